@@ -132,9 +132,7 @@ class DataTable:
         Raises:
           InputError: the name has another ending, or the file cannot be written.
         """
-        path = check_path("path", path)
-        if path.suffix not in _WRITERS:
-            raise InputError(f"path: got {excerpt(str(path))}, want a name that ends in {', '.join(_WRITERS)}")
+        path = check_table_path("path", path)
         text = _WRITERS[path.suffix](self)
         with replacing(path) as unfinished:
             unfinished.write_text(text, encoding="utf-8", newline="\n")
@@ -155,6 +153,14 @@ class DataTable:
 
 _WRITERS = {".csv": DataTable.csv, ".tex": DataTable.latex, ".md": DataTable.markdown}
 ENDINGS = tuple(_WRITERS)
+
+
+def check_table_path(field: str, path: object) -> Path:
+    """The path of a table's file. Raises InputError unless its name ends with one of ENDINGS."""
+    checked = check_path(field, path)
+    if checked.suffix not in ENDINGS:
+        raise InputError(f"{field}: got {excerpt(str(checked))}, want a name that ends in {', '.join(ENDINGS)}")
+    return checked
 
 
 def fraction_format(trials: int) -> str:

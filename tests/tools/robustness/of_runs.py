@@ -223,8 +223,10 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "tables": {"partial": True},
             }.items()
         },
+        "compare": ({"first": results, "second": results, "policies": ("open_loop", "open_loop")},),
         "DataTable": ({"columns": rates.columns, "formats": rates.formats, "notes": rates.notes},),
         "DataTable.select": ({"self": rates, "headings": ["policy", "success"]},),
+        "Outcomes.first": ({"self": results.outcomes(cell), "count": 1},),
         "DataTable.save": ({"self": rates, "path": place.folder / "rates.csv"},),
         "Results.command_of": ({"self": results, "command": "replay"},),
         "Results.solution": ({"self": results, "policy": "open_loop"},),
