@@ -86,7 +86,7 @@ def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, A
         if cell in against:
             one = against[cell]
             cells[-1]["against"] = {
-                "only_smooth": one.pairs.only_first, "only_this": one.pairs.only_second, "p_value": one.adjusted,
+                "only_smooth": one.only_first, "only_this": one.only_second, "p_value": one.adjusted,
             }  # fmt: skip
     plans = {policy: plan_of(results.solution(policy)) for policy in ("smooth", "ilqr")}
     words = [one.describe(scenario.plant()) for one in light]

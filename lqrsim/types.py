@@ -21,6 +21,7 @@ from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.gradients import Gradients
 from lqrsim.solvers.prepared import PreparedSolver
+from lqrsim.stress.data_table import DataTable
 from lqrsim.verify.verdict import Verification
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "Coordinates",
     "CostTerm",
     "Curvature",
+    "DataTable",
     "DerivativeCheck",
     "ExportedC",
     "Funnel",

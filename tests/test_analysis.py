@@ -135,7 +135,7 @@ def test_policies_are_compared_on_the_same_trials() -> None:
     lost = ["reached"] * 6 + ["timed out"] * 3 + ["reached"]
     first, second = Cell("smooth", "wind", 1.0), Cell("open_loop", "wind", 1.0)
     one = comparisons({first: table_of(won, rms=0.03), second: table_of(lost, rms=0.05)})[0]
-    assert (one.pairs.only_first, one.pairs.only_second, one.both) == (3, 1, 6)
+    assert (one.only_first, one.only_second, one.both) == (3, 1, 6)
     assert one.success.value == pytest.approx(0.2)
     assert one.success.low < 0 < one.success.high
     assert one.rms is not None
@@ -157,8 +157,8 @@ def test_several_comparisons_raise_the_p_values() -> None:
     table = {Cell("a", "s", strength): mixed(20, 20) for strength in (1.0, 2.0)}
     table |= {Cell("b", "s", 1.0): mixed(10, 20), Cell("b", "s", 2.0): mixed(14, 20)}
     first, second = comparisons(table)
-    assert first.adjusted == pytest.approx(2 * first.pairs.p_value)
-    assert second.adjusted == pytest.approx(second.pairs.p_value)
+    assert first.adjusted == pytest.approx(2 * first.p_value)
+    assert second.adjusted == pytest.approx(second.p_value)
 
 
 def test_failure_modes_are_counted_by_outcome_and_obstacle() -> None:

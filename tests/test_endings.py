@@ -747,9 +747,10 @@ def test_what_runs_violate_is_named_though_they_reach_the_goal(
     )
     missed = [low - x[:, 1:, 0], x[:, 1:, 0] - high, u[:, :, 1] - most, np.abs(x[:, -1:, 1] - end)]
     knots = [slice(1, None), slice(1, None), slice(0, -1), slice(-1, None)]
-    found = list(problem.violations(run).values())
-    assert len(found) == 4
-    for own, by, acts in zip(found, missed, knots, strict=True):
+    found, x0 = problem.violations(run), problem.dynamics.state_coordinates.names[0]
+    most = "SymbolicConstraint: <lambda>"  # named after the function; the second of the name is numbered
+    assert list(found) == [f"StateBounds: {x0} low", f"StateBounds: {x0} high", most, f"{most} (2)"]
+    for own, by, acts in zip(found.values(), missed, knots, strict=True):
         values = np.where((by > 1e-6) & run.counts[:, acts], by, 0.0)
         worst, when = values.max(axis=1), t[acts][values.argmax(axis=1)]
         np.testing.assert_allclose(own[:, 0], worst, rtol=1e-12, atol=1e-12)  # rounding of the formulas
@@ -759,17 +760,44 @@ def test_what_runs_violate_is_named_though_they_reach_the_goal(
         replace(problem, steps=problem.steps + 1).violations(run)
 
 
-@pytest.mark.parametrize("lows", [(0.3, 0.1), (0.1, 0.3), (0.1, 0.3, 0.2)])
-def test_of_constraints_with_the_same_name_the_largest_violation_counts(
+@pytest.mark.parametrize("lows", [(0.3, 0.1), (0.1, 0.3), (0.1, 9.0, 0.2)])
+def test_constraints_with_the_same_name_are_numbered(
     lows: tuple[float, ...], quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
 ) -> None:
-    """Formulas are named after their functions, and functions may have the same name."""
+    """Formulas are named after their functions, which may have the same name; one that nothing violates has zeros."""
     run = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ForceNoise(0.3)], trials=3, seed=4)
     constraints = [ls.SymbolicConstraint(lambda x, u, p, low=low: [low - x[3] ** 2]) for low in lows]
-    (found,) = replace(quadrotor.problem, constraints=constraints).violations(run).values()
-    by = np.where(run.counts[:, 1:], run.states[:, 1:, 3] ** 2 - min(lows), 0.0)
-    np.testing.assert_allclose(found[:, 0], by.max(axis=1), rtol=1e-12)
-    np.testing.assert_array_equal(found[:, 1], run.times[1 + by.argmax(axis=1)])
+    found, name = replace(quadrotor.problem, constraints=constraints).violations(run), "SymbolicConstraint: <lambda>"
+    assert list(found) == [name, f"{name} (2)", f"{name} (3)"][: len(lows)]
+    for own, low in zip(found.values(), lows, strict=True):
+        by = np.where(run.counts[:, 1:], run.states[:, 1:, 3] ** 2 - low, 0.0)
+        by = np.where(by > 1e-6, by, 0.0)
+        np.testing.assert_allclose(own[:, 0], by.max(axis=1), rtol=1e-12)
+        np.testing.assert_array_equal(own[:, 1], np.where(by.any(axis=1), run.times[1 + by.argmax(axis=1)], 0.0))
+
+
+class Slow(ls.Constraint):
+    """Bounds on two velocities from above, whose rows have names, or none."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
+
+    def bind(self, dynamics: ls.Dynamics) -> ls.types.ConstraintTerm:
+        bounds = ls.StateBounds(vx=(-np.inf, 0.1), vy=(-np.inf, 0.1)).bind(dynamics)
+        return replace(bounds, names=self.names)
+
+
+def test_rows_of_one_name_count_as_one(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Rows without names have their indices."""
+    run = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ForceNoise(0.3)], trials=3, seed=4)
+    constraints = [Slow(()), Slow(("speed", "speed"))]
+    found = replace(quadrotor.problem, constraints=constraints).violations(run)
+    assert list(found) == ["Slow[0]", "Slow[1]", "Slow: speed"]
+    one, other = found["Slow[0]"], found["Slow[1]"]
+    np.testing.assert_array_equal(found["Slow: speed"], np.where(one[:, :1] >= other[:, :1], one, other))
+    assert (one[:, 0] > 0).all()
+    with pytest.raises(InputError, match="ConstraintTerm: names: got 1, want none, or one for each of 2 rows"):
+        replace(quadrotor.problem, constraints=[Slow(("speed",))])
 
 
 def test_a_scenario_without_disturbances_is_told_of_presets() -> None:

@@ -13,12 +13,12 @@ from lqrsim.commands.creating import Export, New
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Harden, Rare
 from lqrsim.commands.solving import List, Simulate, Solve
-from lqrsim.commands.stressing import Replay, Report, Stress
+from lqrsim.commands.stressing import Compare, Replay, Report, Stress
 from lqrsim.commands.viewing import Render, Verify, View
 
 _ALL = (
-    List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Rare, Certify, Harden, Break,
-    FunnelCommand, Export, Bridge, Reproduce, Cache,
+    List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Compare, Rare, Certify, Harden,
+    Break, FunnelCommand, Export, Bridge, Reproduce, Cache,
 )  # fmt: skip
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}
 # Name -> the first line of its help.

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lqrsim.results.rollout import Rollout
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.packaged import Scenario
+    from lqrsim.stress.data_table import DataTable
     from lqrsim.stress.results import Results
     from lqrsim.verify.verdict import Verification
 
@@ -118,6 +119,11 @@ def of_campaign(results: "Results") -> Object:
         "came_to_nothing": results.came_to_nothing(),
         "versions": results.manifest["versions"],
     }
+
+
+def of_table(table: "DataTable") -> list[Object]:
+    """The rows of a table, by the names of its columns."""
+    return _rows(table.columns)
 
 
 def _fields(record: object, names: str) -> Object:

@@ -249,7 +249,7 @@ class Simulate:
             )
         console.say(rollout.summary())
         violations = _violations(scenario.problem, rollout)
-        for one in violations or ():
+        for one in (one for one in violations or () if one["trials"]):
             console.say(
                 f"{one['trials']} of {rollout.trials} trials violate a constraint, {one['constraint']}, by up to"
                 f" {one['most']:.3g} (trial {one['trial']} at {one['time']:.2f} s); outcomes do not count this"
@@ -285,13 +285,13 @@ class Simulate:
 
 
 def _violations(problem: "Problem", rollout: "Rollout") -> list[dict[str, Any]] | None:
-    """For each constraint that trials violate, how many do, and the worst; None for a problem of another horizon."""
+    """For each constraint, how many trials violate it, and the worst; None for a problem of another horizon."""
     if (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         return None
     listed = list[dict[str, Any]]()
     for name, found in problem.violations(rollout).items():
         worst, count = int(found[:, 0].argmax()), int((found[:, 0] > 0).sum())
         by, when = found[worst].tolist()
-        where = {"trial": rollout.first_trial + worst, "time": when}
+        where = {"trial": rollout.first_trial + worst, "time": when} if count else {"trial": None, "time": None}
         listed.append({"constraint": name, "trials": count, "most": by, **where})
     return listed

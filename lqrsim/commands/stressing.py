@@ -163,16 +163,17 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report of a stress test as one HTML page.
+    """Write the report of a stress test: a page, or a table for a paper.
 
-    The page has tables, curves and videos of the worst trials, and needs no network and no other file. It can be
-    written before the stress test has ended, and then says so.
+    The page is one HTML file with tables, curves and videos of the worst trials, which needs no network. The table has
+    the success rates with their intervals, as CSV, LaTeX (booktabs) or Markdown. Both can be written before the stress
+    test has ended, and then say so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """A folder from `lqrsim stress`."""
-    out: Annotated[Path | None, optional("FILE.html")] = None
-    """The page. By default report.html in that folder."""
+    out: Annotated[Path | None, optional("FILE")] = None
+    """The page, .html, or the table: .csv, .tex or .md. By default report.html in that folder."""
     videos: int = 4
     """Number of the worst trials to repeat and render."""
     scenario: OwnScenario = None
@@ -181,17 +182,59 @@ class Report:
     def run(self) -> int:
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
-        from lqrsim.reports.page import report
+        from lqrsim.stress.data_table import ENDINGS
         from lqrsim.stress.results import Results
 
-        page = self.out or self.folder / "report.html"
-        if page.suffix != ".html":
-            raise InputError(f"--out: got {page}, want a name that ends in .html")
-        console.check_output("--out", page.parent, page.name)
+        path = self.out or self.folder / "report.html"
+        if path.suffix not in (".html", *ENDINGS):
+            raise InputError(f"--out: got {path}, want a name that ends in .html, {', '.join(ENDINGS)}")
+        console.check_output("--out", path.parent, path.name)
         results = Results(self.folder, scenario=self.scenario)
-        with console.progress("reporting", "part") as progress:
-            report(results, page, videos=self.videos, progress=progress)
-        console.wrote(page)
+        if path.suffix in ENDINGS:
+            results.rates().save(path)
+        else:
+            from lqrsim.reports.page import report
+
+            with console.progress("reporting", "part") as progress:
+                report(results, path, videos=self.videos, progress=progress)
+        console.wrote(path)
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare:
+    """Compare two stress tests, or two policies of one, cell by cell.
+
+    Stress tests of the same seed are compared trial by trial. Prints the rates, their difference with its interval, and
+    the p-value, adjusted for the number of cells.
+
+      lqrsim compare runs/stress/quadrotor --policies smooth track
+      lqrsim compare runs/first --with runs/second --out difference.tex
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """A folder from `lqrsim stress`."""
+    other: Annotated[Path | None, optional("FOLDER"), arg(name="with")] = None
+    """Another one. By default the same."""
+    policies: Annotated[tuple[str, str] | None, optional("POLICY POLICY")] = None
+    """The policy of each. By default each policy with the one of the same name."""
+    out: Annotated[Path | None, optional("FILE")] = None
+    """File to write the table to: .csv, .tex or .md."""
+    json: Json = False
+
+    def run(self) -> int:
+        from lqrsim.commands import as_json, console
+        from lqrsim.stress.comparison import compare
+        from lqrsim.stress.data_table import check_table_path
+
+        if self.out is not None:
+            check_table_path("--out", self.out)
+            console.check_output("--out", self.out.parent, self.out.name)
+        table = compare(self.folder, self.other, policies=self.policies)
+        console.say(str(table))
+        if self.out is not None:
+            console.wrote(table.save(self.out))
+        console.result(cells=as_json.of_table(table), notes=table.notes)
         return 0

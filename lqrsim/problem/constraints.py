@@ -46,6 +46,8 @@ class ConstraintTerm(Term):
     Attributes:
       rows: number of entries at a step.
       describe: returns the name of a row for messages.
+      names: a name of each row for `Problem.violations`, without numbers that may change; rows of one name count as
+        one. By default rows have their indices.
       uses_control: whether the entries depend on u; if so, they do not act at the last step, which has no control.
       equality: whether the entries must be zero.
       final_only: whether the entries act only at the last step.
@@ -70,6 +72,7 @@ class ConstraintTerm(Term):
     ranges: Array | None = None
     linear: bool = False
     yields: bool = False
+    names: tuple[str, ...] = ()
 
     @property
     def _defines(self) -> Mapping[str, int]:
@@ -84,6 +87,11 @@ class ConstraintTerm(Term):
     def __post_init__(self) -> None:
         keep(self, rows=check_count("ConstraintTerm: rows", self.rows, at_least=0))
         check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
+        keep(self, names=check_items("ConstraintTerm: names", self.names, str, "a tuple with a name of each row"))
+        if self.names and len(self.names) != self.rows:
+            raise InputError(
+                f"ConstraintTerm: names: got {len(self.names)}, want none, or one for each of {self.rows} rows"
+            )
         for name in ("uses_control", "equality", "final_only", "convex", "linear", "yields"):
             keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
@@ -116,6 +124,7 @@ class ConstraintTerm(Term):
             final_only=final_only,
             shared=shared,
             functions=residual.functions,
+            names=residual.parts,
         )
 
 
@@ -208,6 +217,14 @@ def _check_bounds(found: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dy
 def _greatest(sides: Sequence[Side]) -> Side:
     """The greatest number, at each knot."""
     return functools.reduce(np.maximum, sides)
+
+
+def names_of(constraint: Constraint, term: ConstraintTerm) -> list[str]:
+    """A name of each row of a constraint that does not change with its numbers, such as "StateBounds: x low"."""
+    kind = type(constraint).__name__
+    if term.names:
+        return [f"{kind}: {name}" for name in term.names]
+    return [kind] if term.rows == 1 else [f"{kind}[{row}]" for row in range(term.rows)]
 
 
 def violation_of(term: ConstraintTerm, values: Array) -> float:

@@ -160,11 +160,14 @@ class SymbolicConstraint(OfFormula, Constraint):
                 " state the others as another SymbolicConstraint"
             )
         kind = "zero" if self.equality else "not negative"
+        parts = [f"[{row}]" for row in range(rows)] if rows > 1 else [""]
+        name = getattr(self.function, "__name__", type(self.function).__name__)
         return ConstraintTerm(
             source=made["source"],
             data=self._data,
             rows=rows,
-            describe=lambda row: f"that {self.name}{f'[{row}]' if rows > 1 else ''} is {kind}",
+            describe=lambda row: f"that {self.name}{parts[row]} is {kind}",
+            names=tuple(f"{name}{part}" for part in parts),
             uses_control=bool(with_control),
             equality=self.equality,
             final_only=self.at == "final",

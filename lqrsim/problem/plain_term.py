@@ -54,8 +54,8 @@ class PlainTerm:
 
 def violated(
     term: ConstraintTerm, states: Array, controls: Array, counts: npt.NDArray[np.bool_], tolerance: float
-) -> Iterator[tuple[str, Array, npt.NDArray[np.intp]]]:
-    """The name of each row that runs violate, the largest violation (K,) of each run, and its knot (K,).
+) -> Iterator[tuple[Array, npt.NDArray[np.intp]]]:
+    """The largest violation (K,) of each run and its knot (K,), zeros for a run without one, row by row.
 
     Args:
       states: (K, T+1, n). controls: (K, T, m). counts: (K, T+1), whether a knot counts.
@@ -71,5 +71,4 @@ def violated(
             missed = abs(value) if term.equality else -value
             if missed > max(tolerance, found[k]):
                 found[k], when[k] = missed, t
-        if found.any():
-            yield term.describe(row), found, when
+        yield found, when

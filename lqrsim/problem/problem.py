@@ -1,6 +1,7 @@
 """The optimal control problem of Eqs. (1)-(2), in discrete time."""
 
 import copy
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -23,7 +24,15 @@ from lqrsim.errors import (
     keep,
 )
 from lqrsim.problem.collision_shape import KeepsClear
-from lqrsim.problem.constraints import EQUALITY_TOLERANCE, Constraint, ConstraintTerm, bind_all, by_name, goals_of
+from lqrsim.problem.constraints import (
+    EQUALITY_TOLERANCE,
+    Constraint,
+    ConstraintTerm,
+    bind_all,
+    by_name,
+    goals_of,
+    names_of,
+)
 from lqrsim.problem.costs import Cost, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
@@ -495,7 +504,7 @@ class Problem:
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
 
     def violations(self, rollout: Rollout) -> dict[str, Array]:
-        """The constraints that runs violate by more than 1e-6, other than clearances, which a `Rollout` has itself.
+        """By how much runs violate each constraint, other than clearances, which a `Rollout` has itself.
 
         A run's outcome does not count them: a run that reached its goal may have violated any of them.
 
@@ -503,9 +512,10 @@ class Problem:
           rollout: runs of a plan for this problem, K trials.
 
         Returns:
-          Name of a constraint -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in
-          seconds; zeros for a trial without one. Only constraints that some trial violates. If several have the same
-          name, the largest violation of all of them.
+          Name -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in seconds; zeros
+          for a trial that violates it by at most 1e-6. Names do not depend on the runs or on the constraints' numbers:
+          "StateBounds: x low", "GoalState: x", "SymbolicConstraint: NAME" of the function, with "[0]" for the first of
+          several entries. If an earlier constraint has the same name, " (2)" follows, and so on.
 
         Raises:
           InputError: the runs have other states, controls or steps.
@@ -518,11 +528,16 @@ class Problem:
             raise InputError(f"rollout: got {got}, want the problem's: {want}")
         found: dict[str, Array] = {}
         for constraint, term in zip(self.constraints, self.constraint_terms, strict=True):
-            if constraint.kept_clear is None:
-                runs = rollout.states, rollout.applied, rollout.counts
-                for name, by, knots in violated(term, *runs, EQUALITY_TOLERANCE):
-                    own = np.stack([by, rollout.times[knots]], axis=1)
-                    found[name] = np.where(by[:, None] > found[name][:, :1], own, found[name]) if name in found else own
+            if constraint.kept_clear is not None:
+                continue
+            each: dict[str, Array] = {}
+            rows = violated(term, rollout.states, rollout.applied, rollout.counts, EQUALITY_TOLERANCE)
+            for name, (by, knots) in zip(names_of(constraint, term), rows, strict=True):
+                worst = np.stack([by, rollout.times[knots]], axis=1)
+                each[name] = np.where(by[:, None] > each[name][:, :1], worst, each[name]) if name in each else worst
+            for name, worst in each.items():
+                unused = (f"{name} ({number})" for number in itertools.count(2))
+                found[name if name not in found else next(key for key in unused if key not in found)] = worst
         return found
 
     @property

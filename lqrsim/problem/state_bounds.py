@@ -52,8 +52,9 @@ class GoalState(Constraint):
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
         data = _bound_data([(i, 1.0, np.inf, np.array([number])) for i, number in rows])
         return ConstraintTerm(
-            source_of(__name__), data, len(rows), described.__getitem__, equality=True, final_only=True
-        )
+            source_of(__name__), data, len(rows), described.__getitem__, equality=True, final_only=True,
+            names=tuple(names[i] for i, _ in rows),
+        )  # fmt: skip
 
     def with_added_state(self, dynamics: Dynamics) -> "GoalState":
         names = dynamics.state_coordinates.names  # numbers by unit would also apply to the added state
@@ -112,7 +113,7 @@ class StateBounds(Constraint):
     def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         """Raises InputError if a goal is outside the bounds."""
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        rows, described = [], []
+        rows, described, named = [], [], []
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
             for i, sides in self.state_bounds(dynamics).items():
                 name, numbers = names[i], np.atleast_1d(sides[side])
@@ -125,7 +126,10 @@ class StateBounds(Constraint):
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
                 rows.append((i, sign, len(times) - 2 if i in goals else np.inf, numbers))
                 described.append(wanted)
-        return ConstraintTerm(source_of(__name__), _bound_data(rows), len(rows), described.__getitem__, convex=True)
+                named.append(f"{name} {('low', 'high')[side]}")
+        return ConstraintTerm(
+            source_of(__name__), _bound_data(rows), len(rows), described.__getitem__, convex=True, names=tuple(named)
+        )
 
 
 def _bound(field: str, given: object) -> tuple[Side, Side]:

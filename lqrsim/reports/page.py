@@ -412,7 +412,7 @@ def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
             head,
             [
                 [
-                    f"{one.first.strength:g}", str(one.pairs.only_first), str(one.pairs.only_second),
+                    f"{one.first.strength:g}", str(one.only_first), str(one.only_second),
                     f"{one.adjusted:.2g}", _percent(one.success, unit=""), str(one.both),
                     "" if one.rms is None else _between(one.rms.value, one.rms.low, one.rms.high, factor),
                 ]

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_path, excerpt
+from lqrsim.errors import InputError, check_path, excerpt, printable
 from lqrsim.results.fields import check_string
 
 
@@ -235,8 +235,8 @@ def blamed(path: Path, kind: str) -> Iterator[None]:
 
 
 def excerpt_of(path: Path) -> str:
-    """A path for a message; a long one is cut in the middle."""
-    name = str(path)
+    """A path for a message, as printable text; a long one is cut in the middle."""
+    name = printable(str(path))
     return name if len(name) <= 200 else f"{name[:80]}...{name[-80:]}"
 
 

@@ -90,6 +90,7 @@ class ForceLimits(Constraint):
         limits, described = self.limits * (table.shape[1] // len(self.limits)), []
         for side, word in (("low", "at least"), ("high", "at most")):
             described += [f"the force {one.name} of {word} {getattr(one, side):g} {one.unit}" for one in limits]
+        names = tuple(f"{one.name} {side}" for side in ("low", "high") for one in limits)
         low, high = (table.copy(), -table)
         ranges = np.array([one.high - one.low for one in limits])
         low[..., 0] -= [one.low for one in limits] + SPARED * ranges
@@ -97,8 +98,7 @@ class ForceLimits(Constraint):
         rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
-            uses_control=True, convex=True, ranges=np.tile(ranges, 2), linear=True,
-            yields=True,
+            uses_control=True, convex=True, ranges=np.tile(ranges, 2), linear=True, yields=True, names=names,
         )  # fmt: skip
 
 

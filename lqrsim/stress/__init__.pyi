@@ -1,4 +1,5 @@
 from .campaign import run_campaign as run_campaign
+from .comparison import compare as compare
 from .design_point import smallest_failure as smallest_failure
 from .failure_search import ReliabilityProblem as ReliabilityProblem
 from .funnels import FunnelCheck as FunnelCheck

@@ -5,7 +5,7 @@ outcome is a failure.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,17 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Cell
-from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm, mean, paired_difference, rate, wilson
+from lqrsim.stress.statistics import (
+    CONFIDENCE,
+    Estimate,
+    compare,
+    holm,
+    independent_difference,
+    mean,
+    paired_difference,
+    rate,
+    wilson,
+)
 
 Table = Mapping[Cell, Outcomes]
 
@@ -124,21 +134,28 @@ def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE)
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of two policies on the same trials.
+    """A comparison of two cells: on the same trials, or on trials of their own.
 
     Attributes:
-      pairs: number of trials in which only one of them succeeded, with the exact test.
-      success: success rate of the first policy minus that of the second. rms: the difference of the mean tracking
-        errors, over the `both` trials in which both succeeded; None if there are fewer than two.
+      rates: the success rate of each.
+      success: success rate of the first minus that of the second, which is failure rate of the second minus that of the
+        first. rms: the difference of the mean tracking errors, over the `both` trials in which both succeeded; None if
+        there are fewer than two, or trials of their own.
+      only_first, only_second: number of trials in which only one of them succeeded; None for trials of their own.
+      p_value: of the exact test that their success rates are equal, McNemar's on the same trials and else Fisher's; NaN
+        if nothing was drawn in either.
       adjusted: p-value, adjusted for the number of comparisons.
     """
 
     first: Cell
     second: Cell
-    pairs: Pairs
+    rates: tuple[Success, Success]
     success: Estimate
     rms: Estimate | None
     both: int
+    only_first: int | None
+    only_second: int | None
+    p_value: float
     adjusted: float
 
 
@@ -152,26 +169,53 @@ def comparisons(table: Table) -> list[Comparison]:
       InputError: two policies have different trials.
     """
     policies = list(dict.fromkeys(cell.policy for cell in _checked_table(table)))
-    compared: list[Comparison] = []
-    for other in policies[1:]:
-        for cell in table:
-            second = Cell(other, cell.sweep, cell.strength)
-            if cell.policy != policies[0] or second not in table:
-                continue
-            if not (alike(cell, table[cell]) and alike(second, table[second])):
-                compared.append(_compared(cell, second, table[cell], table[second]))
-    adjusted = holm([one.pairs.p_value for one in compared])
-    return [replace(one, adjusted=float(p)) for one, p in zip(compared, adjusted, strict=True)]
+    seconds = ((cell, Cell(other, cell.sweep, cell.strength)) for other in policies[1:] for cell in table)
+    pairs = [
+        (first, second)
+        for first, second in seconds
+        if first.policy == policies[0]
+        and second in table
+        and not (alike(first, table[first]) and alike(second, table[second]))
+    ]
+    return compared(pairs, table, table)
 
 
-def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes) -> Comparison:
-    if not np.array_equal(one.trial, other.trial):
-        raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
-    pairs = compare(succeeded(one), succeeded(other))
-    difference = paired_difference(pairs.only_first, pairs.only_second, len(one))
-    both = succeeded(one) & succeeded(other)
-    rms = mean(one.rms[both] - other.rms[both]) if both.sum() > 1 else None
-    return Comparison(first, second, pairs, difference, rms, int(both.sum()), pairs.p_value)
+def compared(
+    pairs: Iterable[tuple[Cell, Cell]], firsts: Table, seconds: Table, *, paired: bool = True
+) -> list[Comparison]:
+    """Compare pairs of cells, with p-values adjusted for their number (Holm).
+
+    Args:
+      pairs: a cell of `firsts` and a cell of `seconds`.
+      paired: whether trials of the same number are compared with each other, see `comparisons`. If not, the difference
+        of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
+
+    Raises:
+      InputError: two cells have different trials, and are paired.
+    """
+    found = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
+    tested = [place for place, one in enumerate(found) if not np.isnan(one.p_value)]
+    for place, adjusted in zip(tested, holm([found[place].p_value for place in tested]).tolist(), strict=True):
+        found[place] = replace(found[place], adjusted=adjusted)
+    return found
+
+
+def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes, *, paired: bool) -> Comparison:
+    rates, rms, both, only_first, only_second = (success(first, one), success(second, other)), None, 0, None, None
+    if paired:
+        if not np.array_equal(one.trial, other.trial):
+            raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
+        pairs = compare(succeeded(one), succeeded(other))
+        only_first, only_second, p_value = pairs.only_first, pairs.only_second, pairs.p_value
+        difference = paired_difference(only_first, only_second, len(one))
+        joint = succeeded(one) & succeeded(other)
+        both = int(joint.sum())
+        rms = mean(one.rms[joint] - other.rms[joint]) if both > 1 else None
+    else:
+        difference, p_value = independent_difference(*((found.reached, found.trials) for found in rates))
+    if all(found.alike for found in rates):  # the difference of two runs
+        difference, p_value = replace(difference, low=difference.value, high=difference.value), float("nan")
+    return Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)
 
 
 def modes(outcomes: Outcomes) -> dict[tuple[str, str], int]:

@@ -5,7 +5,18 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_flag, check_kind, check_shape, excerpt, keep, numbers_of, shaped
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_kind,
+    check_shape,
+    excerpt,
+    keep,
+    numbers_of,
+    shaped,
+)
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.goal import OUTCOMES
@@ -68,6 +79,18 @@ class Outcomes:
 
     def __len__(self) -> int:
         return len(self.trial)
+
+    def first(self, count: int) -> "Outcomes":
+        """The outcomes of the first trials.
+
+        Args:
+          count: number of trials; more than there are means all.
+
+        Raises:
+          InputError: the number is not positive.
+        """
+        check_count("count", count)
+        return replace(self, **{name: column[:count] for name, column in self.columns().items()})
 
     def columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """Name -> column, in order."""

@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_flag,
+    check_kind,
+    check_name,
+    check_path,
+    check_text,
+    excerpt,
+)
 from lqrsim.results import notebook, save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.goal import OUTCOMES
@@ -21,6 +30,7 @@ from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
+from lqrsim.stress.data_table import DataTable, fraction_format
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE
@@ -151,6 +161,40 @@ class Results:
         said = [*self.manifest["remarks"], *self.plans(), *self.came_to_nothing(), *self.hints()]
         return "\n".join([*lines, *said])
 
+    def rates(self) -> DataTable:
+        """The success rate of each cell so far as a table: for CSV, LaTeX or Markdown.
+
+        It has the columns sweep, strength, policy, trials, a count of each outcome, and success, low and high: the
+        fraction of trials that reached their goal, with its exact interval. A cell without trials has no rate, and
+        one in which nothing is drawn has no interval, because all of its trials are one run.
+
+        Raises:
+          InputError: a file is damaged.
+        """
+        head = ("sweep", "strength", "policy", "trials", *OUTCOMES, "success", "low", "high")
+        rows: list[tuple[Any, ...]] = []
+        for cell, ends, found in self.cell_successes():
+            rate = (None, None, None)
+            if found is not None:
+                interval = (None, None) if found.alike else (found.exact.low, found.exact.high)
+                rate = (found.exact.value, *interval)
+            counts = (ends.total(), *(ends[name] for name in OUTCOMES))
+            rows.append((cell.sweep, cell.strength, cell.policy, *counts, *rate))
+        campaign = self.manifest["campaign"]
+        notes = [
+            f"{campaign['scenario']}, seed {campaign['seed']}; success: the fraction of trials that reached the goal",
+            f"low, high: exact (Clopper-Pearson) interval of {100 * CONFIDENCE:g} %; none if all trials are one run",
+            *self._unfinished(),
+        ]
+        formats: dict[str, str] = dict.fromkeys(("success", "low", "high"), fraction_format(campaign["trials"]))
+        return DataTable(dict(zip(head, zip(*rows, strict=True), strict=True)), formats, notes)
+
+    def _unfinished(self) -> list[str]:
+        """A line that says how many trials are missing, if any."""
+        missing = sum(count for _, _, count in self.missing)
+        of = self.manifest["campaign"]["trials"] * len(self.cells)
+        return [f"not finished: {missing} of {of} trials are missing"] if missing else []
+
     def _repr_html_(self) -> str:
         others = [name for name in OUTCOMES if name != "reached"]
         rows = [("sweep", "strength", "policy", "trials", "reached (%)", f"{100 * CONFIDENCE:g} % interval", *others)]
@@ -162,10 +206,8 @@ class Results:
                 interval = "deterministic: 1 run" if found.alike else interval
             counts = [str(ends[name]) for name in others]
             rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(ends.total()), share, interval, *counts))
-        campaign, missing = self.manifest["campaign"], sum(count for _, _, count in self.missing)
-        of = campaign["trials"] * len(self.cells)
-        remarks = [f"not finished: {missing} of {of} trials are missing"] if missing else []
-        return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", remarks, rows)
+        campaign = self.manifest["campaign"]
+        return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", self._unfinished(), rows)
 
     def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or a diverged filter."""

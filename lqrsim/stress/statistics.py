@@ -131,6 +131,33 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
     return Estimate(surplus / trials, low, high, confidence)
 
 
+def independent_difference(
+    first: tuple[int, int], second: tuple[int, int], *, confidence: float = CONFIDENCE
+) -> tuple[Estimate, float]:
+    """The difference of two success rates, of trials that have nothing in common, and Fisher's exact test of it.
+
+    The interval is Newcombe's hybrid score (Statistics in Medicine 17, 1998, method 10): how far the rates can be off
+    by their Wilson intervals, added as independent errors are.
+
+    Args:
+      first, second: number of successes and of trials.
+
+    Returns:
+      The rate of the first minus that of the second, and the p-value.
+
+    Raises:
+      InputError: as `rate` does.
+    """
+    from scipy import stats
+
+    one, other = (wilson(*counts, confidence=confidence) for counts in (first, second))
+    value = one.value - other.value
+    low = value - float(np.hypot(one.value - one.low, other.high - other.value))
+    high = value + float(np.hypot(one.high - one.value, other.value - other.low))
+    test = stats.fisher_exact([[reached, trials - reached] for reached, trials in (first, second)])
+    return Estimate(value, low, high, confidence), float(test.pvalue)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> float:
     """The last accepted number between `inside` and `outside`, by bisection down to rounding."""
     for _ in range(60):

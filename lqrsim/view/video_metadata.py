@@ -11,7 +11,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, excerpt
-from lqrsim.results.archive import sha256
+from lqrsim.results.archive import excerpt_of, sha256
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import record_from, tree_of
@@ -111,7 +111,7 @@ def read(path: str | os.PathLike[str]) -> VideoMetadata:
     """The metadata of a video. Raises InputError if lqrsim did not write it."""
     path = check_path("video", path)
     if not os.path.isfile(path):  # not the method of Path, which raises if a folder cannot be read
-        raise InputError(f"video: got {path}, want a file that exists")
+        raise InputError(f"video: got {excerpt_of(path)}, want a file that exists")
     try:
         with av.open(str(path)) as container:
             text = container.metadata.get("comment", "")

@@ -224,7 +224,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Clearance of balls": ({"call": ls.Clearance, "world": world, "balls": balls, "margin": 0.1},),
         "ConstraintTerm": ({
             "source": source, "data": [1.0], "rows": 1, "describe": str, "uses_control": False, "equality": True,
-            "final_only": False, "shared": 0, "functions": (),
+            "final_only": False, "shared": 0, "functions": (), "names": ("row",),
         },),
         "SymbolicConstraint": ({"function": bowl, "parameters": {"a": 1.0}, "equality": True, "at": "all"},),
         "Clearance.ahead": ({"self": ls.Clearance(world, radius=0.2, margin=np.linspace(0, 0.1, 5)), "steps": 2},),

@@ -186,7 +186,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     campaign = ls.stress.Campaign(**asked)
     results = ls.stress.run_campaign(campaign, place.folder / "campaign", workers=0)
     score = ls.stress.TrialScore(place.plant, place.solution, [ControlNoise(0.5)], threads=1)
-    cell = results.cells[0]
+    cell, rates = results.cells[0], results.rates()
     fields = (
         "plant",
         "solution",
@@ -223,6 +223,11 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "tables": {"partial": True},
             }.items()
         },
+        "compare": ({"first": results, "second": results, "policies": ("open_loop", "open_loop")},),
+        "DataTable": ({"columns": rates.columns, "formats": rates.formats, "notes": rates.notes},),
+        "DataTable.select": ({"self": rates, "headings": ["policy", "success"]},),
+        "Outcomes.first": ({"self": results.outcomes(cell), "count": 1},),
+        "DataTable.save": ({"self": rates, "path": place.folder / "rates.csv"},),
         "Results.command_of": ({"self": results, "command": "replay"},),
         "Results.solution": ({"self": results, "policy": "open_loop"},),
         **{

@@ -1,0 +1,204 @@
+"""Tables for papers: columns of names and numbers, written as CSV, LaTeX and Markdown."""
+
+import csv
+import io
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_path,
+    check_text,
+    excerpt,
+    keep,
+)
+from lqrsim.results.archive import replacing
+
+Entry = str | int | float | None
+_LONGEST = 10_000  # characters of an entry or a note; a reference to a scenario may have as many
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", "[": "{[}", "*": "{*}",  # a row that begins with one of the last two would be an option of \\
+}  # fmt: skip
+# An underscore within a word is only that. Not all renderers know a backslash before the others.
+_MARKDOWN = re.compile(r"[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])")
+_ENTITIES = {letter: f"&#{ord(letter)};" for letter in "&<>~$"}
+
+
+@dataclass(frozen=True, eq=False)
+class DataTable:
+    """A table with one name or number in each entry. `str(table)` is its Markdown.
+
+    Attributes:
+      columns: heading -> entries, all of one length: text, finite numbers, or None for nothing.
+      formats: heading -> format of the numbers in LaTeX and Markdown, such as ".3f"; by default "g". A CSV has all
+        digits.
+      notes: lines that say what the numbers are: comments in LaTeX, lines below the table in Markdown, not in a CSV.
+
+    Raises:
+      InputError: there are no columns, they have different lengths, or a field is not as described.
+    """
+
+    columns: Mapping[str, Sequence[Entry]]
+    formats: Mapping[str, str] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        who, want = "DataTable: columns", "heading -> entries, each text, a finite number or None"
+        check_kind(who, self.columns, Mapping, want)
+        columns = {
+            check_text(f"{who}: heading", name): tuple(
+                _entry(f"{who}: {excerpt(name)}", entry) for entry in check_items(who, column, object, want)
+            )
+            for name, column in self.columns.items()
+        }
+        if len({len(column) for column in columns.values()}) != 1:
+            got = ", ".join(f"{len(column)} in {excerpt(name)}" for name, column in columns.items()) or "none"
+            raise InputError(f"{who}: got {got}, want at least one column, all of one length")
+        check_kind("DataTable: formats", self.formats, Mapping, "heading -> format")
+        for name, spec in self.formats.items():
+            check_name("DataTable: formats", name, columns)
+            if not (isinstance(spec, str) and re.fullmatch(r"(\.\d\d?)?[efg]", spec)):
+                raise InputError(f"DataTable: formats: {excerpt(name)}: got {excerpt(spec)}, want such as '.3f' or 'g'")
+        notes = check_items("DataTable: notes", self.notes, str, "a list of lines")
+        notes = tuple(check_text("DataTable: notes", note, "a line", at_most=_LONGEST) for note in notes)
+        keep(self, columns=columns, formats=dict(self.formats), notes=notes)
+
+    def select(self, headings: Iterable[str]) -> "DataTable":
+        """The table with these columns alone, in this order.
+
+        Args:
+          headings: headings of columns.
+
+        Raises:
+          InputError: the table has no such column, or none is given.
+        """
+        given = check_items("headings", headings, object, "a list of headings")
+        chosen = {name: self.columns[check_name("headings", name, self.columns)] for name in given}
+        formats = {name: spec for name, spec in self.formats.items() if name in chosen}
+        return DataTable(chosen, formats, self.notes)
+
+    def csv(self) -> str:
+        """The table as CSV (RFC 4180, lines end with a line feed): headings, then rows. None is an empty entry."""
+        text = io.StringIO()
+        rows = zip(*self.columns.values(), strict=True)
+        csv.writer(text, lineterminator="\n").writerows([tuple(self.columns), *rows])
+        return text.getvalue()
+
+    def latex(self) -> str:
+        r"""The table as a `tabular` of LaTeX with the rules of the package booktabs, for `\input` in a `table`."""
+        head, *rows = (" & ".join(row) + r" \\" for row in self._rows(_latex_text, _latex_number))
+        return _lines(
+            r"% needs \usepackage{booktabs}", *(f"% {note}" for note in self.notes),
+            rf"\begin{{tabular}}{{{''.join('l' if text else 'r' for text in self._texts)}}}",
+            r"\toprule", head, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}",
+        )  # fmt: skip
+
+    def markdown(self) -> str:
+        """The table as Markdown with pipes, in columns of equal width; below it the notes."""
+        rows, texts = list(self._rows(_markdown_text, str)), self._texts
+        widths = [max(3, *(len(entry) for entry in column)) for column in zip(*rows, strict=True)]
+        rule = ["-" * width if text else "-" * (width - 1) + ":" for width, text in zip(widths, texts, strict=True)]
+        sides = ["<" if text else ">" for text in texts]
+        head, *rest = (
+            f"| {' | '.join(f'{one:{side}{width}}' for one, side, width in zip(row, sides, widths, strict=True))} |"
+            for row in (rows[0], rule, *rows[1:])
+        )
+        return _lines(head, *rest, *(line for note in self.notes for line in ("", _markdown_text(note))))
+
+    __str__ = markdown
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the table in the format that the name ends with: .csv, .tex or .md.
+
+        Args:
+          path: the file.
+
+        Returns:
+          The path.
+
+        Raises:
+          InputError: the name has another ending, or the file cannot be written.
+        """
+        path = check_table_path("path", path)
+        text = _WRITERS[path.suffix](self)
+        with replacing(path) as unfinished:
+            unfinished.write_text(text, encoding="utf-8", newline="\n")
+        return path
+
+    @property
+    def _texts(self) -> list[bool]:
+        """Whether each column has text."""
+        return [any(isinstance(entry, str) for entry in column) for column in self.columns.values()]
+
+    def _rows(self, text: Callable[[str], str], number: Callable[[str], str]) -> Iterator[list[str]]:
+        """The headings, then the rows, as `text` and `number` write them."""
+        specs = [self.formats.get(name, "g") for name in self.columns]
+        yield [text(name) for name in self.columns]
+        for row in zip(*self.columns.values(), strict=True):
+            yield [_shown(entry, spec, text, number) for entry, spec in zip(row, specs, strict=True)]
+
+
+_WRITERS = {".csv": DataTable.csv, ".tex": DataTable.latex, ".md": DataTable.markdown}
+ENDINGS = tuple(_WRITERS)
+
+
+def check_table_path(field: str, path: object) -> Path:
+    """The path of a table's file. Raises InputError unless its name ends with one of ENDINGS."""
+    checked = check_path(field, path)
+    if checked.suffix not in ENDINGS:
+        raise InputError(f"{field}: got {excerpt(str(checked))}, want a name that ends in {', '.join(ENDINGS)}")
+    return checked
+
+
+def fraction_format(trials: int) -> str:
+    """The format of a fraction of so many trials: a trial more changes it, and it has three digits at least."""
+    return f".{max(3, len(str(trials - 1)))}f"
+
+
+def _entry(field: str, value: object) -> Entry:
+    if value is None:
+        return None
+    if isinstance(value, str):
+        return check_text(field, value, at_most=_LONGEST, empty=True)
+    if isinstance(value, (int, np.integer)):
+        return check_count(field, value, at_least=-(2**63), at_most=2**63 - 1)  # what readers of a CSV hold
+    return check_number(field, value)
+
+
+def _shown(entry: Entry, spec: str, text: Callable[[str], str], number: Callable[[str], str]) -> str:
+    if entry is None:
+        return ""
+    if isinstance(entry, str):
+        return text(entry)
+    return number(str(entry) if isinstance(entry, int) else format(entry, spec))
+
+
+def _lines(*lines: str) -> str:
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _latex_text(text: str) -> str:
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+def _latex_number(text: str) -> str:
+    """In math, in which a minus sign is none of hyphens; 1e-05 as a power of ten."""
+    digits, _, exponent = text.partition("e")
+    return f"${digits} \\times 10^{{{int(exponent)}}}$" if exponent else f"${digits}$"
+
+
+def _markdown_text(text: str) -> str:
+    return _MARKDOWN.sub(r"\\\g<0>", text).translate(str.maketrans(_ENTITIES))
