@@ -214,11 +214,13 @@ def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
 
 @draws
 @pytest.mark.parametrize("rollout", ["flight", *rarely("drive")], indirect=True)
-def test_same_rollout_gives_the_same_bytes(rollout: ls.Rollout, tmp_path: Path) -> None:
-    files = [render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=0.4).read_bytes() for name in "ab"]
-    assert files[0] == files[1]
-    files = [render_still(rollout, tmp_path / f"{name}.png", every=2, size=SMALL).read_bytes() for name in "ab"]
-    assert files[0] == files[1]
+def test_same_rollout_gives_the_same_pictures(rollout: ls.Rollout, tmp_path: Path) -> None:
+    """But for single pixels: OpenGL does not promise bits, and one machine of several has drawn others, once."""
+    one, other = (decode(render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=0.4)) for name in "ab")
+    assert len(one) == len(other)
+    assert max(map(difference, one, other)) < 1
+    one, other = (pixels(render_still(rollout, tmp_path / f"{name}.png", every=2, size=SMALL)) for name in "ab")
+    assert difference(one, other) < 1
 
 
 @draws
@@ -251,7 +253,9 @@ def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> 
     video = decode(render(flight, tmp_path / "run.mp4", quality="draft", size=(480, 270), fps=3))
     assert len(video) == len(frames)
     assert max(np.abs(one - other).mean() for one, other in zip(frames, video, strict=True)) < 4
-    assert render(flight, tmp_path / "again.gif", quality="draft", fps=3).read_bytes() == path.read_bytes()
+    with Image.open(render(flight, tmp_path / "again.gif", quality="draft", fps=3)) as image:
+        again = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(image)]
+    assert max(np.abs(one - other).mean() for one, other in zip(frames, again, strict=True)) < 0.5  # not bits: OpenGL
 
 
 @draws
