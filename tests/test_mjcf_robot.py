@@ -586,8 +586,11 @@ def test_an_arm_that_swings_onto_the_floor_at_first_follows_a_line_of_states(see
 
     start, goal = free(), free()
     problem = robot.problem(start, goal, steps=50, dt=0.02)
-    solution = ls.smooth(problem, threads=1)
+    heard: list[Any] = []
+    solution = ls.smooth(problem, threads=1, callback=heard.append)
     assert solution.status is ls.Status.CONVERGED
+    assert len(set(heard)) == len(heard)  # each once, of both starts
+    assert set(solution.iterations) <= set(heard)
     assert solution.cost < ls.ilqr(problem, max_iterations=100).cost  # which stays on the floor
     assert [one.start for one in solution.candidates] == ["nominal control", "a line of states"]
     assert not robot.dynamics.touches(solution.trajectory.states)
