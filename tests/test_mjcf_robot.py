@@ -598,6 +598,39 @@ def test_an_arm_that_swings_onto_the_floor_at_first_follows_a_line_of_states(see
 
 @settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS)
+def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
+    """A body on two feet over a floor or a table, at any height and heading: plain `mj_step` leaves it where it is."""
+    rng = np.random.default_rng(seed)
+    feet = "".join(
+        f'<body pos="{x} 0 -.2"><joint name="{name}" axis="0 1 0" damping="1"/>'
+        '<geom type="box" size=".06 .1 .02" pos="0 0 -.1" mass=".3"/></body>'
+        for name, x in (("fore", rng.uniform(0.1, 0.2)), ("hind", -rng.uniform(0.1, 0.2)))
+    )
+    top = rng.uniform(-0.2, 0.3)
+    scene = scene_from_xml(
+        f"""<mujoco><option integrator="implicitfast"/><worldbody>
+      <geom name="table" type="box" size="2 2 .01" pos="0 0 {top - 0.01}"/>
+      <body name="trunk" pos="0 0 1"><freejoint/><geom type="box" size=".2 .1 .05" mass="2"/>{feet}</body></worldbody>
+      <actuator><position joint="fore" kp="80"/><position joint="hind" kp="80"/></actuator></mujoco>""",
+        "stand",
+    )
+    robot = ls.MjcfRobot(scene, obstacles=False)
+    state = robot.settled(robot.at(z=top + rng.uniform(0.33, 0.8), rz=rng.uniform(-3, 3)))
+    model = robot.scene.model
+    data = mujoco.MjData(model)
+    data.qpos[:], data.ctrl[:] = robot.configuration(state)[0], robot.hold(state)
+    place = data.qpos.copy()
+    mujoco.mj_step(model, data, round(0.3 / model.opt.timestep))
+    # The feet carry 2.6 kg without moving; the contacts' springs settle by micrometres.
+    np.testing.assert_allclose(data.qpos, place, rtol=0, atol=2e-5)
+    with pytest.raises(InputError, match="touches its support, or is above it"):
+        robot.settled(robot.at(z=top - 2))
+    with pytest.raises(InputError, match="obstacles such as table carry nothing: obstacles= chooses others"):
+        ls.MjcfRobot(scene).settled(robot.at(z=top + 1))
+
+
+@settings(max_examples=examples(8), deadline=None)
+@given(seed=SEEDS)
 def test_muscles_hold_by_pulling_at_most_as_much_as_they_can(seed: int) -> None:
     """Two of them, one against the other, with or without a range of their own: by `mj_step` the limb stays for 0.2 s.
 

@@ -311,8 +311,8 @@ class MjcfRobot(Robot):
     def settled(self, state: npt.ArrayLike) -> Array:
         """A nearby state in which the robot stands at rest. Joints without actuators, such as a free base, move to it.
 
-        Legs keep their angles. The base moves to where the contacts, which are springs, carry it. The robot must touch
-        its support at the given state. Activations of actuators take the values that hold it.
+        Legs keep their angles. The base moves to where the contacts, which are springs, carry it; if it touches nothing,
+        it is let down first. Activations of actuators take the values that hold it.
 
         Args:
           state: (n,), whose velocities do not count.
@@ -327,9 +327,11 @@ class MjcfRobot(Robot):
         model = self.dynamics.physics.model
         place, left = settled(model, self.configuration(state)[0])
         if left > _REST * float(model.body_mass.sum()):
+            names = self.scene.world.names
+            apart = f"; obstacles such as {names[0]} carry nothing: obstacles= chooses others" if names else ""
             raise InputError(
                 f"state: got no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
-                " robot touches its support"
+                f" robot touches its support, or is above it{apart}"
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)

@@ -29,6 +29,7 @@ _END = 1e-9  # relative distance from the end of its range within which an activ
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _PROBES, _LINEAR = 4, 1e-9  # random states at which a force is compared with its slopes, and the relative error
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
+_FALLS = 200  # heights at which a body that is let down may touch: thinner supports are not found
 
 
 @dataclass(frozen=True, eq=False)
@@ -464,9 +465,10 @@ def _owners(size: int, first: npt.NDArray[np.int32], count: npt.NDArray[np.int32
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
-    It uses Newton's method with steps of least norm: contacts are springs, and nothing moves in a free direction, such
-    as along a floor.
+    A free body that touches nothing is let down first. Then Newton's method with steps of least norm: contacts are
+    springs, and nothing moves in a free direction, such as along a floor.
     """
+    qpos = _let_down(model, qpos)
     data, actuators = mujoco.MjData(model), _AtRest(model, qpos)
     free = np.flatnonzero(~actuators.driven(actuators.linear(actuators.neutral)))
     if not len(free):
@@ -493,6 +495,40 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
         else:
             break
     return place, float(np.abs(left).max(initial=0.0))
+
+
+def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
+    """Positions (nq,) in which each free body that touches nothing is lower along gravity, if it touches something
+    there, within the size of the model.
+    """
+    data, found = mujoco.MjData(model), qpos.copy()
+    down, most = model.opt.gravity / max(float(np.linalg.norm(model.opt.gravity)), mujoco.mjMINVAL), model.stat.extent
+
+    def touches(joint: int, at: Array) -> bool:
+        data.qpos[:] = at
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        tree = model.body_rootid[model.jnt_bodyid[joint]]
+        roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
+        return bool(((roots == tree).any(axis=1) & (data.contact.dist <= 0)).any())
+
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        place = slice(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + 3)
+
+        def let_down(by: float, joint: int = joint, place: slice = place) -> Array:
+            lower = found.copy()
+            lower[place] += by * down
+            return lower
+
+        falls = most * np.linspace(0, 1, _FALLS)
+        below = next((k for k, by in enumerate(falls) if touches(joint, let_down(by))), 0)
+        if below:
+            low, high = falls[below - 1], falls[below]
+            while high - low > _SMALL * most:
+                middle = 0.5 * (low + high)
+                low, high = (low, middle) if touches(joint, let_down(middle)) else (middle, high)
+            found = let_down(high)
+    return found
 
 
 def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], Array]:
