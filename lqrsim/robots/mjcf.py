@@ -311,8 +311,8 @@ class MjcfRobot(Robot):
     def settled(self, state: npt.ArrayLike) -> Array:
         """A nearby state in which the robot stands at rest. Joints without actuators, such as a free base, move to it.
 
-        Legs keep their angles. The base moves to where the contacts, which are springs, carry it; if it touches nothing,
-        it is let down first. Activations of actuators take the values that hold it.
+        Legs keep their angles. The base moves to where the contacts, which are springs, carry it. A base that touches
+        nothing is let down first. Activations of actuators take the values that hold it.
 
         Args:
           state: (n,), whose velocities do not count.

@@ -504,30 +504,25 @@ def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
     data, found = mujoco.MjData(model), qpos.copy()
     down, most = model.opt.gravity / max(float(np.linalg.norm(model.opt.gravity)), mujoco.mjMINVAL), model.stat.extent
 
-    def touches(joint: int, at: Array) -> bool:
-        data.qpos[:] = at
+    def touches(joint: int, fall: float) -> bool:
+        data.qpos[:] = found
+        data.joint(joint).qpos[:3] += fall * down
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        tree = model.body_rootid[model.jnt_bodyid[joint]]
         roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
-        return bool(((roots == tree).any(axis=1) & (data.contact.dist <= 0)).any())
+        own = (roots == model.body_rootid[model.jnt_bodyid[joint]]).any(axis=1)
+        return bool((own & (data.contact.dist <= 0)).any())
 
-    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-        place = slice(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + 3)
-
-        def let_down(by: float, joint: int = joint, place: slice = place) -> Array:
-            lower = found.copy()
-            lower[place] += by * down
-            return lower
-
-        falls = most * np.linspace(0, 1, _FALLS)
-        below = next((k for k, by in enumerate(falls) if touches(joint, let_down(by))), 0)
-        if below:
-            low, high = falls[below - 1], falls[below]
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist():
+        falls = np.linspace(0, most, _FALLS)
+        first = next((k for k, fall in enumerate(falls) if touches(joint, fall)), 0)
+        if first:
+            low, high = falls[first - 1], falls[first]
             while high - low > _SMALL * most:
                 middle = 0.5 * (low + high)
-                low, high = (low, middle) if touches(joint, let_down(middle)) else (middle, high)
-            found = let_down(high)
+                low, high = (low, middle) if touches(joint, middle) else (middle, high)
+            touches(joint, high)
+            found = data.qpos.copy()
     return found
 
 
