@@ -190,7 +190,7 @@ def newton_step(settings, model, work, memory):
     memory.failed, memory.share, memory.damping, memory.known = failed, share, damping, 1.0 if failed < 0 else 0.0
     for t in range(settings.steps + 1):
         size = max(size, abs(second.constant[t]))
-    memory.negligible, memory.decrease = 1e-26 * size, 2 * left
+    memory.negligible, memory.decrease = settings.rounding * size, 2 * left
     memory.promised = promised(failed, left, memory)
     return good
 

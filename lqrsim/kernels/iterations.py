@@ -102,6 +102,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         failed, good, negligible = backward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), True, failed
+        memory.negligible = negligible
         if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was unknown
             memory.plan_cost, _ = plan_cost(steps, work.best, model, work.to_go)
         cost = roll_out_and_keep(steps, x_hat, model, work, memory)

@@ -90,7 +90,7 @@ def backward_pass(settings, model, about, work):
 
     Returns:
       The step at which it failed, or -1; whether all numbers there were finite; and the negligible cost. If the optimal
-      cost is zero, squares of rounding errors remain, about 1e-13 of the constants of the stages' models, which cancel.
+      cost is zero, squares of rounding errors of the constants of the stages' models remain, which cancel.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, x, u, costate = stack(N), stack(N), stack(M), stack(N)
@@ -119,7 +119,7 @@ def backward_pass(settings, model, about, work):
     if not good or not smoothed_state(0, to_go, to_come, costate, x_hat):
         return 0, finite(to_go.hessian[0], N, N) and finite(to_come.matrix[0], N, N), 0.0
     copy(x_hat, N, work.x_hats[0])
-    return -1, True, 1e-26 * size if size < inf else 0.0
+    return -1, True, settings.rounding * size if size < inf else 0.0
 
 
 def opening_pass(steps, guided, guess, prior, model, policy, to_go):

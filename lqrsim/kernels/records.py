@@ -475,6 +475,7 @@ class IterationSettings(NamedTuple):
       optimal: whether a settled cost must also be optimal. fixed: whether the start is given exactly.
       guided: whether the first iteration linearises about the guess. prior_iterations: number of iterations with the
         prior.
+      rounding: negligible cost relative to the stages' constants, of which it is left where the least cost is zero.
       valley: the gap below which Newton's method takes over from smoothing; 0 for never.
       descent: the steps of a descent.
     """
@@ -487,6 +488,7 @@ class IterationSettings(NamedTuple):
     fixed: bool
     guided: bool
     prior_iterations: int
+    rounding: float
     valley: float = 0.0
     descent: Descent = NO_DESCENT
 

@@ -91,6 +91,8 @@ class Dynamics:
 
     # Whether the dynamics are given as the state after a control period, not as a rate; see `robots/mjcf_dynamics.py`.
     discrete: ClassVar[bool] = False
+    # Relative size of states whose cost is negligible: if the least cost is zero, it is not reached to rounding.
+    rounding: ClassVar[float] = 1e-13
     # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
 

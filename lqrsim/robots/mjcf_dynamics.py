@@ -58,6 +58,7 @@ class MjcfDynamics(Dynamics):
     """
 
     discrete: ClassVar[bool] = True
+    rounding: ClassVar[float] = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
 
     def __init__(
         self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,

@@ -754,7 +754,7 @@ class SolveRun:
         return IterationSettings(
             steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
             gap_tolerance=max(self.settings.gap_tolerance, least_gap), optimal=self.settings.stop == "optimal",
-            fixed=self.work.fixed, guided=False, prior_iterations=0,
+            fixed=self.work.fixed, guided=False, prior_iterations=0, rounding=self.problem.dynamics.rounding**2,
         )  # fmt: skip
 
     def _violation_of(self, plan: Motion) -> float:

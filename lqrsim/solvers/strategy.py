@@ -922,9 +922,10 @@ class Search:
 
     def _idle(self) -> bool:
         """Whether the best plan does nothing, as when no single control helps from rest, but several together would."""
-        found, nominal = self.best[1], self._problem.nominal_controls
+        (run, found), nominal = self.best, self._problem.nominal_controls
         off = np.abs(found.controls - nominal).max()
-        return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
+        costs = found.cost > run.work.memory["negligible"]
+        return found.success and costs and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
     def is_without_plan(self) -> bool:
