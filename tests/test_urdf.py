@@ -367,6 +367,8 @@ def test_what_is_no_urdf_or_no_robot_is_said_in_a_line(
         ({"efforts": {"twin": 3.0}}, "efforts: got 'twin', want one of: shoulder, elbow, grip"),
         ({"efforts": {"elbow": -1.0}}, "efforts of elbow: got -1.0, want"),
         ({"efforts": 3.0}, "efforts: got 3.0, want numbers by joint"),
+        ({"armature": {"wrist": 0.1}}, "armature: got 'wrist', want one of: shoulder, elbow, grip, twin"),
+        ({"armature": -0.1}, "armature of shoulder: got -0.1, want"),
         ({"servos": {"wrist": (1.0, 1.0)}}, "servos: got 'wrist', want one of: shoulder, elbow, grip"),
         ({"servos": {"elbow": 20.0}}, "servos of elbow: got 20.0, want two numbers, the stiffness and the damping"),
         ({"servos": (1.0, 2.0, 3.0)}, "servos of shoulder: got .*, want two numbers"),
@@ -385,6 +387,20 @@ def test_a_follower_of_no_joint_is_named(arm: Path, caplog: pytest.LogCaptureFix
         "arm.urdf: no joint is followed by twin: want a <mimic> of one that turns or slides"
     ]
     assert robot.actuators == ("shoulder", "elbow", "grip", "twin")
+
+
+@pytest.mark.parametrize("armature", [0.03, {"elbow": 0.02, "grip": 0.4}])
+def test_armature_is_on_the_diagonal_of_the_mass_matrix(arm: Path, armature: float | dict[str, float]) -> None:
+    def mass(**stated: Any) -> Array:
+        model = ls.load_scene(arm, **stated).model
+        data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        return full
+
+    names = ("shoulder", "elbow", "grip", "twin")
+    added = [armature.get(name, 0.0) if isinstance(armature, dict) else armature for name in names]
+    np.testing.assert_allclose(mass(armature=armature) - mass(), np.diag(added), rtol=0, atol=1e-12)
 
 
 def test_it_stands_where_a_scenario_is_named(

@@ -152,7 +152,8 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
     Raises:
       InputError: the object is no controller, or there is no plan.
     """
-    check_kind("plan", plan, (Plan, type(None)), "a Plan, such as smooth(problem)")
+    wanted = "a Plan, such as smooth(problem), which may be followed by another policy: controller=policy"
+    check_kind("plan", plan, (Plan, type(None)), wanted)
     if plan is None and isinstance(given, Controller):
         plan = check_kind(f"{type(given).__name__}.plan", given.plan, (Plan, type(None)), "a Plan or None")
     if plan is None:

@@ -38,6 +38,7 @@ def mjcf(
     base: Base | None = None,
     servos: Servos | None = None,
     efforts: Mapping[str, float] | None = None,
+    armature: float | Mapping[str, float] | None = None,
 ) -> Scenario:
     """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
 
@@ -62,14 +63,16 @@ def mjcf(
       base: of a URDF, as in `load_scene`: "fixed" or "free".
       servos: of a URDF, as in `load_scene`: {"shoulder": (200.0, 10.0)}.
       efforts: of a URDF, as in `load_scene`: {"shoulder": 20.0}.
+      armature: of a URDF, as in `load_scene`: 0.01.
 
     Raises:
       InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """
     keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
     mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None
-    is_stated = any(one is not None for one in (base, servos, efforts))
-    file = load_scene(path, base=base, servos=servos, efforts=efforts) if is_stated else path
+    of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts, "armature": armature}
+    is_stated = any(one is not None for one in of_urdf.values())
+    file = load_scene(path, **of_urdf) if is_stated else path
     robot = MjcfRobot(file, body=body, floors=floors, turns_about=turns_about, obstacles=obstacles, mocap=mocap)
     given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
     if given:

@@ -86,6 +86,7 @@ def load_scene(
     base: Base | None = None,
     servos: Servos | None = None,
     efforts: Mapping[str, float] | None = None,
+    armature: float | Mapping[str, float] | None = None,
 ) -> Scene:
     """A packaged scene by name, or any MJCF or URDF by path.
 
@@ -105,12 +106,15 @@ def load_scene(
       servos: of a URDF: stiffness and damping of servos in the place of motors, in N m/rad and N m s/rad, or in N/m and
         N s/m; by joint, {"shoulder": (200.0, 10.0)}, or for all that have an effort, (200.0, 10.0).
       efforts: of a URDF: largest torques in N m, or forces in N, by joint, in the place of the file's; 0 for no motor.
+      armature: of a URDF, which has none: inertias of motors as their joints feel them, with the square of the gear
+        ratio, in kg m^2, or masses in kg; by joint, or one for all. Without, small links with strong motors are shaken
+        by noise that real ones do not feel.
 
     Raises:
       InputError: no such scene or file; it does not parse or compile; there is no geom or joint of such a name; an
         obstacle is of a type without a distance; or a free base with several root links, or one that a joint moves.
     """
-    of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts}
+    of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts, "armature": armature}
     stated = {name: value for name, value in of_urdf.items() if value is not None}
     mjcf = MjcfModel(*read_urdf(name_or_path, **stated)) if stated else MjcfModel.of_file(name_or_path)
     # What moves in a URDF is an MjcfRobot, which has MuJoCo's distances.

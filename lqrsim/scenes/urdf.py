@@ -40,6 +40,7 @@ def read_urdf(
     base: Base = "fixed",
     servos: Servos | None = None,
     efforts: Mapping[str, float] | None = None,
+    armature: float | Mapping[str, float] | None = None,
 ) -> tuple[str, str]:
     """The name of a URDF, and the MJCF that it becomes. Arguments and errors are those of `load_scene`."""
     path = check_path("URDF", file, f"the path of a {SUFFIX} file")
@@ -49,6 +50,7 @@ def read_urdf(
     compiler = {key: value for one in settings if one.tag == "compiler" for key, value in one.attrib.items()}
     _find_meshes(root, path, compiler)
     spec = _read(root, path.name, {key: value for key, value in compiler.items() if key not in _PATHS})
+    _set_armature(spec, path.name, {} if armature is None else armature)
     if base == "free":
         _free_base(spec, path.name)
     mjcf = ElementTree.Element("mujoco", {"model": spec.modelname})
@@ -219,7 +221,7 @@ def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
         if (kind := _kind(joint)) == "free":
             _add(element, "freejoint", {"name": joint.name} if joint.name else {})
             continue
-        numbers = {"damping": joint.damping, "frictionloss": joint.frictionloss}
+        numbers = {"damping": joint.damping, "frictionloss": joint.frictionloss, "armature": joint.armature}
         numbers |= {"axis": joint.axis} if kind != "ball" else {}
         numbers |= {"range": joint.range} if _is_limited(joint) else {}
         _add(element, "joint", {"name": joint.name, "type": kind}, **numbers)
@@ -260,6 +262,14 @@ def _frame(position: Array, quaternion: Array) -> Array:
     mujoco.mju_quat2Mat(turn, quaternion)
     frame[:3, :3], frame[:3, 3] = turn.reshape(3, 3), position
     return frame
+
+
+def _set_armature(spec: mujoco.MjSpec, name: str, armature: float | Mapping[str, float]) -> None:
+    joints = {one.name: one for one in spec.joints if _kind(one) in ("slide", "hinge")}
+    each = armature if isinstance(armature, Mapping) else dict.fromkeys(joints, armature)
+    for joint, inertia in each.items():
+        one = joints[check_name(f"{name}: armature", joint, joints)]
+        one.armature = check_number(f"{name}: armature of {joint}", inertia, at_least=0.0)
 
 
 def _add_actuators(

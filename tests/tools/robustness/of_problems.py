@@ -283,7 +283,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "load_scene": ({"name_or_path": "arena"}, 0.3),
         "load_scene of a URDF": ({
             "call": ls.load_scene, "name_or_path": urdf, "base": "free", "servos": {"pole": (20.0, 1.0)},
-            "efforts": {"pole": 5.0},
+            "efforts": {"pole": 5.0}, "armature": {"pole": 0.01},
         }, 0.3),
         "Scene": ({
             field.name: getattr(place.scenario.scene, field.name) for field in dataclasses.fields(place.scenario.scene)
