@@ -83,6 +83,18 @@ def test_list_names_every_scenario_with_units(capsys: pytest.CaptureFixture[str]
     assert "rotor_1 (N)" in printed
 
 
+def test_list_describes_the_robot_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text("""<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>
+      </worldbody><actuator><motor name="hinge" joint="hinge"/></actuator></mujoco>""", encoding="utf-8")  # fmt: skip
+    assert main(["list", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "  controls: hinge (N m)" in printed
+    assert "  held at rest by: hinge" in printed
+    assert main(["list", "arm.xml"]) == 2
+    assert "arm.xml" in one_line(capsys)
+
+
 def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["solve", "quadrotor,query=2,seed=0", "--out", str(tmp_path), "--stop", "cost",
                  "--figure", str(tmp_path / "policy.pdf")]) == 0  # fmt: skip

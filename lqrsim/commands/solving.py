@@ -28,7 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """Print the scenarios: robot, scene, states and controls with units."""
+    """Print the scenarios, or the given ones: robot, scene, states and controls with units.
+
+    Of an MJCF or a URDF it also prints what holds the robot at rest, its limits, contacts and obstacles.
+    """
+
+    scenarios: Annotated[Positional[tuple[str, ...]], arg(metavar="SCENARIO ...", help_behavior_hint="")] = ()
+    """As for `lqrsim solve`; by default the packaged ones."""
 
     json: Json = False
 
@@ -37,7 +43,7 @@ class List:
         from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import resolve
 
-        found = {name: resolve(name) for name in scenarios.names()}
+        found = {name: resolve(name) for name in self.scenarios or scenarios.names()}
         for name, scenario in found.items():
             problem = scenario.problem
             console.say(f"{name}: {scenario.summary}")
@@ -45,6 +51,8 @@ class List:
             console.say(f"  horizon:  {problem.steps} steps of {problem.dt:.4g} s")
             console.say(f"  states:   {', '.join(problem.dynamics.state_coordinates.labels)}")
             console.say(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
+            for line in str(scenario.robot).splitlines()[2:]:  # of a robot from an MJCF; the first two say the same
+                console.say(line)
         console.result(scenarios=[as_json.of_scenario(name, scenario) for name, scenario in found.items()])
         return 0
 
