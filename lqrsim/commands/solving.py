@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """Print the scenarios, or the given ones: robot, scene, states and controls with units.
+    """Print scenarios: robot, scene, states and controls with units.
 
     Of an MJCF or a URDF it also prints what holds the robot at rest, its limits, contacts and obstacles.
     """
 
     scenarios: Annotated[Positional[tuple[str, ...]], arg(metavar="SCENARIO ...", help_behavior_hint="")] = ()
-    """As for `lqrsim solve`; by default the packaged ones."""
+    """As for `lqrsim solve`, such as the path of a robot; by default the packaged ones."""
 
     json: Json = False
 
