@@ -28,6 +28,15 @@ def changed(was: Mapping[str, str]) -> str:
     )
 
 
+def other_lqrsim(was: Mapping[str, str]) -> str:
+    """The version of lqrsim that made a result, as `lqrsim 0.2.1`, if it is not this one; else empty.
+
+    The hashes of the same problem or robot may then differ.
+    """
+    made = was.get("lqrsim", "")
+    return f"lqrsim {made}" if made and made != versions()["lqrsim"] else ""
+
+
 @cache
 def outdated(extra: str = "") -> str:
     """A line on the packages that are older than lqrsim, or an extra of it, needs; else empty.

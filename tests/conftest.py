@@ -36,7 +36,7 @@ def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
 LONGEST = (
     "kernels", "campaign", "failure_commands", "render", "parking", "process", "docs", "verify", "offset_free",
     "robustness_api", "whole_problems", "mjcf_robot", "demo", "experiments", "approaches", "stated", "given_solutions",
-    "viewer", "smoother", "site",
+    "viewer", "smoother", "site", "report", "comparison", "splitting",
 )  # fmt: skip
 
 

@@ -20,8 +20,10 @@ NOISE = (ls.disturbances.ControlNoise(0.6),)
 
 
 @pytest.fixture(scope="module")
-def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Folders:
-    """Two policies; the same with more trials of one of them; with another seed; with another plan."""
+def campaigns(tmp_path_factory: pytest.TempPathFactory, drive_solution: ls.Solution) -> Folders:
+    """Two policies; the same with more trials of one of them; with another seed; with another plan; and small ones
+    that cannot be compared with it.
+    """
     folder = tmp_path_factory.mktemp("campaigns")
     first = ls.stress.Campaign(
         scenario="differential_drive", sweeps={"noise": NOISE, "late": (ls.disturbances.MeasurementLatency(1),)},
@@ -29,18 +31,21 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     )  # fmt: skip
     problem = ls.scenarios.differential_drive().problem
     plan = ls.smooth(dataclasses.replace(problem, stage_cost=ls.ControlCost((4.0, 4.0)) + problem.obstacle_costs[0]))
+    small = dataclasses.replace(first, sweeps={"noise": NOISE}, strengths=(1.0,), policies=("smooth",), trials=1)
     made = {
-        "first": (first, None),
-        "longer": (dataclasses.replace(first, policies=("open_loop",), trials=15), None),
-        "seed": (dataclasses.replace(first, seed=1, trials=20), None),
-        "plan": (first, plan),
-        "louder": (dataclasses.replace(first, sweeps={"noise": (ls.disturbances.ControlNoise(0.7),)}), None),
-        "nearer": (dataclasses.replace(first, goal_radius=0.05), None),
-        "other": (dataclasses.replace(first, sweeps={"loud": NOISE}), None),
+        "first": first,
+        "longer": dataclasses.replace(first, policies=("open_loop",), trials=15),
+        "seed": dataclasses.replace(first, seed=1, trials=20),
+        "plan": first,
+        "louder": dataclasses.replace(small, sweeps={"noise": (ls.disturbances.ControlNoise(0.7),)}),
+        "nearer": dataclasses.replace(small, goal_radius=0.05),
+        "other": dataclasses.replace(small, sweeps={"loud": NOISE}),
     }
     return {
-        name: ls.stress.run_campaign(asked, folder / name, workers=0, solution=solution)
-        for name, (asked, solution) in made.items()
+        name: ls.stress.run_campaign(
+            asked, folder / name, workers=0, solution=plan if name == "plan" else drive_solution
+        )
+        for name, asked in made.items()
     }
 
 

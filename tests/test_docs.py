@@ -114,11 +114,16 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
         assert ls.render(rollout, tmp_path / "rink.mp4", size=(320, 240), fps=5).stat().st_size > 1000
 
 
-def test_environments_of_gymnasium(capsys: pytest.CaptureFixture[str]) -> None:
+def test_environments_of_gymnasium(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The blocks hold what they assert, and print what they say."""
+    pytest.importorskip("minari", reason="needs the `minari` extra")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     names = run_page("gymnasium.md")
     single, many = capsys.readouterr().out.split("\n", 1)
     assert single == "reached"
+    assert many.endswith("16 (151, 4) (150, 2)\n")
     assert many.count("reached") == len(names["ended"]) == 16
 
 

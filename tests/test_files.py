@@ -104,6 +104,21 @@ def test_the_same_solution_gives_the_same_bytes(tmp_path: Path, saved: Path, dri
     assert ls.save(drive_solution, tmp_path / "again.npz").read_bytes() == saved.read_bytes()
 
 
+@pytest.mark.parametrize(("angles", "version"), [((), 2), ((3,), 2), ((2,), 3)])
+def test_turns_about_an_axis_have_a_version_of_their_own(angles: tuple[int, ...], version: int, tmp_path: Path) -> None:
+    """lqrsim 0.2 wraps each angle and then the whole vector, and refuses another version than 2."""
+    space = ls.types.Coordinates(names=tuple("abcd"), units=("rad",) * 4, rotation_vectors=(0,), angles=angles)
+    controls = ls.types.Coordinates(names=("f",), units=("N",))
+    arrays = {"gain": np.ones((1, 1, 4)), "offset": np.zeros((1, 1)), "nominal": np.zeros((1, 4))}
+    policy = ls.AffinePolicy(**arrays, dt=0.1, state_coordinates=space, control_coordinates=controls)
+    path = ls.save(policy, tmp_path / "policy.npz")
+    assert contents(path)[1]["version"] == version
+    assert same(ls.load(path), policy)
+    rewrite(path, version=5 - version)
+    with pytest.raises(ls.InputError, match=rf"of version {5 - version}, want version {version}: write it again"):
+        ls.load(path)
+
+
 def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solution) -> None:
     """What docs/file_format.md tells people to do elsewhere."""
     with np.load(saved) as archive:
@@ -136,7 +151,7 @@ def _save_bare_array(path: Path) -> None:
         (lambda path: _save_bare_array(path), "which is damaged"),
         (lambda path: path.write_bytes(pickle.dumps({"gain": 1})), "which is damaged"),
         (lambda path: np.savez(path, meta=np.array([{}], dtype=object)), "which is damaged"),
-        (lambda path: rewrite(path, version=1), "of version 1, want version 7"),
+        (lambda path: rewrite(path, version=1), "of version 1, want version 7 or 8"),
         (lambda path: rewrite(path, format="lqrsim rollout"), "holds a 'lqrsim rollout', want a 'lqrsim solution'"),
         (lambda path: rewrite(path, status="great"), r"status: got 'great', want one of: converged"),
         (lambda path: rewrite(path, **{"policy.offset": np.zeros((150, 3))}), r"policy.offset: got shape \(150, 3\)"),
@@ -393,7 +408,7 @@ STATES = "policy.state_coordinates"
         ({"status": None}, "status: got None, want one of: converged"),
         ({"options": {"a": [[[[[[[[1]]]]]]]]}}, "options.*got more nested lists or objects, want at most 6"),
         ({"scenario": ["quadrotor"]}, "scenario: got .*, want text"),
-        ({"version": 4.5}, "of version 4.5, want version 7"),
+        ({"version": 4.5}, "of version 4.5, want version 7 or 8"),
         ({"cost_to_go.gradient": None}, "cost_to_go.gradient: got nothing, want this field"),
         (
             {
@@ -706,3 +721,21 @@ def test_files_are_ordinary_zip_archives(saved: Path) -> None:
     with zipfile.ZipFile(saved) as archive:
         assert archive.testzip() is None
         assert all(name.endswith(".npy") for name in archive.namelist())
+
+
+def test_pickles_of_problems_are_of_one_version(
+    differential_drive: ls.Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of lqrsim 0.2 begin with the class alone; those of now, with the version."""
+    problem = differential_drive.problem
+    for made in (problem, differential_drive, differential_drive.plant(), ls.prepare(problem)):
+        kind, written = type(made), pickle.dumps(made)
+        assert isinstance(pickle.loads(written), kind)
+        of_old = f"\x80\x02c{kind.__module__}\n{kind.__name__}\n)\x81.".encode("latin1")  # as of any plain class
+        with pytest.raises(ls.InputError, match=f"^{kind.__name__}: got no arguments, as from a pickle of another"):
+            pickle.loads(of_old)
+        with monkeypatch.context() as patch:
+            patch.setattr("lqrsim.results.pickles.versions", lambda: {"lqrsim": "9.0"})
+            with pytest.raises(ls.InputError, match=f"^{kind.__name__}: got a pickle of lqrsim .*, want it made anew"):
+                pickle.loads(written)
+    assert pickle.loads(pickle.dumps(problem)).digest == problem.digest

@@ -91,6 +91,7 @@ ALLOWED = {
     "jinja2": ("reports",),
     "tqdm": ("commands",),
     "gymnasium": ("gym",),
+    "minari": ("gym",),
     "rerun": ("view",),
     "cyclonedds": ("bridge",),
 }

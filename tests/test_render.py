@@ -90,10 +90,9 @@ def test_pictures_have_the_obstacles_where_they_were_in_the_trial(kind: str, see
 @pytest.mark.parametrize(
     ("kind", "size", "area"),
     [
-        ("sphere", (0.2, 0, 0), np.pi * 0.04),
-        ("cylinder", (0.1, 0.3, 0), np.pi * 0.01),  # upright, seen from above
         ("box", (0.2, 0.1, 0.05), 0.08),
-        ("capsule", (0.1, 0.2, 0), np.pi * 0.01),
+        ("capsule", (0.1, 0.2, 0), np.pi * 0.01),  # upright, seen from above
+        *rarely(("sphere", (0.2, 0, 0), np.pi * 0.04), ("cylinder", (0.1, 0.3, 0), np.pi * 0.01)),
     ],
 )
 def test_obstacles_that_move_are_drawn_where_they_are(

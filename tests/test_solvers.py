@@ -278,7 +278,7 @@ class TestEndings:
 
 class TestMany:
     @pytest.mark.parametrize("many", [ls.smooth_many, ls.ilqr_many])
-    @pytest.mark.parametrize("threads", [1, 2, 5])
+    @pytest.mark.parametrize("threads", [1, 5, *rarely(2)])
     def test_each_is_what_one_would_be_to_the_last_bit(self, many, threads: int) -> None:
         one = {ls.smooth_many: ls.smooth, ls.ilqr_many: ls.ilqr}[many]
         problems = [ls.scenarios.quadrotor(query=query).problem for query in range(6)]
@@ -364,7 +364,7 @@ class TestProgress:
         first = next(line for line in told if not line.startswith("compiling "))  # if nothing is cached
         assert re.fullmatch(r"smooth: \d+ s, in the first iteration; at most 5000 s left", first)
 
-    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    @pytest.mark.parametrize("solver", [ls.smooth, *rarely(ls.ilqr)])
     def test_it_says_how_long_it_compiled_if_that_does_not_count(
         self, solver: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:

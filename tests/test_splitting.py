@@ -347,7 +347,7 @@ def docked(gap: float, folder: Path) -> tuple[ls.Plant, ls.Solution]:
     return ls.Plant(robot, scene), ls.smooth(problem)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *rarely(1, 2)])
 def test_a_start_beside_an_obstacle_hides_no_failure(seed: int, tmp_path: Path) -> None:
     """Against plain trials. Nearly all have their least clearance at the start, which tells nothing."""
     gap = np.random.default_rng(seed).uniform(0.005, 0.04)

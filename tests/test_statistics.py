@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sampling import rarely
 from scipy import optimize, stats
 
 import lqrsim as ls
@@ -179,8 +180,8 @@ def test_fisher_s_test_is_the_sum_of_tables_that_are_no_more_likely(case: tuple[
     assert independent_difference((k, n), (other, m))[1] == pytest.approx(wanted, rel=1e-9)
 
 
-@pytest.mark.parametrize("trials", [(20, 20), (20, 50)])
-@pytest.mark.parametrize(("first", "second"), [(0.98, 0.97), (0.9, 0.7), (0.5, 0.5), (0.9, 0.1)])
+@pytest.mark.parametrize("trials", [(20, 50), *rarely(((20, 20),))])
+@pytest.mark.parametrize(("first", "second"), [(0.98, 0.97), (0.9, 0.1), *rarely((0.9, 0.7), (0.5, 0.5))])
 def test_differences_of_independent_rates_cover(trials: tuple[int, int], first: float, second: float) -> None:
     """Summed over all outcomes. A score interval covers 95 % in the mean, and nowhere here less than 93 %."""
     covered = 0.0

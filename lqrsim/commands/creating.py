@@ -1,18 +1,19 @@
-"""Commands that write source files: a new robot, or a policy as C."""
+"""Commands that write files for other tools: a new robot, a policy as C, runs as a data set of Minari."""
 
 import builtins
 import importlib.util
 import keyword
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Json
+from lqrsim.commands.options import Json, optional
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
+OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
 TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
 # Names with another meaning: those used in the written files, MuJoCo's first body, pytest's own file, Windows' devices.
 TAKEN = {
@@ -62,45 +63,107 @@ class New:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a policy as C99, for a microcontroller.
+    """Write a policy as C99, or runs as a data set of Minari.
 
-    The folder gets a header and a source file that need math.h alone and allocate nothing, an example that compares
-    commands with Python's, and a CMake file for this machine and for an STM32F405, which QEMU emulates.
-    docs/microcontrollers.md says how to put it on a Crazyflie or into PX4.
+    With --c, for a microcontroller, the folder gets a header and a source file that need math.h alone and allocate
+    nothing, an example that compares commands with Python's, and a CMake file for this machine and for an STM32F405,
+    which QEMU emulates. docs/microcontrollers.md says how to put it on a Crazyflie or into PX4.
+
+    With --minari, to learn from, each trial becomes an episode; see docs/gymnasium.md. The data set is written to the
+    folder of Minari, which MINARI_DATASETS_PATH names.
 
       lqrsim export runs/quadrotor/solution.npz --c firmware/policy
       cmake -S firmware/policy -B build && cmake --build build && ctest --test-dir build
+      lqrsim export runs/quadrotor/rollout.npz --minari quadrotor/light-v0
+      lqrsim export runs/stress/quadrotor --minari quadrotor/stressed-v0 --cell smooth,light,1
     """
 
-    policy: Annotated[Positional[Path], arg(metavar="POLICY.npz")]
-    """A file from `lqrsim solve`, or a policy from `ls.save`: of ls.track, or of ls.OffsetFree with its filter."""
-    c: Annotated[Path, arg(metavar="FOLDER")]
+    source: Annotated[Positional[Path], arg(metavar="FILE.npz|FOLDER")]
+    """For --c a file from `lqrsim solve`, or a policy from `ls.save`: of ls.track, or of ls.OffsetFree with its filter.
+    For --minari a file from `lqrsim simulate`, or a folder from `lqrsim stress`, whose trials are run again."""
+    c: Annotated[Path | None, optional("FOLDER")] = None
     """Folder for the C files. Files of their names are replaced."""
     number: Literal["float", "double"] = "float"
-    """Type of the numbers, except the time, which is a double."""
+    """Type of the numbers in C, except the time, which is a double."""
     gains: Literal["full", "int16"] = "full"
-    """int16: matrices take 16 bits an entry. The largest change of the commands is printed and in the header."""
+    """int16: matrices in C take 16 bits an entry. The largest change of the commands is printed and in the header."""
     interpolate: bool = False
-    """Blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
+    """In C, blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
     name: str = "policy"
-    """Name of the files and the functions: lower-case letters, digits and underscores."""
+    """Name of the C files and functions: lower-case letters, digits and underscores."""
+    minari: Annotated[str | None, optional("NAMESPACE/NAME-vVERSION")] = None
+    """Name of the data set, which must be new."""
+    actions: Literal["normalized", "controls"] = "normalized"
+    """Of the data set: from -1 to 1 between the limits of each control, or in the controls' own units."""
+    cell: Annotated[tuple[str, ...], optional("CELL ...")] = ()
+    """Cells of a stress test, as in `lqrsim replay`. By default all."""
+    solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
+    """Solution of the run. By default solution.npz beside it."""
+    scenario: Annotated[str | None, optional("SCENARIO")] = None
+    """Scenario of the run, for the rewards, as in `lqrsim simulate` or `lqrsim replay`."""
     json: Json = False
 
     def run(self) -> int:
+        from lqrsim.errors import InputError
+
+        if (self.c is None) == (self.minari is None):
+            raise InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
+        unused, target = (OF_C, "--c") if self.c is None else (OF_MINARI, "--minari")
+        if given := [one.name for one in fields(self) if one.name in unused and getattr(self, one.name) != one.default]:
+            raise InputError(f"--{given[0]}: got {getattr(self, given[0])} without {target}, want it with that")
+        if self.c is not None:
+            self._to_c(self.c)
+        if self.minari is not None:
+            self._to_minari(self.minari)
+        return 0
+
+    def _to_c(self, folder: Path) -> None:
         from lqrsim.commands import console
         from lqrsim.results import save_load
         from lqrsim.results.export_c import export_c
 
-        console.check_output("--c", self.c)
-        policy: Any = save_load.load(self.policy)  # `export_c` refuses anything that cannot be exported
+        console.check_output("--c", folder)
+        policy: Any = save_load.load(self.source)  # `export_c` refuses anything that cannot be exported
         found = export_c(
-            policy, self.c, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
+            policy, folder, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
         )
         for path in found.files:
             console.wrote(path)
         console.say(found.summary())
         console.result(sha256=found.sha256, table_bytes=found.table_bytes, rounding=found.rounding)
-        return 0
+
+    def _to_minari(self, name: str) -> None:
+        from lqrsim.commands import console
+        from lqrsim.errors import InputError
+        from lqrsim.results import save_load
+        from lqrsim.results.rollout import Rollout
+        from lqrsim.stress.results import Results, replay
+        from lqrsim.stress.specification import Cell
+
+        try:
+            from lqrsim.gym import make_env, write_minari
+        except ImportError as error:
+            raise InputError(f"--minari: {error}, and 'lqrsim[minari]'") from None
+        if self.source.is_dir():
+            results = Results(self.source, scenario=self.scenario)
+            cells = [Cell.named(one, results.cells) for one in self.cell] or results.cells
+            shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
+            runs = (replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
+            solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
+            named = self.scenario or results.manifest["campaign"]["scenario"]
+            _ = results.resolved  # raises an exception if that is code which was not named
+        else:
+            if self.cell:
+                raise InputError(f"--cell: got {self.cell[0]} with {self.source}, want the folder of a stress test")
+            runs = save_load.load(self.source, Rollout)
+            solution = self.solution or self.source.with_name("solution.npz")
+            named = self.scenario or console.load_with_scenario(solution, None)[0].scenario
+        # A path as text, from which `recover_environment` can make it.
+        env = make_env(named, solution=str(solution.absolute()), actions=self.actions)
+        found = write_minari(name, env, runs)
+        console.wrote(found.spec.data_path)
+        console.say(f"{found.total_episodes} episodes of {found.total_steps} control periods")
+        console.result(episodes=found.total_episodes, steps=found.total_steps)
 
 
 def check_robot_name(name: str) -> None:

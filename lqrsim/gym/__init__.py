@@ -19,9 +19,10 @@ except ModuleNotFoundError as error:
     raise ImportError(f"lqrsim.gym: {error}; run: pip install 'lqrsim[gym]'") from None
 
 from lqrsim.gym.environment import Environment, Expert, VectorEnvironment
+from lqrsim.gym.minari_data import write_minari
 from lqrsim.scenarios.packaged import Scenario
 
-__all__ = ["Environment", "Expert", "VectorEnvironment", "make_env", "make_vec"]
+__all__ = ["Environment", "Expert", "VectorEnvironment", "make_env", "make_vec", "write_minari"]
 
 SCENARIOS = {"lqrsim/Quadrotor-v0": "quadrotor", "lqrsim/DifferentialDrive-v0": "differential_drive"}
 ANY = "lqrsim/Scenario-v0"

@@ -40,6 +40,7 @@ from lqrsim.problem.plain_term import violated
 from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
+from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
 
@@ -95,7 +96,7 @@ class FixedState:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Problem:
+class Problem(OneVersion):
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
 
     Attributes:

@@ -194,8 +194,10 @@ class Archive:
 
 
 @contextlib.contextmanager
-def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterator[Archive]:
-    """Open a file of this kind, or of any in `versions`. Exceptions in the block are reported as faults of the file.
+def opened(path: Path, kind: str | None, versions: Mapping[str, tuple[int, ...]]) -> Iterator[Archive]:
+    """Open a file of this kind, or of any in `versions`, in one of its versions there.
+
+    Exceptions in the block are reported as faults of the file.
 
     Raises:
       InputError: the file does not exist, has another kind or version, or is damaged.
@@ -208,11 +210,16 @@ def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterato
         if said not in wanted:
             names = " or ".join(repr(one) for one in wanted)
             raise Other(f"{field}: got {path}, which holds a {excerpt(said)}, want a {names}")
-        version = versions[str(said).removeprefix("lqrsim ")]
-        if found.meta.get("version") != version:
-            was = excerpt(found.meta.get("version"))
-            raise Other(f"{field}: got {path} of version {was}, want version {version}: write it again")
+        known = versions[str(said).removeprefix("lqrsim ")]
+        if (version := found.meta.get("version")) not in known:
+            raise of_other_version(path, field, version, known)
         yield found
+
+
+def of_other_version(path: Path, field: str, version: object, known: tuple[int, ...]) -> Other:
+    """The exception for a file of another version than the known ones."""
+    want = " or ".join(map(str, known))
+    return Other(f"{field}: got {path} of version {excerpt(version)}, want version {want}: write it again")
 
 
 @contextlib.contextmanager

@@ -14,8 +14,19 @@ from typing import Any, TypeVar, get_args, get_origin, overload
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
-from lqrsim.results.archive import Arrays, Header, anything, canonical, digest, opened, parse, write
+from lqrsim.results.archive import (
+    Arrays,
+    Header,
+    anything,
+    canonical,
+    digest,
+    of_other_version,
+    opened,
+    parse,
+    write,
+)
 from lqrsim.results.certificate import FailureCertificate
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -37,7 +48,9 @@ FORMATS: dict[type, tuple[str, int]] = {
     Funnel: ("funnel", 2),
     FailureCertificate: ("certificate", 2),
 }
-VERSIONS = dict(FORMATS.values())
+# A file in which an entry of a rotation vector is an angle, a turn about its axis, has the next version, for lqrsim 0.2
+# would read it as part of the vector. When a version is raised, it is by two.
+VERSIONS = {name: (version, version + 1) for name, version in FORMATS.values()}
 # Fields that older files of the same version lack.
 LATER = {
     (Certificate, "contacts"),
@@ -87,7 +100,7 @@ def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
         raise InputError(f"result: got a {name}, {reason}, want an unchanged result of lqrsim") from None
-    return arrays, {"format": f"lqrsim {name}", "version": version, **tree}
+    return arrays, {"format": f"lqrsim {name}", "version": version + _has_turns(result), **tree}
 
 
 @overload
@@ -124,7 +137,17 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         record = _record(kind, tree, "", arrays)
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want it mentioned there")
+        if (version := archive.meta["version"]) != (own := VERSIONS[found][_has_turns(record)]):
+            raise of_other_version(path, found, version, (own,))
         return record
+
+
+def _has_turns(value: Any) -> bool:
+    """Whether coordinates in a record have a rotation vector of which one entry is an angle."""
+    if isinstance(value, Coordinates):
+        return max(value.turns, default=-1) >= 0
+    inside = (getattr(value, name) for name in declarations(type(value))) if is_dataclass(value) else value
+    return any(map(_has_turns, inside)) if is_dataclass(value) or isinstance(value, tuple) else False
 
 
 def tree_of(record: Any) -> dict[str, Any]:

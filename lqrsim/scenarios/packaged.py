@@ -24,6 +24,7 @@ from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.results.goal import Target
+from lqrsim.results.pickles import OneVersion
 from lqrsim.results.solution import Solution
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
@@ -36,7 +37,7 @@ from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, r
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scenario:
+class Scenario(OneVersion):
     """A robot in a scene with a problem.
 
     Attributes:

@@ -21,6 +21,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.initial_guess import InitialPrior, is_function, resolve
 from lqrsim.solvers.smoother import smooth
+from lqrsim.versions import other_lqrsim
 
 SOLVERS: Mapping[str, Callable[..., Solution]] = {"smooth": smooth, "ilqr": ilqr}
 
@@ -140,7 +141,11 @@ def difference(solution: Solution, problem: Problem) -> str:
     ]
     text = "; ".join(named)
     text = text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
-    return f": {text}" if named else ", in numbers that a description of it leaves out"
+    if named:
+        return f": {text}"
+    if older := other_lqrsim(solution.versions):
+        return f", or of the same: it is described alike, but {older} hashes problems otherwise; solve it again to know"
+    return ", in numbers that a description of it leaves out"
 
 
 def _differing(*texts: str) -> list[str]:

@@ -16,6 +16,7 @@ from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_kind, check_number, check_text, shaped, vectors_of
 from lqrsim.problem.collision_shape import shape_in
+from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_kinematics
@@ -33,7 +34,7 @@ MOST_SUBSTEPS = 20_000  # physics steps in a control period
 Indices = npt.NDArray[np.intp]
 
 
-class Plant:
+class Plant(OneVersion):
     """A robot in a scene, ready to run.
 
     Attributes:

@@ -27,6 +27,7 @@ from lqrsim.results.solution_parts import Curvature, Status
 from lqrsim.solvers.curvature import AT_ZERO, HELD
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.stages import Stages
+from lqrsim.versions import other_lqrsim
 
 # Step of the differences, relative to a parameter's scale. The error of a central difference is about its square, that
 # of rounding is 1e-16 of the cost divided by it: both are below 1e-8 where the cost changes in proportion.
@@ -100,9 +101,8 @@ def gradients(
     _check_solution(solution, plan)
     problem = _made(make, point)
     if problem.digest != solution.problem_digest:
-        raise InputError(
-            "solution: got one of another problem, or with limits of forces refined, want that of make(at)"
-        )
+        how = other_lqrsim(solution.versions) or "limits of forces refined"
+        raise InputError(f"solution: got one of another problem, or with {how}, want that of make(at)")
     optimum = _Optimum(problem, solution)
 
     def difference(k: int, step: float) -> list[Array]:

@@ -12,6 +12,7 @@ from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.pickles import OneVersion
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
@@ -85,7 +86,7 @@ def prepare(
     return PreparedSolver(problem, settings, check_threads(threads))
 
 
-class PreparedSolver:
+class PreparedSolver(OneVersion):
     """A solver for problems of one structure, from one state after another; `prepare` makes it.
 
     Attributes:

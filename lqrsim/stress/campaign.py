@@ -63,7 +63,7 @@ from lqrsim.stress.policies import (
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import Campaign, Shard
 from lqrsim.stress.trials import Job
-from lqrsim.versions import changed, versions
+from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
 
@@ -266,7 +266,11 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
         ("start", "start"),
     ):  # fmt: skip
         if specification[field] != manifest[field]:
-            raise InputError(f"scenario: got a {what} other than the one {folder} was begun with, want another folder")
+            older = other_lqrsim(manifest["versions"])
+            older = f", or with the hashes of {older}" if older else ""
+            raise InputError(
+                f"scenario: got a {what} other than the one {folder} was begun with{older}, want another folder"
+            )
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / GIVEN

@@ -392,17 +392,19 @@ def replay(
     cell: Cell,
     trial: int,
     *,
+    trials: int = 1,
     frames: bool = True,
     contacts: bool = True,
 ) -> Rollout:
-    """Run a trial of a campaign again: bit-identical until it ends, and without contacts until the plan ends.
+    """Run trials of a campaign again: bit-identical until they end, and without contacts until the plan ends.
 
     It needs the kind of processor and the versions in `results.manifest["versions"]`.
 
     Args:
       results: the campaign.
       cell: one of its cells.
-      trial: number of the trial, from 0.
+      trial: number of the first trial, from 0.
+      trials: number of trials.
       frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
 
@@ -413,9 +415,11 @@ def replay(
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
     frames, contacts = check_flag("frames", frames), check_flag("contacts", contacts)
-    if check_count("trial", trial, at_least=0) >= results.manifest["campaign"]["trials"]:
-        raise InputError(f"trial: got {trial}, want less than {results.manifest['campaign']['trials']}")
-    return results.trials.run(cell, trial, frames=frames, contacts=contacts)
+    each = results.manifest["campaign"]["trials"]
+    if check_count("trial", trial, at_least=0) >= each:
+        raise InputError(f"trial: got {trial}, want less than {each}")
+    check_count("trials", trials, at_most=each - trial)
+    return results.trials.run(cell, trial, trials, frames=frames, contacts=contacts)
 
 
 def row(results: Results, cell: Cell, trial: int) -> dict[str, Any]:

@@ -1,6 +1,9 @@
 """Arguments that public callables accept: environments of Gymnasium. See `subjects.py`."""
 
+import os
+import tempfile
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -27,6 +30,11 @@ def environments(place: Place) -> dict[str, tuple[Any, ...]]:
         many.reset(seed=0)
         return many.step(actions)
 
+    def write(**arguments: Any) -> None:
+        """Where nothing is yet, and nobody looks."""
+        with tempfile.TemporaryDirectory() as empty, mock.patch.dict(os.environ, MINARI_DATASETS_PATH=empty):
+            lqrsim.gym.write_minari(**arguments)
+
     return {
         "gym.make_env": (scenario | options, 0.3),
         "gym.make_vec": (scenario | {"num_envs": 2} | options, 0.3),
@@ -40,4 +48,5 @@ def environments(place: Place) -> dict[str, tuple[Any, ...]]:
         "gym.VectorEnvironment.step": ({"call": step_many, "actions": np.zeros((2, 2))},),
         "gym.Expert": ({"env": made, "controller": place.solution.policy},),
         "gym.Expert.__call__": ({"call": expert, "observation": seen},),
+        "gym.write_minari": ({"call": write, "name": "tiny/run-v0", "env": made, "rollouts": place.rollout},),
     }  # fmt: skip
