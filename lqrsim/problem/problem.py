@@ -514,8 +514,9 @@ class Problem:
         Returns:
           Name -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in seconds; zeros
           for a trial that violates it by at most 1e-6. Names do not depend on the runs or on the constraints' numbers:
-          "StateBounds: x low", "GoalState: x", "SymbolicConstraint: NAME" of the function, with "[0]" for the first of
-          several entries. If an earlier constraint has the same name, " (2)" follows, and so on.
+          "StateBounds: x low", "GoalState: x", "SymbolicConstraint: NAME", its `name` or that of the function, with "[0]"
+          for the first of several entries. Only a lambda without a name is called by its expressions, which may have
+          numbers. If an earlier constraint has the same name, " (2)" follows, and so on.
 
         Raises:
           InputError: the runs have other states, controls or steps.
