@@ -212,22 +212,23 @@ def own_functions() -> SimpleNamespace:
         is_commutative = True  # a condition says nothing of it
 
         @classmethod
-        def eval(cls, condition: Any, one: Any, other: Any) -> Any:
+        def eval(cls, *args: Any) -> Any:
+            condition, one, other = args
             if condition in (True, False):
                 return one if condition else other
             return one if one == other else None
 
-        def _eval_derivative(self, s: Any) -> Any:
+        def _eval_derivative(self: Any, s: Any) -> Any:
             condition, one, other = self.args
             return choice(condition, one.diff(s), other.diff(s))
 
     class max(sympy.Function):
-        def _eval_derivative(self, s: Any) -> Any:
+        def _eval_derivative(self: Any, s: Any) -> Any:
             a, b = self.args
             return choice(sympy.Gt(b, a, evaluate=False), b.diff(s), a.diff(s))
 
     class min(sympy.Function):
-        def _eval_derivative(self, s: Any) -> Any:
+        def _eval_derivative(self: Any, s: Any) -> Any:
             a, b = self.args
             return choice(sympy.Lt(b, a, evaluate=False), b.diff(s), a.diff(s))
 

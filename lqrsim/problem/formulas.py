@@ -25,7 +25,6 @@ from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 
-
 MOST_LETTERS = 60  # of an expression that stands for a name: half a line
 
 
