@@ -1,11 +1,13 @@
-"""Second derivatives of formulas, against SymPy's of the formulas written out, recurrences and differences."""
+"""Second derivatives of formulas, against differences with many digits, and recurrences."""
 
+import functools
 import hashlib
 import itertools
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import mpmath
@@ -14,14 +16,13 @@ import pytest
 import sympy
 from altro.airplane import airplane
 from compiling import run
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples
 from sympy import Abs, Heaviside, Max, Min, Mod, Piecewise, atan2, cos, exp, floor, log, sign, sin, sqrt, tanh
 
 import lqrsim as ls
 from lqrsim import rotations
-from lqrsim.codegen import symbolic
 from lqrsim.codegen.edge_pushing import weighted_hessian
 from lqrsim.errors import Array
 
@@ -79,28 +80,31 @@ def compiled_hessian(dynamics: ls.Dynamics, x: Array, u: Array, weights: Array) 
     return found
 
 
-def ratio_in_digits(name: str) -> Callable[[Any], Any]:
-    """`sine_ratio` and the others, and their derivatives, with many digits."""
-    base, _, order = name.partition("_d")
-    angle = {
+def exact_hessian(formulas: list[Any], weights: Array, symbols: list[Any], at: Array, size: int) -> Array:
+    """By second differences with 60 digits of SymPy's own functions, whose error is some 1e-25."""
+    angles = {
         "sine_ratio": lambda r: mpmath.sin(r) / r,
         "cosine_ratio": lambda r: (1 - mpmath.cos(r)) / r**2,
         "cotangent_ratio": lambda r: (1 - r / 2 * mpmath.cot(r / 2)) / r**2,
-    }[base]
-    return lambda s: mpmath.diff(lambda square: angle(mpmath.sqrt(square)), s, int(order or 0))
+    }
+    known = {name: lambda s, of=of: of(mpmath.sqrt(s)) for name, of in angles.items()}
+    known["Heaviside"] = lambda a, half=0.5: (1 + mpmath.sign(a)) / 2
+    function = sympy.lambdify(symbols, formulas, modules=[known, "mpmath"], cse=True)
+    step = mpmath.mpf(10) ** -15
+    with mpmath.workdps(60):
+        weighed, point = ([mpmath.mpf(float(one)) for one in numbers] for numbers in (weights, at))
 
+        def value(*moves: tuple[int, int]) -> Any:
+            moved = point[:]
+            for i, sign in moves:
+                moved[i] += sign * step
+            return mpmath.fdot(weighed, function(*moved))
 
-def exact_hessian(formulas: list[Any], weights: Array, variables: list[Any], symbols: list[Any], at: Array) -> Array:
-    """That of the formulas written out, by SymPy, evaluated with 40 digits."""
-    names = [name + end for name in rotations.RATIOS for end in ("", "_d1", "_d2")]
-    modules = [{name: ratio_in_digits(name) for name in names}, "mpmath"]
-    total = sympy.Add(*[sympy.Float(float(w), 40) * one for w, one in zip(weights, formulas, strict=True)])
-    with mpmath.workdps(40):
-        entries = [[symbolic.smooth_almost_everywhere(total.diff(a).diff(b)) for b in variables] for a in variables]
-        # SymPy puts a case's zero into another case, where it does not apply: its logarithm is infinite.
-        assume(not any(entry.has(sympy.zoo, sympy.nan) for row in entries for entry in row))
-        values = sympy.lambdify(symbols, entries, modules=modules)(*[mpmath.mpf(float(one)) for one in at])
-    return np.array([[float(one) for one in row] for row in values])
+        wanted = np.zeros((size, size))
+        for i, j in itertools.combinations_with_replacement(range(size), 2):
+            ends = [one * other * value((i, one), (j, other)) for one in (1, -1) for other in (1, -1)]
+            wanted[i, j] = wanted[j, i] = float(mpmath.fsum(ends) / (4 * step**2))
+    return wanted
 
 
 @settings(max_examples=examples(60))
@@ -110,9 +114,8 @@ def test_of_drawn_formulas(draw: st.DataObject, seed: int) -> None:
     symbols = list(sympy.symbols("x0 x1 u0 p0", real=True))
     formulas = drawn(lambda count: draw.draw(st.integers(0, count - 1)), symbols)
     dynamics = dynamics_of(formulas, symbols)
-    traced, *_ = dynamics._traced()  # with remainders and jumps worked out
     at, weights = np.append(rng.uniform(-1, 1, 3), 0.7), rng.uniform(-1, 1, 2)
-    wanted = exact_hessian(traced, weights, symbols[:3], symbols, at)
+    wanted = exact_hessian(formulas, weights, symbols, at, 3)
     found = compiled_hessian(dynamics, at[:2].copy(), at[2:3].copy(), weights)
     # Some hundred operations on numbers of size 1, whose derivatives grow.
     np.testing.assert_allclose(found, wanted, atol=1e-11 * max(1.0, np.abs(wanted).max()))
@@ -154,6 +157,31 @@ def test_a_case_that_does_not_apply_may_be_undefined() -> None:
     np.testing.assert_allclose(found, [[second, 0.25, 9.0], [0.25, 0, 0], [9.0, 0, 0]], rtol=1e-13)
 
 
+def test_extremes_of_dozens() -> None:
+    """SymPy compares all pairs of arguments, for hours with these. At a kink a slope is that of one side."""
+    rng = np.random.default_rng(3)
+    sides, levels = rng.normal(size=(40, 2)), rng.uniform(0.1, 1, 40)
+
+    def rates(x: Any, u: Any, p: Any) -> list[Any]:
+        planes = [a * x.a + b * x.b - c for (a, b), c in zip(sides.tolist(), levels.tolist(), strict=True)]
+        return [Max(*planes), functools.reduce(Min, planes) + Max(u.c, -sympy.oo), Abs(x.a) * x.b - Max(x.a, 2 * x.a)]
+
+    dynamics = ls.Dynamics(rates, states={"a": "", "b": "", "d": ""}, controls={"c": ""})
+    for x in [*rng.normal(size=(5, 3)), np.array([0.0, 0.7, 0.0])]:
+        planes, (a, b, _) = sides @ x[:2] - levels, x
+        # Numbers of formulas are written with 15 digits.
+        np.testing.assert_allclose(
+            dynamics.rate(x, [0.3]), [planes.max(), planes.min() + 0.3, abs(a) * b - max(a, 2 * a)], rtol=1e-13
+        )
+        fx, fu = dynamics.rate_jacobian(x, [0.3])
+        np.testing.assert_allclose(fx[:2, :2], sides[[planes.argmax(), planes.argmin()]], rtol=1e-14)
+        np.testing.assert_array_equal(fu, [[0], [1], [0]])
+        if a:
+            np.testing.assert_allclose(fx[2], [np.sign(a) * b - (2 if a > 0 else 1), abs(a), 0], atol=1e-15)
+        else:  # between -b - 1 and b - 2, of which Abs has the mean and Max one
+            assert fx[2, 0] in (-1, -2)
+
+
 def test_the_effort_grows_with_the_number_of_operations() -> None:
     """Each turn of a map uses the last value twice: written out, ten turns are thousands of operations."""
     x, weight = sympy.symbols("x0 w0", real=True)
@@ -179,27 +207,15 @@ def test_the_effort_grows_with_the_number_of_operations() -> None:
 
 @pytest.mark.long
 def test_of_an_aeroplane() -> None:
-    """The largest formula of the experiments, by second differences with 60 digits, whose error is some 1e-25."""
+    """The largest formula of the experiments."""
     dynamics = airplane()
-    rates, x, u = dynamics._traced()
+    symbols = sympy.symbols("x:17", real=True)
+    rates = dynamics.f(symbols[:13], symbols[13:], SimpleNamespace(**dynamics.parameters))
     rng = np.random.default_rng(0)
     attitude, speed = rng.normal(size=4), np.array([6.0, 0.5, -0.4])
     at = np.concatenate([rng.normal(size=3), attitude, speed, rng.normal(size=3), [90.0, 100.0, 110.0, 95.0]])
-    weights, size, step = rng.normal(size=13), 17, mpmath.mpf(10) ** -15
-    with mpmath.workdps(60):
-        function = sympy.lambdify([*x, *u], rates, modules="mpmath", cse=True)
-        weighed, point = [mpmath.mpf(float(one)) for one in weights], [mpmath.mpf(float(one)) for one in at]
-
-        def value(*moves: tuple[int, int]) -> Any:
-            moved = point[:]
-            for i, sign in moves:
-                moved[i] += sign * step
-            return mpmath.fdot(weighed, function(*moved))
-
-        wanted = np.zeros((size, size))
-        for i, j in itertools.combinations_with_replacement(range(size), 2):
-            ends = [one * other * value((i, one), (j, other)) for one in (1, -1) for other in (1, -1)]
-            wanted[i, j] = wanted[j, i] = float(mpmath.fsum(ends) / (4 * step**2))
+    weights = rng.normal(size=13)
+    wanted = exact_hessian(rates, weights, list(symbols), at, 17)
     found = compiled_hessian(dynamics, at[:13].copy(), at[13:].copy(), weights)
     np.testing.assert_allclose(found, wanted, atol=1e-12 * np.abs(wanted).max())
 

@@ -992,6 +992,13 @@ class TestParts:
                 replay(source, SIZES, "noise_quadratic", X, U, numbers_of(term), risky, ahead, 0, stage)
                 replay(source, SIZES, "noise_value", X, U, numbers_of(term), risky, ahead)
 
+    def test_a_map(self) -> None:
+        def after(x, u, p):
+            return [x[0] * u[0], x[1] + u[1] ** 2, x[2] * x[0] ** 2]
+
+        sides = {"x": "", "y": "", "h": ""}, {"v": "", "w": ""}
+        self.steps(ls.Dynamics(after, states=sides[0], controls=sides[1], period=0.1), X, U, 0.1)
+
     @pytest.mark.parametrize("given", [False, True])
     def test_dynamics_that_are_functions(self, given: bool) -> None:
         def rate(x, u, p):

@@ -95,32 +95,33 @@ def by_differences(dynamics: ls.Dynamics, x: Array, u: Array, weights: Array, dt
 
 class TestSecondDerivatives:
     @settings(max_examples=examples(15))
-    @given(seed=st.integers(0, 2**32 - 1), which=st.sampled_from(["drive", "quadrotor", "pendulum"]))
+    @given(seed=st.integers(0, 2**32 - 1), which=st.sampled_from(["drive", "quadrotor", "pendulum", "map"]))
     def test_of_formulas(self, seed: int, which: str) -> None:
         rng = np.random.default_rng(seed)
         dynamics = {"drive": ls.DifferentialDrive().dynamics, "quadrotor": ls.Quadrotor().dynamics}.get(which)
-        dynamics = pendulum() if dynamics is None else dynamics
+        dt = rng.uniform(0.01, 0.2)
+        dynamics = pendulum(period=dt if which == "map" else None) if dynamics is None else dynamics
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         # Rotations of up to 3 rad: within and beyond where the ratios of an angle are series.
         x, u, weights = rng.uniform(-1.5, 1.5, n), rng.uniform(-2, 2, m), rng.normal(size=n)
-        dt = rng.uniform(0.01, 0.2)
         found = second_derivatives(dynamics, x, u, weights, dt)
         wanted = by_differences(dynamics, x, u, weights, dt)
         np.testing.assert_allclose(found, found.T, atol=1e-12)
         # Central differences with a step of 1e-5 are good to some 1e-10 of the function's size, and to rounding.
         np.testing.assert_allclose(found, wanted, atol=1e-7 * max(1.0, np.abs(wanted).max()))
 
+    @pytest.mark.parametrize("period", [None, *rarely(0.1)])
     @pytest.mark.parametrize("level", ["plain", "plain with Jacobian", "a formula that is too long"])
-    def test_by_differences(self, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_by_differences(self, level: str, period: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(dynamics_module, "MOST_STEPS", 3)
         if level.startswith("plain"):
             given = slope_in_numbers if "Jacobian" in level else None
-            dynamics = pendulum(swing_in_numbers, level="plain", jacobian=given)
+            dynamics = pendulum(swing_in_numbers, level="plain", jacobian=given, period=period)
         else:
-            dynamics = pendulum()
+            dynamics = pendulum(period=period)
         x, u, weights = np.array([0.7, -1.3]), np.array([0.4]), np.array([0.3, -2.0])
         found = second_derivatives(dynamics, x, u, weights, 0.1)
-        wanted = by_differences(pendulum(), x, u, weights, 0.1)
+        wanted = by_differences(pendulum(period=period), x, u, weights, 0.1)
         assert dynamics.curvature_source is not None
         assert "differences" in repr(dynamics.curvature_source)
         # Second differences with a step of 1e-4 leave some 1e-8, and rounding as much.

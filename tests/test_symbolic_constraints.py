@@ -319,6 +319,10 @@ class TestInfeasible:
             ([ls.GoalState([1, 0])], "the goal of 1 m for x is missed by"),
             ([ls.SymbolicConstraint(line, parameters={"slope": 0.0}, equality=True, at="final")],
              "that line(x, u, p) is zero is missed by"),
+            ([ls.SymbolicConstraint(line, parameters={"slope": 0.0}, equality=True, at="final", name="the line")],
+             "that the line is zero is missed by"),
+            ([ls.SymbolicConstraint(lambda x, u, p: x.v - p.least, parameters={"least": 0.5})],
+             "that -p.least + v is not negative is missed by"),
             ([ls.GoalState(x=0.3), ls.StateBounds(v=(0.5, np.inf))],
              "v of at least 0.5 m/s is missed by 0.47 at 0.10 s (step 1)"),
         ],
@@ -328,6 +332,21 @@ class TestInfeasible:
         assert solution.status is Status.INFEASIBLE, solution.summary()
         assert said in solution.detail
         assert solution.violation > 1e-3
+
+
+def test_a_lambda_is_called_by_its_expressions() -> None:
+    """Beside a free duration, too; long ones are cut, and numbered so that none counts as another."""
+    many = ls.SymbolicConstraint(lambda x, u, p: [x.x + sum(x.v**i for i in range(3, 20 + k)) for k in range(2)])
+    two = ls.SymbolicConstraint(lambda x, u, p: [1 - x.x, 2 + x.v * x.x], name="two")
+    names = [name for term in problem(many, two).constraint_terms for name in term.names]
+    assert [name[-6:] for name in names[:2]] == ["...[0]", "...[1]"]
+    assert names[2:] == ["two[0]", "two[1]"]
+    dynamics = problem().dynamics
+    one = ls.SymbolicConstraint(lambda x, u, p: 1 - x.x)
+    assert one.bind(dynamics).names == one.with_added_state(dynamics).bind(dynamics).names == ("1 - x",)
+    assert "name='two'" in repr(two)
+    with pytest.raises(ls.InputError, match="SymbolicCost: name: got '', want text: one printable line"):
+        ls.SymbolicCost(line, name="")
 
 
 def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path) -> None:

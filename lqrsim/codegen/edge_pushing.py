@@ -20,7 +20,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from lqrsim.codegen.symbolic import smooth_almost_everywhere
+from lqrsim.codegen.symbolic import own_functions, without_kinks
 
 
 class Operations:
@@ -80,7 +80,7 @@ class WeightedSum:
         self._gradient: dict[Any, list[Any]] = defaultdict(list)
         self._hessian: dict[Any, dict[Any, list[Any]]] = defaultdict(lambda: defaultdict(list))
         # Terms whose sum is positive where the sum depends on a symbol. It does not where the symbol is only in other
-        # cases of a Piecewise; its derivatives there may be infinite, and a product with zero would be NaN.
+        # cases of a choice; its derivatives there may be infinite, and a product with zero would be NaN.
         self._uses: dict[Any, list[Any]] = defaultdict(list)
 
     def begin(self, result: Any, weight: Any) -> None:
@@ -91,10 +91,9 @@ class WeightedSum:
 
     def replace(self, symbol: Any, operation: Any) -> None:
         """Replace a symbol by the operation that it names."""
-        import sympy
-
         if symbol not in self._uses:
             return
+        choice = own_functions().choice
         weight, uses = self._named(self._gradient.pop(symbol)), self._uses.pop(symbol)
         row = {other: self._named(terms) for other, terms in self._hessian.pop(symbol, {}).items()}
         curved = row.pop(symbol, 0)
@@ -104,18 +103,17 @@ class WeightedSum:
 
         def slope_where_used(slope: Any) -> Any:
             if used != 1 and not slope.is_number:
-                slope = sympy.Piecewise((slope, used > 0), (0, True))
+                slope = choice(used > 0, slope, 0)
             return self._operations.name(slope)
 
         inputs = sorted(operation.free_symbols & self._order.keys(), key=self._order.__getitem__)
-        slopes = {a: smooth_almost_everywhere(operation.diff(a)) for a in inputs}
-        slopes = {a: slope for a, slope in slopes.items() if slope != 0}
+        slopes = {a: slope for a in inputs if (slope := without_kinks(operation.diff(a))) != 0}
         names = {a: slope_where_used(slope) for a, slope in slopes.items()}
         for i, a in enumerate(slopes):
             share = 1
-            if operation.is_Piecewise:
-                cases = [(int(case.has(a)), condition) for case, condition in operation.args]
-                share = self._operations.name(sympy.Piecewise(*cases))
+            if isinstance(operation, choice):
+                condition, *cases = operation.args
+                share = self._operations.name(choice(condition, *[int(case.has(a)) for case in cases]))
             self._uses[a].append(self._named([used * share]))
             self._gradient[a].append(weight * names[a])
             for b in list(slopes)[i:]:
@@ -144,10 +142,8 @@ def weighted_hessian(
 ) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
     """The second derivatives of `sum_i weights[i] formulas[i]`.
 
-    At kinks and jumps they are what `smooth_almost_everywhere` makes of distributions.
-
     Args:
-      formulas: real SymPy expressions.
+      formulas: real SymPy expressions, without kinks as SymPy writes them; see `without_kinks`.
       weights: a symbol for each formula, which is in none of them.
       variables: symbols.
       most: largest number of steps.
@@ -157,7 +153,7 @@ def weighted_hessian(
       always zero, as (i, j) -> expression. None if there would be more steps.
     """
     operations = Operations()
-    results = operations.of([smooth_almost_everywhere(formula) for formula in formulas])
+    results = operations.of(formulas)
     order = {symbol: i for i, symbol in enumerate(variables)}
     forward = []
     for symbol, operation in operations.steps:

@@ -4,8 +4,9 @@ import contextlib
 import functools
 import json
 import keyword
+import threading
 import unicodedata
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from lqrsim.errors import InputError, check_kind, check_name, check_number, exce
 from lqrsim.rotations import RATIOS
 
 MOST = 1000  # largest number of parameters of a function
+_TRACING = threading.RLock()  # what a trace changes in SymPy
 
 
 class Parameters(SimpleNamespace):
@@ -139,7 +141,8 @@ def trace(
     of, counted = ("x", "") if controls is None else ("x, u", f" and {len(u)} in u")
     called = f"{getattr(function, '__qualname__', repr(function))}({of}, p)"
     try:
-        returned = function(*given)
+        with _unsorted_extremes():
+            returned = function(*given)
     except InputError as error:
         raise InputError(f"{called}: {error}") from None
     except Exception as error:  # any exception of a user's function becomes one line
@@ -167,51 +170,121 @@ def trace(
             raise InputError(f"{called}: got the unknown symbol {strange[0]} in entry {i}, want {of} and p only")
         if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
             raise InputError(f"{called}: got {expression} as entry {i}, want a finite real expression")
+        if expression.has(sympy.Sum, sympy.Product, sympy.Integral, sympy.Derivative):
+            expression = expression.doit()
         for piecewise in expression.atoms(sympy.Piecewise):
             last: Any = piecewise.args[-1]
             if last[1] != sympy.true:
                 raise InputError(f"{called}: got {piecewise} in entry {i}, want its last case to be (expression, True)")
-        expressions.append(_worked_out(expression))
+        expressions.append(without_kinks(expression))
     return expressions, x, u
 
 
+@contextlib.contextmanager
+def _unsorted_extremes() -> Iterator[None]:
+    """A context in which `Max` and `Min` keep their arguments: SymPy compares all pairs, for seconds."""
+    from sympy.functions.elementary.miscellaneous import MinMaxBase
+
+    def keep(cls: Any, *given: Any, **options: Any) -> Any:
+        if any(getattr(one, "free_symbols", ()) for one in given):
+            options, given = {"evaluate": False} | options, tuple(one for one in given if one != cls.identity)
+        return made(cls, *given, **options)
+
+    with _TRACING:
+        made = MinMaxBase.__new__
+        MinMaxBase.__new__ = keep
+        try:
+            yield
+        finally:
+            MinMaxBase.__new__ = made
+
+
 @functools.cache
-def _floor() -> Any:
-    """SymPy's floor with a derivative: zero, as it is everywhere but at the jumps."""
+def own_functions() -> SimpleNamespace:
+    """Functions with kinks and jumps, whose derivatives are those beside them: of the case that applies.
+
+    Those of SymPy's functions have distributions, and conditions that SymPy simplifies, for minutes if there are many.
+    `choice(condition, one, other)` is one where the condition is true, and else the other.
+    """
     import sympy
+
+    class choice(sympy.Function):
+        is_commutative = True  # a condition says nothing of it
+
+        @classmethod
+        def eval(cls, *args: Any) -> Any:
+            condition, one, other = args
+            if condition in (True, False):
+                return one if condition else other
+            return one if one == other else None
+
+        def _eval_derivative(self: Any, s: Any) -> Any:
+            condition, one, other = self.args
+            return choice(condition, one.diff(s), other.diff(s))
+
+    class max(sympy.Function):
+        def _eval_derivative(self: Any, s: Any) -> Any:
+            a, b = self.args
+            return choice(sympy.Gt(b, a, evaluate=False), b.diff(s), a.diff(s))
+
+    class min(sympy.Function):
+        def _eval_derivative(self: Any, s: Any) -> Any:
+            a, b = self.args
+            return choice(sympy.Lt(b, a, evaluate=False), b.diff(s), a.diff(s))
+
+    class abs(sympy.Function):
+        def fdiff(self, argindex: int = 1) -> Any:
+            return step(self.args[0], 0, -1)
 
     class floor(sympy.Function):
         def fdiff(self, argindex: int = 1) -> Any:
             return sympy.Integer(0)
 
-    return floor
+    def step(a: Any, at_zero: Any, below: Any = 0) -> Any:
+        return choice(sympy.Gt(a, 0, evaluate=False), 1, choice(sympy.Lt(a, 0, evaluate=False), below, at_zero))
+
+    return SimpleNamespace(choice=choice, max=max, min=min, abs=abs, floor=floor, step=step)
 
 
-def _worked_out(expression: Any) -> Any:
-    """The expression with its sums, integrals and derivatives worked out, and remainders and jumps by `_floor`."""
+@functools.cache
+def _rules() -> dict[Any, Callable[..., Any]]:
+    """What takes the place of SymPy's functions with kinks and jumps."""
     import sympy
 
-    if expression.has(sympy.Sum, sympy.Product, sympy.Integral, sympy.Derivative):
-        expression = expression.doit()
-    if not expression.has(sympy.Mod, sympy.frac, sympy.ceiling, sympy.floor):
+    own = own_functions()
+
+    def first_that_applies(*cases: Any) -> Any:
+        return functools.reduce(lambda other, case: own.choice(case[1], case[0], other), cases[-2::-1], cases[-1][0])
+
+    return {
+        sympy.Max: lambda *entries: functools.reduce(own.max, entries),
+        sympy.Min: lambda *entries: functools.reduce(own.min, entries),
+        sympy.Abs: own.abs,
+        sympy.sign: lambda a: own.step(a, 0, -1),
+        sympy.Heaviside: own.step,
+        sympy.DiracDelta: lambda *arguments: sympy.Integer(0),
+        sympy.Piecewise: first_that_applies,
+        sympy.Mod: lambda a, b: a - b * own.floor(a / b),
+        sympy.frac: lambda a: a - own.floor(a),
+        sympy.ceiling: lambda a: -own.floor(-a),
+        sympy.floor: own.floor,
+    }
+
+
+def without_kinks(expression: Any) -> Any:
+    """The expression with `own_functions` in the place of SymPy's with kinks and jumps."""
+    rules, made = _rules(), {}
+    if not expression.has(*rules):
         return expression
-    expression = expression.replace(sympy.Mod, lambda a, b: a - b * sympy.floor(a / b))
-    expression = expression.replace(sympy.frac, lambda a: a - sympy.floor(a))
-    expression = expression.replace(sympy.ceiling, lambda a: -sympy.floor(-a))
-    return expression.replace(sympy.floor, _floor())
 
+    def remade(part: Any) -> Any:
+        if part not in made:
+            parts = [remade(one) for one in part.args]
+            known = rules.get(part.func) or (part.func if parts != list(part.args) else lambda *_: part)
+            made[part] = known(*parts)
+        return made[part]
 
-def smooth_almost_everywhere(expression: Any) -> Any:
-    """Replace distributions by zero: they are zero except at kinks and jumps, where there is no derivative."""
-    import sympy
-
-    kinds = (sympy.sign, sympy.Heaviside)
-    if not expression.has(sympy.DiracDelta, *kinds):
-        return expression
-    expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
-    for kind in kinds:
-        expression = expression.replace(kind, lambda *arguments, kind=kind: kind(*arguments).rewrite(sympy.Piecewise))
-    return expression
+    return remade(expression)
 
 
 def write_function(
@@ -243,9 +316,13 @@ def write_function(
     class Printer(PythonCodePrinter):
         def _print_Function(self, expr: Any) -> str:
             head = expr.func.__name__
-            if head.partition("_d")[0] in RATIOS or isinstance(expr, _floor()):
-                return f"{head}({self._print(expr.args[0])})"
+            if head.partition("_d")[0] in RATIOS or expr.func in vars(own_functions()).values():
+                return f"{head}({', '.join(map(self._print, expr.args))})"
             return super()._print_Function(expr)  # pyright: ignore[reportAttributeAccessIssue]
+
+        def _print_choice(self, expr: Any) -> str:
+            condition, one, other = map(self._print, expr.args)
+            return f"({one} if {condition} else {other})"
 
         def _print_Pow(self, expr: Any, rational: bool = False) -> str:
             base, exponent = expr.args
@@ -255,7 +332,7 @@ def write_function(
                 return f"({product})" if exponent > 0 else f"(1/({product}))"
             return super()._print_Pow(expr, rational=rational)
 
-    values = [smooth_almost_everywhere(value) for value in assignments.values()]
+    values = [without_kinks(value) for value in assignments.values()]
     printer = Printer({"fully_qualified_modules": False})
     if steps is None:
         steps, values = sympy.cse(values, symbols=sympy.numbered_symbols("s"))

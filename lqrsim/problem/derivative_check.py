@@ -199,7 +199,7 @@ class _Derivative(NamedTuple):
 def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     n = len(states)
-    if dynamics.discrete:
+    if dynamics.by_mujoco:
         return  # its derivatives are central differences already
     for x, u in points:
         fx, fu = dynamics.rate_jacobian(x, u)

@@ -27,7 +27,7 @@ from lqrsim.codegen.user_functions import (
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_number, excerpt
-from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
+from lqrsim.kernels import differences, discrete_map, runge_kutta, step_curvature, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ MOST_STEPS = 10_000
 
 
 class Dynamics:
-    """`xdot = f(x, u)`: Eq. (1), with the meaning of its states and controls.
+    """`xdot = f(x, u)`: Eq. (1), or with `period` a map `x+ = f(x, u)`, with the meaning of its states and controls.
 
     A pendulum, swung by a motor:
 
@@ -83,14 +83,17 @@ class Dynamics:
         and df/du to fx (n, n) and fu (n, m), which are zero on entry. A numba function if f is one, else a Python
         function.
       level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
+      period: for a map, f is the next state, after this many seconds, and every `dt` is this period. `rate` and
+        `rate_jacobian` are then f's value and derivatives. A map has no inverse and no state in between: solvers in
+        continuous time, form="primal" and free durations are refused. None for rates.
 
     Raises:
       InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. The result
         of f is checked when it is first needed.
     """
 
-    # Whether the dynamics are given as the state after a control period, not as a rate; see `robots/mjcf_dynamics.py`.
-    discrete: ClassVar[bool] = False
+    # Whether MuJoCo does the steps; see `robots/mjcf_dynamics.py`. They have no second derivatives.
+    by_mujoco: ClassVar[bool] = False
     # Relative size of states whose cost is negligible: if the least cost is zero, it is not reached to rounding.
     rounding: ClassVar[float] = 1e-13
     # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
@@ -112,7 +115,9 @@ class Dynamics:
         control_limits: Limits | None = None,
         jacobian: Callable[..., None] | None = None,
         level: str | None = None,
+        period: float | None = None,
     ) -> None:
+        self._period = None if period is None else check_number("period", period, above=0.0)
         for field, given in (("states", states), ("controls", controls)):
             if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
                 raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: unit")
@@ -178,6 +183,16 @@ class Dynamics:
     def name(self) -> str:
         """The name of the dynamics in messages: the name of `f`."""
         return name_of(self.f)
+
+    @property
+    def period(self) -> float | None:
+        """The seconds of which every duration of a step is a multiple; None if it may be any."""
+        return self._period
+
+    @property
+    def discrete(self) -> bool:
+        """Whether the dynamics are given as the state after a step, not as a rate: there is no inverse."""
+        return self.period is not None
 
     def with_parameters(self, **values: float) -> "Dynamics":
         """The same dynamics with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing
@@ -301,9 +316,14 @@ class Dynamics:
 
     @cached_property
     def step_source(self) -> Source:
-        """Source of `advance` and `step_jacobian`, as defined in `kernels/runge_kutta.py`."""
+        """Source of `advance` and `step_jacobian`, as in `kernels/runge_kutta.py`, or in `kernels/discrete_map.py`."""
+        return source_of(discrete_map if self.discrete else runge_kutta).filled(**self._rates)
+
+    @property
+    def _rates(self) -> dict[str, Source]:
+        """The functions of `source` that steps leave open."""
         names = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
-        return source_of(runge_kutta).filled(**dict.fromkeys(names, self.source))
+        return dict.fromkeys(names, self.source)
 
     @cached_property
     def compiled(self) -> CompiledModule:
@@ -313,10 +333,11 @@ class Dynamics:
 
     @cached_property
     def curvature_source(self) -> Source | None:
-        """Source of `step_curvature`, as defined in `kernels/step_curvature.py`; None if it is zero everywhere."""
-        kept = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
+        """Source of `step_curvature`, as in `kernels/step_curvature.py`; None if it is zero everywhere."""
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
-        by_values = source_of(differences, AXES=axes).filled(**dict.fromkeys(kept, self.source))
+        by_values = source_of(differences, AXES=axes).filled(
+            **self._rates, **dict.fromkeys(("advance", "step_jacobian"), self.step_source)
+        )
         by_jacobians = source_of(step_curvature).filled(step_curvature=(by_values, "curvature_from_jacobians"))
         if self.level != "symbolic" and self.jacobian is None:
             by_values = by_values.filled(value=(by_values, "weighted_step"))
@@ -333,8 +354,12 @@ class Dynamics:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)
         curved = text_source(made["source"], f"second derivatives of {self.name}(x, u, p)")
-        open_source = source_of(step_curvature, SUPPORT=support, K=len(support), STATES=states)
-        return open_source.filled(rate_curvature=curved, **dict.fromkeys(kept, self.source))
+        open_source = (
+            source_of(discrete_map, SUPPORT=support, K=len(support))
+            if self.discrete
+            else source_of(step_curvature, SUPPORT=support, K=len(support), STATES=states)
+        )
+        return open_source.filled(rate_curvature=curved, **self._rates)
 
     @cached_property
     def step_curvature(self) -> float:
@@ -396,7 +421,7 @@ class Dynamics:
         }
 
     def period_near(self, dt: float) -> float:
-        """The possible duration of a step nearest to `dt`: `dt` itself, unless MuJoCo does the steps.
+        """The possible duration of steps nearest to `dt`: `dt` itself, or a multiple of `period`.
 
         Args:
           dt: seconds.
@@ -404,10 +429,11 @@ class Dynamics:
         Returns:
           Seconds.
         """
-        return check_number("dt", dt)
+        dt = check_number("dt", dt)
+        return dt if self.period is None else round(dt / self.period) * self.period
 
     def check_period(self, dt: float) -> None:
-        """Check that a step can last `dt` seconds. It always can, unless MuJoCo does the steps.
+        """Check that a step can last `dt` seconds: of a map, its period; see `MjcfDynamics` for MuJoCo's steps.
 
         Args:
           dt: seconds.
@@ -415,7 +441,9 @@ class Dynamics:
         Raises:
           InputError: it cannot.
         """
-        check_number("dt", dt)
+        dt = check_number("dt", dt)
+        if self.period is not None and abs(dt - self.period) > 1e-9 * self.period:  # rounding, as of 1 / 30
+            raise InputError(f"dt: got {dt:g} s, want {self.period:g} s, the period of the map {self.name}")
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
         """The Runge-Kutta steps of control periods of `dt` seconds.
@@ -428,6 +456,8 @@ class Dynamics:
         Returns:
           The duration of a step in seconds, and df/dx (k, n, n); None if the steps are another method's.
         """
+        if self.discrete:
+            return None
         slopes = np.zeros((len(states), states.shape[1], states.shape[1]))
         of = in_c_order(states), in_c_order(controls), numbers_of(self)
         self.compiled.state_jacobians(len(states), *of, slopes)
@@ -482,6 +512,7 @@ class Dynamics:
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
         """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python.
+        A map has no step backwards.
 
         Args:
           state: (n,).
@@ -490,7 +521,8 @@ class Dynamics:
         """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
-        self._plain["advance"](x, u, self._numbers(), check_number("dt", dt), out)
+        self.check_period(dt)
+        self._plain["advance"](x, u, self._numbers(), float(dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
@@ -504,7 +536,8 @@ class Dynamics:
         x, u = self._check(state, control)
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
-        self._plain["step_jacobian"](x, u, self._numbers(), check_number("dt", dt), out, jacobian)
+        self.check_period(dt)
+        self._plain["step_jacobian"](x, u, self._numbers(), float(dt), out, jacobian)
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 

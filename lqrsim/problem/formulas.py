@@ -1,6 +1,8 @@
 """Costs and constraints that are stated as functions: formulas of symbols, and numba or plain Python functions."""
 
 import copy
+import functools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -17,11 +19,13 @@ from lqrsim.codegen.user_functions import (
     name_of,
     with_derivatives,
 )
-from lqrsim.errors import Array, InputError, check_flag, check_name
+from lqrsim.errors import Array, InputError, check_flag, check_name, check_text
 from lqrsim.kernels import differences, user_functions
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
+
+MOST_LETTERS = 60  # of an expression that stands for a name: half a line
 
 
 class OfFunction:
@@ -29,11 +33,19 @@ class OfFunction:
 
     function: Callable[..., Any]
     parameters: dict[str, float]
+    _name: str = ""  # the given name
 
     @property
     def name(self) -> str:
-        """The name of its function."""
-        return f"{name_of(self.function)}(x, u, p)"
+        """The name in messages: by default that of its function."""
+        return self._name or f"{name_of(self.function)}(x, u, p)"
+
+    def _stated(self) -> Mapping[str, object]:
+        return {**super()._stated(), "name": self._name or None}  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _set_name(self, name: str | None) -> None:
+        if name is not None:
+            self._name = check_text(f"{type(self).__name__}: name", name)
 
     @property
     def _data(self) -> Array:
@@ -43,8 +55,11 @@ class OfFunction:
 class OfFormula(OfFunction):
     """A cost or a constraint that is stated as a formula, with parameters."""
 
-    def _set_formula(self, function: Callable[..., Any], parameters: Mapping[str, float] | None, instead: str) -> None:
+    def _set_formula(
+        self, function: Callable[..., Any], parameters: Mapping[str, float] | None, name: str | None, instead: str
+    ) -> None:
         """Check and keep a function of symbols."""
+        self._set_name(name)
         if level_of(function, None) == "compiled":
             raise InputError(f"{type(self).__name__}: got the numba function {name_of(function)}, want {instead}")
         check_signature(function, ("x", "u", "p"))
@@ -52,7 +67,7 @@ class OfFormula(OfFunction):
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         other, function, n = copy.copy(self), self.function, len(dynamics.state_coordinates)
-        other.function = lambda x, u, p: function(x[:n], u, p)
+        other.function = functools.update_wrapper(lambda x, u, p: function(x[:n], u, p), function)
         return other
 
 
@@ -64,6 +79,7 @@ class SymbolicCost(OfFormula, Cost):
         cost it must not depend on u.
       parameters: name -> value, as in `Dynamics`.
       convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
+      name: the name in messages; by default that of the function.
     """
 
     def __init__(
@@ -72,8 +88,9 @@ class SymbolicCost(OfFormula, Cost):
         *,
         parameters: Mapping[str, float] | None = None,
         convex: bool = False,
+        name: str | None = None,
     ) -> None:
-        self._set_formula(function, parameters, "FunctionCost for it")
+        self._set_formula(function, parameters, name, "FunctionCost for it")
         self.convex = check_flag("SymbolicCost: convex", convex)
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
@@ -129,6 +146,8 @@ class SymbolicConstraint(OfFormula, Constraint):
       parameters: name -> value, as in `Dynamics`.
       equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
       at: "all" steps, or only the "final" step, at which the expressions must not depend on u.
+      name: the name in messages and in `Problem.violations`; by default that of the function, or its expression if it
+        is a lambda.
     """
 
     def __init__(
@@ -138,8 +157,9 @@ class SymbolicConstraint(OfFormula, Constraint):
         parameters: Mapping[str, float] | None = None,
         equality: bool = False,
         at: str = "all",
+        name: str | None = None,
     ) -> None:
-        self._set_formula(function, parameters, "one of SymPy symbols")
+        self._set_formula(function, parameters, name, "one of SymPy symbols")
         self.equality = check_flag("SymbolicConstraint: equality", equality)
         self.at = check_name("SymbolicConstraint: at", at, STEPS)
 
@@ -147,8 +167,9 @@ class SymbolicConstraint(OfFormula, Constraint):
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
         details = ("constraint", *names, tuple(self.parameters))
         made = symbolic.kept(
-            self.function, details, lambda: self._trace(*names), source=str, rows=int, with_control=list
-        )
+            self.function, details, lambda: self._trace(*names),
+            source=str, rows=int, with_control=list, texts=list,
+        )  # fmt: skip
         with_control, rows = made["with_control"], made["rows"]
         if self.at == "final" and with_control:
             raise InputError(
@@ -161,13 +182,16 @@ class SymbolicConstraint(OfFormula, Constraint):
             )
         kind = "zero" if self.equality else "not negative"
         parts = [f"[{row}]" for row in range(rows)] if rows > 1 else [""]
-        name = getattr(self.function, "__name__", type(self.function).__name__)
+        name = self._name or getattr(self.function, "__name__", type(self.function).__name__)
+        names, texts = ([f"{one}{part}" for part in parts] for one in (name, self.name))
+        if name == "<lambda>":
+            names = texts = made["texts"]
         return ConstraintTerm(
             source=made["source"],
             data=self._data,
             rows=rows,
-            describe=lambda row: f"that {self.name}{parts[row]} is {kind}",
-            names=tuple(f"{name}{part}" for part in parts),
+            describe=lambda row: f"that {texts[row]} is {kind}",
+            names=tuple(names),
             uses_control=bool(with_control),
             equality=self.equality,
             final_only=self.at == "final",
@@ -188,11 +212,18 @@ class SymbolicConstraint(OfFormula, Constraint):
             parts.append(_written(slope, slopes, self.name))
             choices["value"].append(f"    if row == {row}:\n        return {value}")
             choices["slope"].append(f"    if row == {row}:\n        {slope}")
+        words = {f"x{i}": name for i, name in enumerate(states)} | {f"u{i}": name for i, name in enumerate(controls)}
+        words |= {f"p{i}": f"p.{name}" for i, name in enumerate(self.parameters)}
+        texts = [re.sub(r"\b[xup]\d+\b", lambda found: words[found[0]], str(entry)) for entry in traced]
         value = "\n".join(["def value(x, u, t, row, data):", *choices["value"], "    return 0.0"])
         slope = "\n".join(["def slope(x, u, t, row, data, gradient):", *choices["slope"]])
         return {
             "source": "\n\n".join([*parts, value, slope]) + "\n",
             "rows": len(traced),
+            "texts": [
+                text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}...[{row}]"
+                for row, text in enumerate(texts)
+            ],
             "with_control": [row for row, entry in enumerate(traced) if entry.free_symbols & set(u)],
         }
 
@@ -208,6 +239,7 @@ class FunctionCost(OfFunction, Cost):
       depends_on: names of the states and controls that the cost depends on; all by default. The fewer, the faster.
       parameters: name -> value, as in `Dynamics`.
       convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
+      name: the name in messages; by default that of the function.
       level: "compiled" or "plain"; by default compiled if the function is numba's, and plain otherwise.
     """
 
@@ -220,7 +252,9 @@ class FunctionCost(OfFunction, Cost):
         parameters: Mapping[str, float] | None = None,
         convex: bool = False,
         level: str | None = None,
+        name: str | None = None,
     ) -> None:
+        self._set_name(name)
         self.function, self.derivatives = function, derivatives
         self.convex = check_flag("FunctionCost: convex", convex)
         self.level = level_of(function, level)

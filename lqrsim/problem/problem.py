@@ -488,7 +488,7 @@ class Problem(OneVersion):
         keep(self, duration=(low, high))
         why = ""
         if self.dynamics.discrete or self.dynamics.level != "symbolic":
-            why = "dynamics that are not a formula"
+            why = "dynamics that are not a formula of rates"
         elif self.noise is not None:
             why = "noise"
         elif any(one.world.moving for one in self.kept_clear):
@@ -515,8 +515,9 @@ class Problem(OneVersion):
         Returns:
           Name -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in seconds; zeros
           for a trial that violates it by at most 1e-6. Names do not depend on the runs or on the constraints' numbers:
-          "StateBounds: x low", "GoalState: x", "SymbolicConstraint: NAME" of the function, with "[0]" for the first of
-          several entries. If an earlier constraint has the same name, " (2)" follows, and so on.
+          "StateBounds: x low", "GoalState: x", "SymbolicConstraint: NAME", its `name` or that of its function, with
+          "[0]" for the first of several entries. Only a lambda without a name is called by its expressions, which may
+          have numbers. If an earlier constraint has the same name, " (2)" follows, and so on.
 
         Raises:
           InputError: the runs have other states, controls or steps.

@@ -57,7 +57,7 @@ class MjcfDynamics(Dynamics):
       mjcf: the MJCF.
     """
 
-    discrete: ClassVar[bool] = True
+    by_mujoco: ClassVar[bool] = True
     rounding: ClassVar[float] = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
 
     def __init__(
@@ -232,10 +232,6 @@ class MjcfDynamics(Dynamics):
     def period(self) -> float:
         """The physics step in seconds."""
         return float(self.mjcf.model.opt.timestep)
-
-    def period_near(self, dt: float) -> float:
-        """The whole number of physics steps nearest to `dt`, in seconds."""
-        return round(check_number("dt", dt) / self.period) * self.period
 
     def check_period(self, dt: float) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""

@@ -137,7 +137,7 @@ def _undisturbed(loop: "ClosedLoop") -> Array | None:
         loop.records.turn_to_plan(settings.states)
         ended = min(loop.collisions.at[0], loop.records.time_of(loop.records.lost_since)[0])
         return np.where(plan.trajectory.times[:, None] < ended, loop.records.states[0], np.nan)
-    if not plant.robot.dynamics.discrete or plant.simulator is not None:
+    if not plant.robot.dynamics.by_mujoco or plant.simulator is not None:
         return None
     which = plan.policy.digest, plan.trajectory.states.tobytes()
     if plant.ran is None or plant.ran[:2] != which:

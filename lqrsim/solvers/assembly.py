@@ -140,7 +140,7 @@ def _near_singular(problem: Problem, found: RunResult) -> str:
         apart = np.where(turns > 0, np.abs(angles - period * turns), np.inf)
         if apart.min() < close:
             knot, names = int(apart.argmin()), ", ".join(space.names[i] for i in entries)
-            axis = _regular_axis(states[:, first : first + 3]) if problem.dynamics.discrete and turn < 0 else None
+            axis = _regular_axis(states[:, first : first + 3]) if problem.dynamics.by_mujoco and turn < 0 else None
             return (
                 f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from {what}, where {where} are"
                 " singular: the policy may take an attitude beside the plan's for another turn"
@@ -164,7 +164,7 @@ def _fragile(problem: Problem, found: RunResult) -> str:
     Where a contact begins or ends, a step may jump, and rounding decides which way. Only then is it looked at.
     """
     states, space = found.states, problem.dynamics.state_coordinates
-    if not problem.dynamics.discrete or not problem.dynamics.touches(states):
+    if not problem.dynamics.touches(states):
         return ""
     for draw in range(BESIDE):
         signs = np.sign(np.sin(1.0 + (1 + draw) * np.arange(1, len(space) + 1)))

@@ -124,7 +124,7 @@ def can_be_exact(problem: Problem) -> bool:
 
 def has_curvature(problem: Problem) -> bool:
     """Whether the dynamics have second derivatives; the steps of an MJCF have none."""
-    return not problem.dynamics.discrete
+    return not problem.dynamics.by_mujoco
 
 
 S = TypeVar("S", bound=Settings)

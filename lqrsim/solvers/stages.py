@@ -121,7 +121,7 @@ class Stages:
         self.live[steps, self.owners == -1] = False
         self._acts[...] = self._live[...] = self.live
         self.about = self.about._replace(
-            steps=steps, soft=0 if fixed else 1, learns=int(problem.dynamics.discrete), model=model
+            steps=steps, soft=0 if fixed else 1, learns=int(problem.dynamics.by_mujoco), model=model
         )
         self.about.slow[...], self.about.keeps[...] = 0.0, 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0

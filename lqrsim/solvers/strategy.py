@@ -811,7 +811,7 @@ class Search:
         if self._nearer is not None:
             remedy = f"raise the weight of {names} until moving it costs less than leaving it"
         elif otherwise:
-            what = "with which the robot touches that body" if problem.dynamics.discrete else f"that change {names}"
+            what = "with which the robot touches that body" if problem.dynamics.by_mujoco else f"that change {names}"
             remedy = f"begin with start=[...], controls {what}"
         if self._budget.stop.due:
             status, remedy = Status.TIME_LIMIT, ""
