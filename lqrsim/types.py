@@ -18,7 +18,6 @@ from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Replan
 from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertificate, Curvature, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
-from lqrsim.robots.sensors import RobotSensors
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.gradients import Gradients
 from lqrsim.solvers.prepared import PreparedSolver
@@ -50,7 +49,6 @@ __all__ = [
     "Quadratic",
     "Replan",
     "ReplanRecord",
-    "RobotSensors",
     "SafePlan",
     "SphereCenters",
     "TotalCost",

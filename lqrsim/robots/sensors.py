@@ -117,64 +117,28 @@ class RobotSensors:
         return sha256(self._scene.mjcf.xml, repr(self.sensors))
 
     def check_robot(self, dynamics: Dynamics) -> None:
-        """Check that these are sensors of the robot with these dynamics.
-
-        Args:
-          dynamics: those of a problem.
-
-        Raises:
-          InputError: they are of another robot.
-        """
+        """Raise InputError unless these are sensors of the robot with these dynamics."""
         own, others = self._robot.dynamics.state_coordinates, dynamics.state_coordinates
         if own.names != others.names:
             raise InputError(f"sensors: got those of robot {self._robot.name}, want those of the problem's robot")
 
     def each(self, field: str) -> Array:
-        """A field of the sensors, for each number of the readings.
-
-        Args:
-          field: such as "noise".
-
-        Returns:
-          (Y,).
-        """
+        """A field of the sensors, for each number of the readings, (Y,)."""
         sizes = [one.stop - one.start for one in self.columns]
         return np.repeat([float(getattr(one, field)) for one in self.sensors], sizes)
 
     def due(self, knot: int, dt: float) -> npt.NDArray[np.bool_]:
-        """Whether each sensor is read at a knot.
-
-        Args:
-          knot: its number.
-          dt: control period in s.
-
-        Returns:
-          One flag for each sensor.
-        """
+        """Whether each sensor is read at a knot, for a control period of dt seconds."""
         rates = np.array([np.inf if one.rate is None else one.rate for one in self.sensors])
         each = np.minimum(rates, 1 / dt) * dt  # multiples of the interval in a period
         return np.floor(knot * each + _ROUNDING) > np.floor((knot - 1) * each + _ROUNDING)
 
     def late(self, dt: float) -> list[int]:
-        """The number of control periods after which the reading of each sensor arrives.
-
-        Args:
-          dt: control period in s.
-
-        Returns:
-          One number for each sensor.
-        """
+        """The number of control periods of dt seconds after which the reading of each sensor arrives."""
         return [int(np.ceil((one.delay or 0.0) / dt - _ROUNDING)) for one in self.sensors]
 
     def readings(self, sensordata: Array) -> Array:
-        """The readings in MuJoCo's `sensordata`; NaN where a rangefinder meets nothing.
-
-        Args:
-          sensordata: (K, any).
-
-        Returns:
-          (K, Y).
-        """
+        """The readings (K, Y) in MuJoCo's `sensordata` (K, any); NaN where a rangefinder meets nothing."""
         found = sensordata[:, self._places]
         found[(found == NO_HIT) & self._far] = np.nan
         return found
