@@ -34,6 +34,8 @@ from lqrsim.disturbances import (
     Payload,
     Push,
     Saturation,
+    Sensor,
+    SensorErrors,
     ThrustMismatch,
     TorqueNoise,
     WheelRadiusMismatch,
@@ -66,6 +68,7 @@ OWN = {
         Gusts(0.5, 0.5),
         Dryden("light"),
         Payload(0.02, "quadrotor"),
+        SensorErrors([Sensor("quadrotor_gyro", noise=0.1)]),
     ],
     "arena": [
         WheelRadiusMismatch(0.01),
@@ -124,7 +127,8 @@ def test_a_trial_is_the_same_alone_and_among_four_and_each_trial_is_its_own(plan
     assert_same(simulate(plant, solution, disturbances=[one], seed=3, trials=4), together)
     # It does something.
     changed = any((getattr(together, name) != getattr(calm[fixture], name)[:1]).any() for name in RECORDS)
-    assert changed or isinstance(one, Saturation)  # whose limits these plans keep
+    # These plans keep the limits of the one, and this policy does not read the sensors of the other.
+    assert changed or isinstance(one, Saturation | SensorErrors)
 
 
 @pytest.mark.parametrize("fixture", ["arena", pytest.param("cage", marks=pytest.mark.long)])
@@ -309,6 +313,7 @@ def test_descriptions_are_in_words_and_units(plants):
         "gusts, std 0.5 m/s, time constant 0.5 s",
         "light Dryden turbulence at 2 m, wind 7.72 m/s at 20 ft",
         "a load of 0.02 kg on quadrotor",
+        "errors of sensors, times 1: quadrotor_gyro (noise 0.1, bias 0 and 0 in 1 s, loss 0)",
     ]
     assert words["arena"][-3:] == [
         "wheel radius off by 1 % (std, cut at 3 std)",

@@ -35,6 +35,8 @@ from lqrsim.disturbances import (
     Payload,
     Push,
     Saturation,
+    Sensor,
+    SensorErrors,
     ThrustMismatch,
     TorqueNoise,
     Unknown,
@@ -60,6 +62,7 @@ EXAMPLES = [
 IN_WORDS = [
     InertiaMismatch(0.1), MeasurementBias(0.005), Saturation(share=0.9),
     ActuatorLoss(at=0.2, remaining=0.7), Push((0.1, 0.0, 0.0), at=0.1), FrictionMismatch(0.1),
+    SensorErrors([Sensor("quadrotor_gyro", noise=0.1)]),
 ]  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
+from lqrsim.robots.sensors import RobotSensors
 
 
 def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
@@ -72,7 +73,7 @@ class ControllerRun(abc.ABC):
 
         Args:
           step: number of the control period; called once for each, in order.
-          measured: (K, n), the measured states.
+          measured: (K, n), the measured states; for a controller with `sensors` their readings, (K, Y).
 
         Returns:
           Controls (K, m) within the limits.
@@ -133,6 +134,11 @@ class Controller(abc.ABC):
     @property
     def plan(self) -> Plan | None:
         """The controller's own plan, or None. A controller with its own plan can be simulated without another."""
+        return None
+
+    @property
+    def sensors(self) -> RobotSensors | None:
+        """The sensors of the MJCF that the controller reads in place of the measured states; None by default."""
         return None
 
 

@@ -3,6 +3,7 @@
 A Kalman filter estimates the state, the actuators' outputs and the unknowns. A tracking law acts on all the estimates.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
+from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.control.tracking import (
     choose_tolerances,
     reach_of,
@@ -33,6 +35,7 @@ from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 from lqrsim.results.solution import Solution
+from lqrsim.robots.sensors import RobotSensors
 
 MEMORY = 5.0  # s
 # The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
@@ -66,7 +69,9 @@ class OffsetFree(Controller):
       effort: as in `track`.
       at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
-        SymPy symbols, as in `Dynamics`, that does not depend on u.
+        SymPy symbols, as in `Dynamics`, that does not depend on u; or sensors of the MJCF, `plant.sensors(...)`, each
+        with its own noise, bias, rate, delay and loss: see `sensor_filter.py`. With these the uncertainty says nothing
+        of measurements, a stated lag makes nothing milder, and only `simulate` runs the law.
       memory: time in s; by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as
         stated: constants do not change, what varies has the mean zero, and a stated lag exists. A steady disturbance
         then leaves an error.
@@ -97,8 +102,9 @@ class OffsetFree(Controller):
       nominal: z in an undisturbed run, (T+1, Z).
 
     Raises:
-      InputError: something does not fit the system; an unknown changes no measurement; or `replan_every` is shorter
-        than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
+      InputError: something does not fit the system; an unknown changes no measurement; sensors of the MJCF come with
+        `replan_every` or an uncertainty of measurements, or one reads the same in all states; or `replan_every` is
+        shorter than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
     """
 
     def __init__(
@@ -110,7 +116,7 @@ class OffsetFree(Controller):
         tolerate: PerEntry | None = None,
         effort: PerEntry | None = None,
         at_end: float = AT_END,
-        sensors: Sensors = None,
+        sensors: Sensors | RobotSensors = None,
         memory: float | None = None,
         record: bool = False,
         replan_every: float | None = None,
@@ -128,15 +134,18 @@ class OffsetFree(Controller):
         }  # fmt: skip
         self.record = check_flag("OffsetFree: record", record)
         self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
-        sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
+        self._sensors = sensors if isinstance(sensors, RobotSensors) else None
+        states = None if isinstance(sensors, RobotSensors) else sensors
+        sensor = sensor_of(states, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         stated = PlanModel.of(problem.dynamics, plan, uncertainty, sensor)
         self.model = for_filter(stated, memory, efforts)
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
-        self.filter = kalman_filter(self.model)
+        self._sensing = None if self._sensors is None else self._sensor_filter(self._sensors, replan_every)
+        self.filter = kalman_filter(self.model) if self._sensing is None else self._sensing.along
         design = self._design(tolerate, efforts, at_end)
-        if uncertainty.lag > 0 and memory < np.inf:
+        if uncertainty.lag > 0 and memory < np.inf and self._sensing is None:
             design = self._with_margin(design, stated, memory, tolerate, efforts, at_end)
         self.model, self.filter, self.weights = design.model, design.filter, design.weights
         self._law = FilterLaw.of(solution, design)
@@ -157,6 +166,19 @@ class OffsetFree(Controller):
           InputError: as for a new OffsetFree.
         """
         return OffsetFree(self.problem, solution, uncertainty, **self._stated)
+
+    def _sensor_filter(self, sensors: RobotSensors, replan_every: float | None) -> SensorFilter:
+        sensors.check_robot(self.problem.dynamics)
+        for name in ("measurement", "latency", "loss"):
+            value = getattr(self.uncertainty, name)
+            if np.any(list(value.values()) if isinstance(value, Mapping) else value):
+                raise InputError(
+                    f"OffsetFree: uncertainty: got a {name} of {value} with sensors of the MJCF, want none: each sensor"
+                    " has its own"
+                )
+        if replan_every is not None:
+            raise InputError(f"OffsetFree: replan_every: got {replan_every:g} with sensors of the MJCF, want None")
+        return SensorFilter(self.model, sensors)
 
     def _replan_rule(self, every: float) -> ReplanRule:
         late = self.uncertainty.latency, self.uncertainty.delay
@@ -197,6 +219,8 @@ class OffsetFree(Controller):
 
     def start(self, trials: int) -> "FilterRun | ReplannedRun":
         records = empty_records(self._law, trials) if self.record else None
+        if self._sensing is not None:
+            return SensorRun(self._sensing, self._law, trials, records)
         if self._rule is None:
             return FilterRun(self._law, trials, records)
         return ReplannedRun(self._rule, self._law, trials, records, always=self.replan_always)
@@ -205,8 +229,14 @@ class OffsetFree(Controller):
     def plan(self) -> Plan:
         return self.solution
 
-    def _check_one_plan(self, what: str) -> None:
-        """Raise InputError if the law re-plans: matrices about later plans are not known in advance."""
+    @property
+    def sensors(self) -> RobotSensors | None:
+        return self._sensors
+
+    def _check_in_advance(self, what: str) -> None:
+        """Raise InputError if matrices are not known in advance: about later plans, or gains after losses."""
+        if self._sensors is not None:
+            raise InputError(f"OffsetFree: {what}: got a law that reads sensors of the MJCF, want measured states")
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
@@ -217,9 +247,10 @@ class OffsetFree(Controller):
           uncertainty: uncertainty of the run; by default the one for which the law was designed.
 
         Raises:
-          InputError: with `replan_every`, which leads to other plans; or the uncertainty does not fit the system.
+          InputError: with `replan_every`, which leads to other plans; with sensors of the MJCF, as gains depend on what
+            gets lost; or the uncertainty does not fit the system.
         """
-        self._check_one_plan("loop")
+        self._check_in_advance("loop")
         met = self.uncertainty if uncertainty is None else uncertainty
         check_kind("uncertainty", met, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
         met.check(self.problem.dynamics)
@@ -233,9 +264,9 @@ class OffsetFree(Controller):
         """Filter and law for a robot, in NumPy alone, with predictions that are linear about the plan; `save` takes it.
 
         Raises:
-          InputError: with `replan_every`, which needs a solver.
+          InputError: with `replan_every`, which needs a solver; or with sensors of the MJCF, which need MuJoCo.
         """
-        self._check_one_plan("policy")
+        self._check_in_advance("policy")
         return policy_of(self._law)
 
     @property
@@ -246,13 +277,14 @@ class OffsetFree(Controller):
         numbers = np.array([model.plan.dt, model.uncertainty.lag, told.latency, told.delay, told.command_loss])
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.step_source.digest, moved, model.sensor.source.digest, model.sensor.data
+        read = () if self._sensors is None else (self._sensors.digest,)
         again = (
             ()
             if self._rule is None
             else (f"{self.problem.digest} {self._rule.periods} {self.replan_always}", self.filter.corrected)
         )
         rules = (space.rules for space in self.coordinates)
-        return sha256(*parts, numbers, *sources, *again, *rules)[:16]
+        return sha256(*parts, numbers, *sources, *again, *read, *rules)[:16]
 
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:

@@ -29,6 +29,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.sensors import Sensor
 from lqrsim.scenes.scene import Scene, load_scene
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
@@ -57,6 +58,7 @@ class Scenario(OneVersion):
       simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
       fit_timestep: whether the plant has the longest physics step that divides the control period, as for a plan of a
         free duration; by default a control period that is not a multiple of the physics step is refused.
+      sensors: sensors of the MJCF that the policy "offset_free" reads; by default it has the measured states.
     """
 
     name: str
@@ -72,6 +74,7 @@ class Scenario(OneVersion):
     goal_tolerance: float | None = None
     simulator: Simulator | None = None
     fit_timestep: bool = False
+    sensors: tuple[Sensor, ...] = ()
 
     def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
         """The goal options of `simulate`: the given ones, or the scenario's own if neither is given.
@@ -120,6 +123,7 @@ class Scenario(OneVersion):
             resolve(self.start, self.problem)
         check_flag("Scenario: fit_timestep", self.fit_timestep)
         check_kind("Scenario: simulator", self.simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
+        keep(self, sensors=check_items("Scenario: sensors", self.sensors, Sensor, "a tuple of Sensor"))
         check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:

@@ -152,7 +152,7 @@ def check_planned(model: mujoco.MjModel, name: str, obstacles: tuple[int, ...]) 
         "actuators": (model.nu == 0, "got none", "at least one <actuator> that has a control"),
         "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),
         "plugins": (model.npluginstate > 0, "got plugins with their own states", "none"),
-        "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),
+        "delays": (model.actuator_history.any(), "got actuators with a delay", "none"),
     }
     for what, (found, got, wanted) in refused.items():
         if found:

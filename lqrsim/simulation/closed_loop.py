@@ -25,6 +25,7 @@ from lqrsim.simulation.effects import Effects
 from lqrsim.simulation.mujoco_physics import MujocoPhysics
 from lqrsim.simulation.physics import Physics, SimulatorPhysics
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.readings import Readings
 from lqrsim.simulation.recorder import Recorder
 from lqrsim.simulation.run_settings import RunSettings
 from lqrsim.versions import versions
@@ -176,6 +177,8 @@ class ClosedLoop:
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
         self.step, self.measured, self._knot = 0, self.states, settings.knot
+        sensors = settings.law.sensors
+        self._readings = None if sensors is None else Readings(sensors, self.effects, self.physics, plan.dt)
 
     def _physics(self) -> Physics:
         plant, trials, substeps = self.settings.plant, self.settings.trials, self.settings.substeps
@@ -199,7 +202,9 @@ class ClosedLoop:
         for step in range(self.settings.knot):
             states, controls = (np.tile(one[step], (trials, 1)) for one in (whole.states, whole.controls))
             self.effects.follow(step, states, controls)
-            self.controller_run.control(step, states)
+            read = self._readings
+            shown = states if read is None else read.follow(step, states, self._held(step))
+            self.controller_run.control(step, shown)
         self.step, self.measured = 0, self.measure(0)
 
     def period(self) -> bool:
@@ -227,8 +232,11 @@ class ClosedLoop:
     def decide(self, step: int, measured: Array) -> Array:
         """The controller's commands (K, m); if it fails, the plan's controls."""
         shape = self.settings.trials, len(self._names)
+        shown, knot = measured, self._knot + step
+        if self._readings is not None:
+            shown = self._readings.arriving(knot, None if step else self._held(knot))
         try:
-            commands = _checked_commands(self.controller_run.control(self._knot + step, measured), shape)
+            commands = _checked_commands(self.controller_run.control(knot, shown), shape)
             failed = _not_finite(commands)
             reasons = [_not_a_number(row, self._names) for row in commands[failed]]
         except Exception as error:  # a controller may raise anything; its trials have failed
@@ -238,6 +246,10 @@ class ClosedLoop:
         self.records.fail(step, failed, reasons)
         self.records.commanded[:, step] = commands
         return np.where(failed[:, None], self.settings.trajectory.controls[step], commands)
+
+    def _held(self, knot: int) -> Array:
+        """The plan's controls (K, m) of the period before a knot; at the first knot those of its first period."""
+        return np.tile(self.settings.whole.controls[max(knot - 1, 0)], (self.settings.trials, 1))
 
     def actuate(self, step: int, commands: Array) -> Array:
         """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""

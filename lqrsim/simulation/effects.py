@@ -62,7 +62,7 @@ class Effects:
         if not np.isfinite(self.displaced).all():
             raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
-        self._kicks = self._hooks("kick")
+        self._reads, self._kicks = self._hooks("read"), self._hooks("kick")
         winds = [(slice(6, 9), 1.0)] if plant.has_medium else []
         if plant.simulator is None or not plant.has_medium:  # an MJCF may have a drag beside its fluid
             winds.append((slice(0, 3), plant.robot.drag))
@@ -131,6 +131,13 @@ class Effects:
         for name, measure in self._measures:
             measured = shaped(name, measure(step, measured), measured.shape)
         return measured
+
+    def read(self, step: int, readings: dict[str, Array]) -> dict[str, Array]:
+        """The readings (K, any) of sensors, by name, with errors."""
+        for label, read in self._reads:
+            found = check_kind(label, read(step, dict(readings)), dict, "readings by the names of sensors")
+            readings = {name: shaped(f"{label}: {name}", found.get(name), one.shape) for name, one in readings.items()}
+        return readings
 
     def actuate(self, step: int, controls: Array) -> Array:
         """The disturbed controls (K, m), before they saturate."""

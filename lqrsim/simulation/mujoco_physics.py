@@ -115,6 +115,21 @@ class MujocoPhysics(Physics):
         self.simulations.forward()
         return self._sensors[:, self.plant.contact] > 0
 
+    def sense(self, held: Array | None = None) -> Array:
+        """MuJoCo's `sensordata` (K, any) of the present, under the controls and forces of the last period.
+
+        The simulations continue as if it had not been asked for.
+
+        Args:
+          held: other controls (K, m) to be in force, as before the first period.
+        """
+        if held is not None:
+            self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(held)
+        before, readings = self.simulations.state.copy(), self.simulations.bind("sensordata")
+        self.simulations.forward()
+        self.simulations.state[:] = before
+        return readings.copy()
+
     def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
         self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench

@@ -19,9 +19,11 @@ from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
+from lqrsim.robots.sensors import RobotSensors, Sensor
 from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
+from lqrsim.scenes.mjcf_sensors import at_once
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
@@ -136,6 +138,19 @@ class Plant(OneVersion):
             return self.simulator.weight
         roots = self.bodies[~np.isin(self.model.body_parentid[self.bodies], self.bodies)]
         return float(self.model.body_subtreemass[roots].sum() * np.linalg.norm(self.model.opt.gravity))
+
+    def sensors(self, sensors: Sequence[Sensor]) -> RobotSensors:
+        """Sensors of the scene's MJCF, for `OffsetFree(sensors=...)` and `SensorErrors`.
+
+        Args:
+          sensors: one for each element of `<sensor>` that is used.
+
+        Raises:
+          InputError: as `RobotSensors`; or a simulator moves the robot, which computes no sensors of an MJCF.
+        """
+        if self.simulator is not None:
+            raise InputError(f"sensors: got a plant simulated by {self.simulator.name}, want one moved by MuJoCo")
+        return RobotSensors(self.robot, self.scene, sensors)
 
     def check_simulator(self, what: str, parameter: str | None = None) -> None:
         """Check that a disturbance can change a parameter of the physics.
@@ -342,7 +357,9 @@ class Plant(OneVersion):
                 # The items to report, their order, and their number.
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
-        return compiled(spec)
+        model = compiled(spec)
+        at_once(model)
+        return model
 
 
 def extent(plant: Plant) -> float:

@@ -185,7 +185,8 @@ def make_controller(
         case "track":
             return track(problem, solution, uncertainty=design_uncertainty(scenario, design))
         case "offset_free":
-            return OffsetFree(problem, solution, design_uncertainty(scenario, design))
+            read = scenario.plant().sensors(scenario.sensors) if scenario.sensors else None
+            return OffsetFree(problem, solution, design_uncertainty(scenario, design), sensors=read)
         case "replan":
             if solution.problem_digest != problem.digest:
                 other = solving.difference(solution, problem)

@@ -37,6 +37,7 @@ from lqrsim.simulation.disturbances.noise import (
 from lqrsim.simulation.disturbances.noise import as_disturbances as as_disturbances
 from lqrsim.simulation.disturbances.presets import PRESETS as PRESETS
 from lqrsim.simulation.disturbances.presets import preset
+from lqrsim.simulation.disturbances.sensors import SensorErrors
 from lqrsim.simulation.disturbances.wind import Dryden, Gusts, MeanWind
 
 KINDS: dict[str, type[Disturbance]] = {
@@ -72,6 +73,7 @@ __all__ = [
     "Payload",
     "Push",
     "Saturation",
+    "SensorErrors",
     "ThrustMismatch",
     "TorqueNoise",
     "WheelRadiusMismatch",

@@ -36,6 +36,7 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import PARAMETERS
 
 Hook = Callable[[int, Array], Array]
+ReadHook = Callable[[int, dict[str, Array]], dict[str, Array]]
 Kick = Callable[[int, Array, Array], Array]
 Numbers = float | Sequence[float]
 
@@ -52,6 +53,8 @@ class Effect:
       alter: called once, before the first step, with MuJoCo's simulations; `simulations.expand(field)` gives each trial
         its own values of a field of the model; the first axis is the trial. Refused for other simulators.
       measure: (step, states (K, n)) -> measured states, (K, n); step runs to T inclusive.
+      read: (step, readings (K, any) by the sensor's name) -> the same with errors; NaN for a reading that gets lost.
+        It is called for a controller that reads sensors of the MJCF.
       actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
@@ -66,6 +69,7 @@ class Effect:
     factors: Mapping[str, Array] | None = None
     alter: Callable[[batch.Batch], None] | None = None
     measure: Hook | None = None
+    read: ReadHook | None = None
     actuate: Hook | None = None
     force: Hook | None = None
     torque: Hook | None = None
@@ -76,7 +80,7 @@ class Effect:
     def __post_init__(self) -> None:
         for name in ("initial_states", "alter"):
             check_function(f"Effect: {name}", getattr(self, name), "a function of one argument, or None", arguments=1)
-        for name in ("measure", "actuate", "force", "torque", "wind"):
+        for name in ("measure", "read", "actuate", "force", "torque", "wind"):
             wanted = "a function of the step and an array, or None"
             check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
         wanted = "a function of the step, states and controls, or None"

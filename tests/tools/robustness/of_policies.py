@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.disturbances import ControlNoise, Unknown
+from lqrsim.disturbances import ControlNoise, Sensor, Unknown
 from robustness.place import Place
 
 
@@ -25,6 +25,8 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
     return {
         "Unknown": (fields(unknown),),
         "Uncertainty": (fields(uncertainty),),
+        "Sensor": (fields(Sensor("create_position", noise=0.1, rate=5.0, delay=0.2)),),
+        "Plant.sensors": ({"self": place.plant, "sensors": [Sensor("create_position")]},),
         "Uncertainty.steady": ({"self": uncertainty, "memory": 5.0, "share": 0.2},),
         "track": (common | chosen, 0.5),
         "OffsetFree": (common | chosen | {"sensors": ("x", "y"), "memory": 5.0, "record": False}, 0.5),

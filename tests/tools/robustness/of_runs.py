@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.disturbances import ControlNoise, Disturbance, Effect, GilbertElliott
+from lqrsim.disturbances import ControlNoise, Disturbance, Effect, GilbertElliott, Sensor
 from robustness.of_problems import print_nothing
 from robustness.place import Place
 
@@ -18,6 +18,7 @@ DISTURBANCES: dict[str, dict[str, Any]] = {
     "MeasurementLatency": {"periods": 1}, "MotorLag": {"time_constant": 0.1},
     "Payload": {"mass": 0.1, "body": "create"},
     "Push": {"impulse": (1.0, 0.0, 0.0), "at": 0.1}, "Saturation": {"share": 0.5},
+    "SensorErrors": {"sensors": [Sensor("create_position", noise=0.01)], "strength": 1.0},
     **{
         kind: {"std": 0.1}
         for kind in (

@@ -1,0 +1,308 @@
+"""An extended Kalman filter on the sensors of an MJCF, which have rates, delays and losses of their own.
+
+It estimates (z, b): z as in `plan_model.py`, and b, the biases of the readings that have one. States are predicted by
+the nonlinear dynamics and readings by MuJoCo, both with the estimates. Covariances are propagated in the run, because
+they depend on what got lost; their derivatives are those along the plan.
+
+A reading that arrives late belongs to an earlier knot. The filter therefore keeps its estimate of the last knot whose
+readings have all had the time to arrive, and from there is run again in each period, with the readings that are known
+by now. The result is that of a filter that had each reading in its place.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.control.controllers import turn_to_nearest
+from lqrsim.control.filter_law import FilterLaw, FilterRun
+from lqrsim.control.kalman import NOTHING, RESOLUTION, KalmanFilter
+from lqrsim.control.plan_model import STEP, PlanModel
+from lqrsim.control.uncertainty import per_entry, triangular_root
+from lqrsim.errors import Array, InputError
+from lqrsim.robots.sensors import RobotSensors
+
+# A reading tells nothing of the state if that moves it by less than this share of the state's own change, or of one
+# step of the differences: those of MuJoCo are good to about 1e-9.
+_SILENT = 1e-8
+_WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+
+
+class Estimate(NamedTuple):
+    """The estimates of K trials at a knot.
+
+    Attributes:
+      z: (K, Z). bias: (K, B). covariance: of the errors of both, (K, Z+B, Z+B).
+    """
+
+    z: Array
+    bias: Array
+    covariance: Array
+
+    def copy(self) -> "Estimate":
+        return Estimate(*(one.copy() for one in self))
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFilter:
+    """The filter about a plan.
+
+    Attributes:
+      model: the linear model that the filter assumes. sensors: what it reads.
+    """
+
+    model: PlanModel
+    sensors: RobotSensors
+
+    @cached_property
+    def biased(self) -> npt.NDArray[np.intp]:
+        """The numbers of the readings that have a bias, (B,)."""
+        return np.flatnonzero(self.sensors.each("bias") + self.sensors.each("bias_walk"))
+
+    @cached_property
+    def late(self) -> list[int]:
+        """For each sensor, the number of periods after which its reading arrives."""
+        return self.sensors.late(self.model.plan.dt)
+
+    @cached_property
+    def _wrench(self) -> Array:
+        """From the values of the unknown parameters to the force and torque on the robot, (6, P)."""
+        names, found = self.model.parameters, np.zeros((6, len(self.model.parameters)))
+        for j, name in enumerate(names):
+            if name in _WRENCH:
+                found[_WRENCH.index(name), j] = 1.0
+            elif name.startswith("wind_"):
+                found["xyz".index(name[-1]), j] = self.sensors.drag
+        return found
+
+    def acting(self, z: Array, controls: Array) -> tuple[Array, Array]:
+        """The controls (K, m) and the force and torque (K, 6) under which readings are taken, for estimates (K, Z).
+
+        Args:
+          controls: (K, m), the command of the period before.
+        """
+        model, first = self.model, self.model.n + self.model.lagging
+        unknown = np.vecdot(model.output, z[:, None, first:])
+        parameters, gains, offsets = np.split(unknown, [len(model.parameters), len(model.parameters) + model.m], axis=1)
+        reached = z[:, model.n : first] if model.lagging else controls
+        return reached * (1 + gains) + offsets, np.vecdot(self._wrench, parameters[:, None])
+
+    @cached_property
+    def _slopes(self) -> tuple[Array, Array, Array]:
+        """Central differences of the readings along the plan: for states, controls, and force and torque."""
+        plan, model = self.model.plan, self.model
+        before = np.maximum(np.arange(plan.steps + 1) - 1, 0)
+        at = np.concatenate([plan.states, plan.controls[before], np.zeros((plan.steps + 1, 6))], axis=1)
+        read, slopes = self.sensors.reader(), np.empty((plan.steps + 1, len(self.sensors.names), at.shape[1]))
+        for j in range(at.shape[1]):
+            step = STEP * np.maximum(np.abs(at[:, j]), 1.0)
+            sides = []
+            for sign in (1.0, -1.0):
+                moved = at.copy()
+                moved[:, j] += sign * step
+                sides.append(read(*np.split(moved, [model.n, model.n + model.m], axis=1)))
+            slopes[:, :, j] = (self._aligned(sides[0], sides[1]) - sides[1]) / (2 * step[:, None])
+        slopes[np.isnan(slopes)] = 0.0  # where a rangefinder meets nothing
+        states, controls, wrench = np.split(slopes, [model.n, model.n + model.m], axis=2)
+        return states, controls, wrench
+
+    @cached_property
+    def H(self) -> Array:
+        """Output matrices of (z, b), (T+1, Y, Z+B).
+
+        Raises:
+          InputError: a sensor reads the same whatever the state and the unknowns are.
+        """
+        model, (states, controls, wrench) = self.model, self._slopes
+        knots, count, first = len(states), len(self.sensors.names), model.n + model.lagging
+        H = np.zeros((knots, count, model.size + len(self.biased)))
+        H[:, :, : model.n] = states
+        H[:, :, model.n : first] = controls[:, :, : model.lagging]
+        planned = model.plan.controls[np.maximum(np.arange(knots) - 1, 0)]
+        effects = np.concatenate([wrench @ self._wrench, controls * planned[:, None], controls], axis=2)
+        H[:, :, first : model.size] = effects @ model.output
+        for one, at in zip(self.sensors.sensors, self.sensors.columns, strict=True):
+            if np.abs(H[:, at, : model.size]).max(initial=0.0) < _SILENT:
+                raise InputError(
+                    f"OffsetFree: sensors: got {one.name!r}, whose reading is the same in all states near the plan,"
+                    " want sensors that see the robot"
+                )
+        H[:, self.biased, model.size + np.arange(len(self.biased))] = 1.0
+        return H
+
+    @cached_property
+    def noise(self) -> Array:
+        """Variances of the readings' noise, (T+1, Y): the sensors' own, and that of white forces and controls.
+
+        Those of one knot count as independent of each other and of the noise on the state.
+        """
+        model, (_, controls, wrench) = self.model, self._slopes
+        told, space = model.uncertainty, model.dynamics.control_coordinates
+        shaken = controls * (per_entry("Uncertainty: control", told.control, space) * (not model.lagging))
+        found = self.sensors.each("noise") ** 2 + np.vecdot(shaken, shaken)
+        for one in told.unknowns:
+            values = np.array([one.shares.get(name, 0.0) for name in model.parameters])
+            if one.white and values.any():
+                found = found + (one.std * wrench @ (self._wrench @ values)) ** 2
+        return found
+
+    def start(self, trials: int, z: Array) -> Estimate:
+        """The estimate before the first reading, with the same z (Z,) for all trials."""
+        size, biased = self.model.size, len(self.biased)
+        covariance = np.zeros((trials, size + biased, size + biased))
+        covariance[:, :size, :size] = self.model.start_root @ self.model.start_root.T
+        own = size + np.arange(biased)
+        covariance[:, own, own] = self.sensors.each("bias")[self.biased] ** 2
+        return Estimate(np.tile(z, (trials, 1)), np.zeros((trials, biased)), covariance)
+
+    def predict(self, covariance: Array, knot: int) -> None:
+        """Propagate covariances (K, Z+B, Z+B) in place over the period that ends at a knot."""
+        model, t = self.model, min(knot, self.model.plan.steps) - 1
+        size, F = model.size, model.F[t]
+        covariance[:, :size] = F @ covariance[:, :size]
+        covariance[:, :, :size] = covariance[:, :, :size] @ F.T
+        covariance[:, :size, :size] += model.process_noise[t]
+        own = size + np.arange(len(self.biased))
+        covariance[:, own, own] += self.sensors.each("bias_walk")[self.biased] ** 2 * model.plan.dt
+
+    def correct(self, covariance: Array, knot: int, known: npt.NDArray[np.bool_], off: Array) -> Array:
+        """Correct covariances in place by the readings that are known (K, Y), one number after the other.
+
+        Args:
+          off: readings minus their predictions, (K, Y).
+
+        Returns:
+          The corrections of (z, b), (K, Z+B).
+        """
+        t = min(knot, self.model.plan.steps)
+        moved = np.zeros(covariance.shape[:2])
+        for i in np.flatnonzero(known.any(axis=0)):
+            row = self.H[t, i]
+            seen = np.vecdot(covariance, row)
+            variance = np.vecdot(seen, row)
+            variance += np.maximum(self.noise[t, i], RESOLUTION**2 * variance) + NOTHING**2
+            gain = np.where(known[:, i, None], seen / variance[:, None], 0.0)
+            moved += gain * np.where(known[:, i], off[:, i] - np.vecdot(moved, row), 0.0)[:, None]
+            covariance -= gain[:, :, None] * seen[:, None, :]
+        return moved
+
+    def due(self, knot: int) -> npt.NDArray[np.bool_]:
+        """Which numbers of the readings (Y,) are taken at a knot."""
+        found = np.zeros(len(self.sensors.names), dtype=bool)
+        for at, due in zip(self.sensors.columns, self.sensors.due(knot, self.model.plan.dt), strict=True):
+            found[at] = due
+        return found
+
+    @cached_property
+    def along(self) -> KalmanFilter:
+        """Its covariances about the plan if no reading gets lost.
+
+        The gain and the innovation are those of a filter that measures what the estimate learns from one knot to the
+        next; laws are designed by no more.
+        """
+        model, size, knots = self.model, self.model.size, self.model.plan.steps + 1
+        slowest, corrected = max(self.late), np.empty((knots, size, size))
+        kept, late = self.start(1, np.zeros(size)).covariance, np.repeat(self.late, self._sizes)
+        for t in range(knots):
+            now = kept
+            for j in range(max(t - slowest, 0), t + 1):
+                now = now.copy()
+                if j:
+                    self.predict(now, j)
+                known = self.due(j) & (j + late <= t)
+                self.correct(now, j, known[None], np.zeros((1, len(known))))
+                if j == t - slowest:
+                    kept = now
+            corrected[t] = now[0, :size, :size]
+        before = model.start_root @ model.start_root.T
+        predicted = np.concatenate([before[None], model.F @ corrected[:-1] @ model.F.transpose(0, 2, 1)])
+        predicted[1:] += model.process_noise
+        learned, root = _root(predicted - corrected), triangular_root(_root(corrected))
+        identity = np.broadcast_to(np.eye(size), learned.shape)
+        return KalmanFilter(learned, predicted, corrected, root, identity, np.zeros((knots, len(model.transition))))
+
+    @property
+    def _sizes(self) -> list[int]:
+        return [at.stop - at.start for at in self.sensors.columns]
+
+    def _aligned(self, readings: Array, near: Array) -> Array:
+        """The readings (K, Y), with each quaternion or its negative, whichever is nearer to another reading's."""
+        found = readings.copy()
+        for at, turns in zip(self.sensors.columns, self.sensors.quaternions, strict=True):
+            if turns:
+                found[:, at] *= np.where(np.vecdot(readings[:, at], near[:, at]) < 0, -1.0, 1.0)[:, None]
+        return found
+
+    def difference(self, readings: Array, expected: Array) -> Array:
+        """Readings minus expectations, (K, Y)."""
+        return self._aligned(readings, expected) - expected
+
+
+def _root(covariance: Array) -> Array:
+    """A square root of each covariance, (T+1, Z, Z); rounding may have made one slightly indefinite."""
+    variances, axes = np.linalg.eigh(covariance)
+    return axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+
+
+class SensorRun(FilterRun):
+    """K trials of a run, with the estimates of a `SensorFilter`.
+
+    Attributes:
+      estimate: the estimate at the newest knot, with the readings that have arrived.
+    """
+
+    def __init__(self, filter_: SensorFilter, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
+        super().__init__(law, trials, records)
+        self._filter, self._read = filter_, filter_.sensors.reader()
+        self.innovations = None  # readings of one knot arrive at several
+        self.estimate = self._kept = filter_.start(trials, law.nominal[0])
+        self._first = 0  # the first knot after that of `_kept`, whose readings have all arrived
+        self._taken, self._acting = dict[int, Array](), dict[int, Array]()
+
+    def take_in(self, step: int, measured: Array) -> None:
+        """Run the filter again, with the readings (K, Y) that arrive at a step."""
+        shape, sensors = (self._trials, len(self._filter.sensors.names)), self._filter.sensors
+        if measured.shape != shape:
+            raise InputError(
+                f"OffsetFree: got measurements of shape {measured.shape}, want readings {shape} of {sensors}, which"
+                " `simulate` has"
+            )
+        self._acting[step] = np.tile(self.model.plan.controls[0], (self._trials, 1))  # before the first period
+        if step:
+            self._acting[step] = self._commands.pop(0)
+        self._taken[step] = np.full(shape, np.nan)
+        for at, late in zip(sensors.columns, self._filter.late, strict=True):
+            if step >= late:
+                self._taken[step - late][:, at] = measured[:, at]
+        now, slowest = self._kept, max(self._filter.late)
+        for knot in range(self._first, step + 1):
+            now = self._advance(now.copy(), knot)
+            if knot == step - slowest:
+                self._kept, self._first = now, knot + 1
+                del self._taken[knot], self._acting[knot]
+        self.estimate, self.z = now, now.z
+        if self.estimates is not None and step < len(self.estimates):
+            self.estimates[step] = self.z
+
+    def _advance(self, estimate: Estimate, knot: int) -> Estimate:
+        """Predict an estimate to a knot, except the first, and correct it by the knot's readings, all in place."""
+        filter_, (z, bias, covariance), model = self._filter, estimate, self.model
+        if knot:
+            self._predict(z, self._acting[knot])
+            filter_.predict(covariance, knot)
+        near = in_c_order(model.plan.states[[min(knot, model.plan.steps)]])
+        states = in_c_order(z[None, :, : model.n])
+        turn_to_nearest(model.dynamics.state_coordinates, states, near)
+        z[:, : model.n] = states[0]
+        known = ~np.isnan(self._taken[knot])
+        if known.any():
+            expected = self._read(states[0], *filter_.acting(z, self._acting[knot]))
+            expected[:, filter_.biased] += bias
+            off = filter_.difference(self._taken[knot], expected)
+            moved = filter_.correct(covariance, knot, known & np.isfinite(off), off)
+            z += moved[:, : model.size]
+            bias += moved[:, model.size :]
+        return estimate

@@ -1,0 +1,87 @@
+"""The errors of the sensors of an MJCF."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.errors import Array, check_items, check_kind, check_name, check_number, keep
+from lqrsim.results.solution_parts import Trajectory
+from lqrsim.robots.sensors import Sensor
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, left_out, normal, uniform
+from lqrsim.simulation.plant import Plant
+
+SETTINGS = tuple(one.name for one in fields(Sensor)[1:])  # all but the name
+
+
+@dataclass(frozen=True)
+class SensorErrors(Disturbance):
+    """Noise, biases and losses of sensors of the MJCF, for a controller that reads them.
+
+    Without it, readings are exact. Rates and delays are those of the controller's sensors in any case.
+
+    Args:
+      sensors: the sensors, as in `plant.sensors`; or the settings of each by its name, as they are kept and stored.
+        Those that the controller does not read have no effect.
+      strength: factor of the standard deviations, and of the chance of a loss, which is at most 1.
+    """
+
+    sensors: Mapping[str, Mapping[str, float]] | Sequence[Sensor]
+    strength: float = 1.0
+
+    discrete = True
+    _scales = "strength"
+
+    def __post_init__(self) -> None:
+        keep(self, strength=check_number("SensorErrors: strength", self.strength, at_least=0.0))
+        given = self.sensors
+        if not isinstance(given, Mapping):
+            known = check_items("SensorErrors: sensors", given, Sensor, "a list of Sensor")
+            given = {one.name: {key: getattr(one, key) for key in SETTINGS} for one in known}
+        for name, one in given.items():
+            wanted = "settings of a Sensor by name"
+            for key in check_kind(f"SensorErrors: sensors: {name}", one, Mapping, wanted):
+                check_name(f"SensorErrors: sensors: {name}", key, SETTINGS)
+        keep(self, sensors=given)
+        keep(self, sensors={one.name: {key: getattr(one, key) for key in SETTINGS} for one in self.known})
+
+    @cached_property
+    def known(self) -> tuple[Sensor, ...]:
+        """The sensors, each as a `Sensor`."""
+        given: Any = self.sensors
+        return tuple(Sensor(name, **one) for name, one in given.items())
+
+    def check(self, plant: Plant) -> None:
+        plant.sensors(self.known)
+
+    def describe(self, plant: Plant) -> str:
+        each = (
+            f"{one.name} (noise {one.noise:g}, bias {one.bias:g} and {one.bias_walk:g} in 1 s, loss {one.loss:g})"
+            for one in plant.sensors(self.known).sensors
+        )
+        return f"errors of sensors, times {self.strength:g}: {', '.join(each)}"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        known, knots = plant.sensors(self.known), plan.steps + 1
+        size = len(known.names)
+        errors = known.each("noise") * normal(generators, knots, size)
+        errors += known.each("bias") * normal(generators, 1, size)
+        walks = normal(generators, plan.steps, size).cumsum(axis=1)
+        errors[:, 1:] += known.each("bias_walk") * np.sqrt(plan.dt) * walks
+        losses = np.array([one.loss for one in known.sensors])
+        lost = uniform(generators, knots, len(losses)) < self.strength * losses
+        errors *= self.strength
+        for i, columns in enumerate(known.columns):
+            errors[..., columns][lost[..., i]] = np.nan
+        of = {one.name: errors[..., columns] for one, columns in zip(known.sensors, known.columns, strict=True)}
+        return Effect(read=partial(_with_errors, of))
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return left_out(self, plant, "OffsetFree has them by its own sensors=", acts=self.strength > 0)
+
+
+def _with_errors(errors: Mapping[str, Array], step: int, readings: Mapping[str, Array]) -> dict[str, Array]:
+    return {name: one + errors[name][:, step] if name in errors else one for name, one in readings.items()}
