@@ -172,6 +172,9 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_runs(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:
         raise InputError(f"form: got 'primal' for {problem.dynamics.name}, whose steps have no inverse, want 'dual'")
+    if problem.control_rate is not None and (settings.form == "primal" or settings.first_pass == "backward"):
+        got = "form='primal'" if settings.form == "primal" else "first_pass='backward'"
+        raise InputError(f"control_rate: got rates with {got}, want neither: the last command has no inverse step")
     if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"
