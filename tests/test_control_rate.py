@@ -31,15 +31,19 @@ def standing() -> Linear:
     return linear([[0.0, 1.0], [9.81, 0.0]], [[0.0], [1.0]], np.zeros((2, 1)), start=[0.1, 0.0], steps=30)
 
 
-def costs(problem: ls.Problem, one: Linear, controls: Array) -> float:
-    """The cost of controls (T, m), written out; the weights of a `linear` problem are 1."""
-    x, total, rate = problem.start, 0.0, problem.control_rate
-    assert x is not None
+def quadratic_program(problem: ls.Problem, one: Linear) -> tuple[Array, Array, float]:
+    """Hessian, gradient and constant of the cost of the controls, in a row; the weights of a `linear` problem are 1."""
+    steps, m = one.plan.controls.shape
+    reached, rate = np.linalg.matrix_power(one.A, steps) @ one.plan.states[0], problem.control_rate
     assert rate is not None
-    for u in controls:
-        total, x = total + 0.5 * u @ u, one.A @ x + one.B @ u
-    weight = 0.0 if rate.weight is None else rate.weight
-    return total + 0.5 * x @ x + 0.5 * float((weight * rates_of(problem, controls) ** 2).sum())
+    moves = np.hstack([np.linalg.matrix_power(one.A, steps - 1 - t) @ one.B for t in range(steps)])
+    weight = np.tile(np.zeros(m) if rate.weight is None else np.asarray(rate.weight), (steps, 1))
+    zero, units = rates_of(problem, np.zeros((steps, m))), np.eye(steps * m).reshape(-1, steps, m)
+    slopes = np.array([(rates_of(problem, unit) - zero).ravel() for unit in units]).T
+    weights = weight[steps - len(zero) :].ravel()
+    hessian = np.eye(steps * m) + moves.T @ moves + slopes.T @ (weights[:, None] * slopes)
+    gradient = moves.T @ reached + slopes.T @ (weights * zero.ravel())
+    return hessian, gradient, 0.5 * float(reached @ reached + weights @ zero.ravel() ** 2)
 
 
 def rates_of(problem: ls.Problem, controls: Array) -> Array:
@@ -56,7 +60,7 @@ def rates_of(problem: ls.Problem, controls: Array) -> Array:
 def test_a_plan_is_that_of_the_quadratic_program(
     size: tuple[int, int], seed: int, weighed: bool, limited: bool, known: bool
 ) -> None:
-    """SciPy's SLSQP on the controls alone, which it finds to some 1e-6; costs then agree to the square of that."""
+    """SciPy's SLSQP finds the controls to some 1e-5; costs then agree to the square of that."""
     (n, m), rng = size, np.random.default_rng(seed)
     one = drawn(rng, n, m)
     weight, high = rng.uniform(0.001, 0.1, size=m), rng.uniform(0.5, 4.0, size=m)
@@ -68,19 +72,23 @@ def test_a_plan_is_that_of_the_quadratic_program(
     problem = replace(one.problem, control_rate=rate)
     solution = ls.smooth(problem)
     assert solution.success
-    shape = one.plan.controls.shape
+    shape, (H, g, constant) = one.plan.controls.shape, quadratic_program(problem, one)
     kept: list[Any] = []
     if limited:
         kept = [
             {"type": "ineq", "fun": lambda u: (rates_of(problem, u.reshape(shape)) - low).ravel()},
             {"type": "ineq", "fun": lambda u: (high - rates_of(problem, u.reshape(shape))).ravel()},
         ]
+
+    def cost(u: Array) -> float:
+        return 0.5 * float(u @ H @ u) + float(g @ u) + constant
+
     found = minimize(
-        lambda u: costs(problem, one, u.reshape(shape)), np.zeros(shape).ravel(), method="SLSQP", constraints=kept,
-        options={"ftol": 1e-13, "maxiter": 500},
+        cost, -np.linalg.solve(H, g), jac=lambda u: H @ u + g, method="SLSQP", constraints=kept,
+        options={"ftol": 1e-14, "maxiter": 500},
     )  # fmt: skip
     controls = solution.trajectory.controls
-    assert solution.cost == pytest.approx(costs(problem, one, controls), rel=1e-9)
+    assert solution.cost == pytest.approx(cost(controls.ravel()), rel=1e-9, abs=1e-12)
     assert solution.cost == pytest.approx(found.fun, rel=1e-7, abs=1e-9)
     np.testing.assert_allclose(controls, found.x.reshape(shape), atol=2e-4)
     if limited:
@@ -208,6 +216,9 @@ class TestPolicies:
         least = expected(best)
         assert least < expected(own) < 4 * least
         assert expected(dropped) > 10 * least  # the pendulum falls
+        remembering = ls.lq.rate_feedback(problem, ls.smooth(problem))
+        best[0, :, 2] = 0.0  # the first last command does not deviate
+        np.testing.assert_allclose(remembering.gain, best, rtol=1e-8, atol=1e-12)
 
 
 class TestReplans:
@@ -299,6 +310,9 @@ def test_an_arm_from_an_mjcf(tmp_path: Path) -> None:
     beyond = np.abs(rates_of(problem, shaken.commanded[0])).max() - 2.0
     assert max(found[f"ControlRate: servo {side}"][0, 0] for side in ("low", "high")) == pytest.approx(beyond)
     assert beyond > 0  # feedback adds to the rates of the plan
+    remembering = ls.lq.rate_feedback(problem, solution)
+    followed = ls.simulate(ls.Plant(robot, robot.scene), solution, controller=remembering)
+    np.testing.assert_allclose(followed.commanded[0], solution.trajectory.controls, atol=1e-4)
     again = ls.prepare(problem).solve(start, solution, previous=rate.previous)
     assert np.abs(rates_of(problem, again.trajectory.controls)).max() <= 2.0
 

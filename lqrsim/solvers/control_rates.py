@@ -17,10 +17,11 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
@@ -31,7 +32,7 @@ from lqrsim.solvers.assembly import clearance_of, copy_of, parts_of
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, is_function
-from lqrsim.solvers.settings import Settings, SmootherSettings
+from lqrsim.solvers.settings import Settings, SmootherSettings, check_problem
 
 P = TypeVar("P", Solution, Replan)
 S = TypeVar("S", bound=Settings)
@@ -78,22 +79,78 @@ def feedback(
     stage = problem.stage_cost + bounding_cost(problem, controls)
     other = problem._with(stage_cost=stage, control_rate=None)
     other = other._with(_terms=problem._terms | {"stage_cost": other._bound(stage.terms)})
-    gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
-    if np.isfinite(states).all() and np.isfinite(controls).all():
-        guess = InitialGuess(gain, controls, multipliers=multipliers[: len(problem.constraints)])
-        run = SolveRun.lent(other, SmootherSettings(), guess, states[0].copy(), Budget(1))
-        run.work.take(states, controls, float(compiled.costs_of(other, states[None], controls[None])[0]))
-        with problem.dynamics.quiet():
-            if np.isfinite(run.linearize_about_plan()):
-                gain = run.work.arrays.policy.gain.copy()
-                cost_to_go = copy_of(Quadratic(*run.work.arrays.to_go))
-        run.give_back()
+    gain, cost_to_go = _gains(other, states, controls, multipliers[: len(problem.constraints)])
     gain, offset = compiled.law_about(states, controls, gain)
     policy = AffinePolicy(
         gain=gain, offset=offset, nominal=states[:-1].copy(), dt=problem.dt,
         state_coordinates=problem.dynamics.state_coordinates, control_coordinates=problem.applied_coordinates,
     )  # fmt: skip
     return policy, cost_to_go
+
+
+def _gains(
+    problem: Problem, states: Array, controls: Array, multipliers: tuple[Multipliers, ...]
+) -> tuple[Array, Quadratic | None]:
+    """Gains (T, m, n) about a plan, and the cost-to-go; zeros and None if there are none."""
+    gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
+    if np.isfinite(states).all() and np.isfinite(controls).all():
+        guess = InitialGuess(gain, controls, multipliers=multipliers)
+        run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
+        run.work.take(states, controls, float(compiled.costs_of(problem, states[None], controls[None])[0]))
+        with problem.dynamics.quiet():
+            if np.isfinite(run.linearize_about_plan()):
+                gain = run.work.arrays.policy.gain.copy()
+                cost_to_go = copy_of(Quadratic(*run.work.arrays.to_go))
+        run.give_back()
+    return gain, cost_to_go
+
+
+def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
+    """The best feedback about a plan for a problem with a `control_rate`, which remembers the last command.
+
+        rollout = ls.simulate(plant, solution, controller=ls.lq.rate_feedback(problem, solution))
+
+    The solution's own policy has no memory, so it has to charge each control for all changes that it may lead to. This
+    one moves a control by little at a time and goes on from there. It measures all states, and like other output
+    feedback it can be simulated, saved and exported to C. It minimises the cost of rates; limits of rates it does not
+    know.
+
+    Args:
+      problem: the problem, with a weight on rates.
+      solution: its solution.
+
+    Raises:
+      InputError: the problem has no such weight, the solution is of another problem, or there is no feedback about its
+        plan.
+    """
+    check_problem(problem)
+    check_kind("solution", solution, Solution, "the Solution of the problem")
+    rate = problem.control_rate
+    if rate is None or rate.weight is None:
+        raise InputError(f"problem: got control_rate={rate!r}, want one with a weight")
+    if solution.problem_digest != problem.digest:
+        raise InputError("solution: got that of another problem, want that of this one")
+    wide, plan, n = with_last_command(problem), solution.trajectory, len(problem.dynamics.state_coordinates)
+    states = _with_commands(plan.states, plan.controls)
+    if rate.previous is not None:
+        states[0, n:] = rate.previous
+    kept = widened(solution, problem, wide).multipliers
+    gain, found = _gains(wide, states, plan.controls, kept)
+    if found is None:
+        raise InputError(f"solution: got a plan without feedback ({solution.status.name}), want one that converged")
+    steps, m = plan.controls.shape
+    pairs = zip(plan.states[:-1], plan.controls, strict=True)
+    each = [problem.dynamics.linearize(x, u, plan.dt) for x, u in pairs]
+    A, B, c = (np.array(one) for one in zip(*each, strict=True))
+    gain, offset = compiled.law_about(states, plan.controls, gain)
+    onto = np.eye(n + m, n)
+    return OutputFeedbackPolicy(
+        gain=gain, offset=offset, correction=np.tile(onto, (steps, 1, 1)), sensor=np.tile(np.eye(n), (steps, 1, 1)),
+        sensor_offset=np.zeros((steps, n)), transition=onto @ A @ onto.T,
+        input=np.concatenate([B, np.tile(np.eye(m), (steps, 1, 1))], axis=1), drift=np.pad(c, [(0, 0), (0, m)]),
+        nominal=states[:-1], dt=plan.dt, state_coordinates=problem.dynamics.state_coordinates,
+        control_coordinates=problem.applied_coordinates, measured_coordinates=problem.dynamics.state_coordinates,
+    )  # fmt: skip
 
 
 def bounding_cost(problem: Problem, controls: Array) -> ControlCost:
