@@ -313,7 +313,7 @@ def test_an_arm_from_an_mjcf(tmp_path: Path) -> None:
     remembering = ls.lq.rate_feedback(problem, solution)
     followed = ls.simulate(ls.Plant(robot, robot.scene), solution, controller=remembering)
     np.testing.assert_allclose(followed.commanded[0], solution.trajectory.controls, atol=1e-4)
-    again = ls.prepare(problem).solve(start, solution, previous=rate.previous)
+    again = ls.prepare(problem).solve(start, solution, previous=robot.hold(start))
     assert np.abs(rates_of(problem, again.trajectory.controls)).max() <= 2.0
 
 
@@ -334,7 +334,7 @@ class TestProblems:
         solution = SOLVED(problem)
         assert solution.problem_digest == problem.digest
         ls.save(solution, tmp_path / "solution.npz")
-        kept = ls.load(tmp_path / "solution.npz")
+        kept = ls.load(tmp_path / "solution.npz", kind=ls.Solution)
         np.testing.assert_array_equal(kept.policy.gain, solution.policy.gain)
         assert kept.policy.gain.shape == (20, 1, 2)
         assert len(ls.smooth(problem, start=kept).iterations) <= len(solution.iterations)

@@ -133,7 +133,7 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
     wide, plan, n = with_last_command(problem), solution.trajectory, len(problem.dynamics.state_coordinates)
     states = _with_commands(plan.states, plan.controls)
     if rate.previous is not None:
-        states[0, n:] = rate.previous
+        states[0, n:] = np.asarray(rate.previous)
     kept = widened(solution, problem, wide).multipliers
     gain, found = _gains(wide, states, plan.controls, kept)
     if found is None:
