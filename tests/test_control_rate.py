@@ -248,6 +248,18 @@ class TestReplans:
         assert np.abs(np.diff(commands, axis=0)).max() <= 4.0 * 0.05 + 1e-12
         assert run.log.solved >= 10
 
+    def test_other_numbers_of_rates_need_no_compiling(self) -> None:
+        problem = pendulum(control_rate=ls.ControlRate(weight=1e-4, limits=4.0))
+        solver, start, state = PREPARED(problem), SOLVED(problem), np.zeros(2)
+        tight = replace(problem, control_rate=ls.ControlRate(weight=2e-4, limits=3.0))
+        found = solver.solve(state, start, problem=tight)
+        assert found.cost == pytest.approx(ls.smooth(tight).cost, rel=1e-5)
+        for rate in (None, ls.ControlRate(weight=1e-4)):
+            with pytest.raises(ls.InputError, match="another structure"):
+                solver.check(replace(problem, control_rate=rate))
+        with pytest.raises(ls.InputError, match="another structure"):
+            ls.prepare(pendulum()).check(problem)
+
     def test_a_live_replanner_keeps_the_limit_too(self) -> None:
         problem = pendulum(control_rate=ls.ControlRate(limits=4.0))
         with ls.Replanner(problem, SOLVED(problem), every=0.1).live(clock=lambda: 0.0) as live:
@@ -324,6 +336,16 @@ class TestProblems:
         assert solution.status is ls.Status.INFEASIBLE
         assert "a rate of torque of at most 0.5 N m/s" in solution.detail
 
+    def test_limits_of_rates_may_have_a_price(self) -> None:
+        """The cost of a plan that pays to exceed them is below that of one that keeps them, and the detail says so."""
+        rate = ls.ControlRate(limits={"torque": 0.5}, previous=0.0)
+        problem = pendulum(control_rate=rate)
+        cheap, kept = ls.smooth(problem, elastic=1e-3), SOLVED(problem)
+        assert cheap.success
+        assert cheap.cost < kept.cost
+        assert np.abs(rates_of(problem, cheap.trajectory.controls)).max() > 0.5
+        assert "a rate of torque" in cheap.detail
+
     def test_what_is_stated_is_said_kept_and_told_apart(self, tmp_path: Path) -> None:
         rate = ls.ControlRate(weight={"N m": 0.002}, limits={"torque": (-3.0, 4.0)})
         problem = pendulum(control_rate=rate)
@@ -378,7 +400,7 @@ class TestProblems:
             with pytest.raises(ls.InputError, match=r"control_rate: got ControlRate.* with "):
                 pendulum(control_rate=rate, **parts)
         problem = pendulum(control_rate=rate)
-        with pytest.raises(ls.InputError, match="form='primal'"):
+        with pytest.raises(ls.InputError, match="form: got 'primal' with control_rate"):
             ls.smooth(replace(problem, initial=ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0])), form="primal")
         with pytest.raises(ls.InputError, match="want none for ilqr"):
             ls.ilqr(problem)

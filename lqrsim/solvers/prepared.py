@@ -79,10 +79,12 @@ def prepare(
         tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
-    if tolerance is None and getattr(problem, "constraints", ()) and settings.second_order(problem):
-        if _can_yield(problem):
+    check_problem(problem)
+    solved = problem if problem.control_rate is None else with_last_command(problem)
+    if tolerance is None and solved.constraints and settings.second_order(solved):
+        if _can_yield(solved):
             settings = replace(settings, tolerance=COARSE)
-        elif settings.final(problem) == FINE:
+        elif settings.final(solved) == FINE:
             settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings, check_threads(threads))
 
@@ -159,7 +161,8 @@ class PreparedSolver:
           InputError: the problem would have to be compiled.
         """
         check_problem(problem)
-        if compiled.structure(problem) != self._structure:
+        other = (problem.control_rate is None) != (self._wide is None)
+        if other or compiled.structure(problem) != self._structure:
             raise InputError(
                 "problem: got another structure, want the prepared one with other numbers: goal, weights,"
                 " obstacles, parameters, limits, steps"

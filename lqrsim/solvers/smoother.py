@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from lqrsim.errors import InputError
+from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
@@ -159,6 +160,11 @@ def smooth_many(
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
+    if problem.control_rate is not None:
+        for option, got, want in (("form", settings.form, "dual"), ("first_pass", settings.first_pass, "forward")):
+            if got != want:
+                raise InputError(f"{option}: got {got!r} with control_rate, want {want!r}: no step leads back from it")
+        problem = with_last_command(problem)  # its constraints have the limits of rates
     if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
         if problem.constraints:
             why = 'None without finish="newton" and stop="optimal"'
@@ -172,9 +178,6 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_runs(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:
         raise InputError(f"form: got 'primal' for {problem.dynamics.name}, whose steps have no inverse, want 'dual'")
-    if problem.control_rate is not None and (settings.form == "primal" or settings.first_pass == "backward"):
-        got = "form='primal'" if settings.form == "primal" else "first_pass='backward'"
-        raise InputError(f"control_rate: got rates with {got}, want neither: the last command has no inverse step")
     if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"
