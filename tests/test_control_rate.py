@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.solvers.control_rates import bounding_cost
+from lqrsim.solvers.control_rates import bounding_cost, feedback
 
 SIZES = [(2, 1), (1, 2)]  # states and controls
 
@@ -113,11 +113,15 @@ def pendulum(**parts: Any) -> ls.Problem:
     )  # fmt: skip
 
 
+def swinging_plainly(x: Array, u: Array) -> list[float]:
+    return [x[1], 2 * u[0] - 9.81 * np.sin(x[0])]
+
+
 def step(x: Array, u: float, dt: float) -> Array:
     """One Runge-Kutta step of the pendulum."""
 
     def rate(x: Array) -> Array:
-        return np.array([x[1], 2 * u - 9.81 * np.sin(x[0])])
+        return np.array(swinging_plainly(x, np.array([u])))
 
     a = rate(x)
     b = rate(x + dt / 2 * a)
@@ -336,6 +340,17 @@ class TestProblems:
         assert solution.status is ls.Status.INFEASIBLE
         assert "a rate of torque of at most 0.5 N m/s" in solution.detail
 
+    def test_a_plan_that_is_not_finite_has_no_feedback(self) -> None:
+        problem = pendulum(control_rate=ls.ControlRate(weight=0.002))
+        solution = SOLVED(problem)
+        lost = ls.Trajectory(np.full((21, 3), np.nan), np.full((20, 1), np.nan), problem.dt)
+        policy, cost_to_go = feedback(problem, lost)
+        assert cost_to_go is None
+        assert not policy.gain.any()
+        failed = replace(solution, status=ls.Status.NOT_FINITE, trajectory=replace(lost, states=lost.states[:, :2]))
+        with pytest.raises(ls.InputError, match="without feedback"):
+            ls.lq.rate_feedback(problem, failed)
+
     def test_limits_of_rates_may_have_a_price(self) -> None:
         """The cost of a plan that pays to exceed them is below that of one that keeps them, and the detail says so."""
         rate = ls.ControlRate(limits={"torque": 0.5}, previous=0.0)
@@ -404,5 +419,7 @@ class TestProblems:
             ls.smooth(replace(problem, initial=ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0])), form="primal")
         with pytest.raises(ls.InputError, match="want none for ilqr"):
             ls.ilqr(problem)
+        with pytest.raises(ls.InputError, match="control_rate: got a FunctionCost"):
+            ls.smooth(problem.with_costs(stage_cost=problem.stage_cost + ls.FunctionCost(lambda x, u, p: x[0] ** 2)))
         with pytest.raises(ls.InputError, match="for a problem without control_rate"):
             pendulum().from_state([0.0, 0.0], previous=[0.0])

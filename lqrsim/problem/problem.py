@@ -110,10 +110,10 @@ class Problem:
         (lowest, highest); by default the actuators' range. Infinite limits mean that the plan has none. Plan and policy
         respect these limits exactly; the policy also respects those of the actuators.
       control_rate: the cost and the limits of the rates of controls, see `ControlRate`; None for neither. A plan keeps
-        the limits, and a solution's cost includes the rates. The policy is a function of the state alone, as of a
-        problem without limits in which each change of control costs at most what it may cost with the changes beside
-        it. A run under disturbances may therefore exceed the limits: a `Replanner` clips its commands to them, others
-        do not, and `violations` says by how much. Costs of runs do not include rates.
+        the limits, and the cost of a solution includes that of rates; costs of runs do not. The policy is a function of
+        the state alone; `lq.rate_feedback` makes the best feedback, which also depends on the last command. Feedback
+        adds to the rates of the plan: a `Replanner` clips its commands to the limits, other controllers do not, and
+        `violations` says by how much they exceed them.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
       begin: time in s of the first knot. The positions of moving obstacles are those at time 0.

@@ -76,10 +76,12 @@ def feedback(
       plan: the plan, with the last command among its states. multipliers: of its constraints.
     """
     states, controls = _narrow(plan, problem).states, plan.controls
-    stage = problem.stage_cost + bounding_cost(problem, controls)
-    other = problem._with(stage_cost=stage, control_rate=None)
-    other = other._with(_terms=problem._terms | {"stage_cost": other._bound(stage.terms)})
-    gain, cost_to_go = _gains(other, states, controls, multipliers[: len(problem.constraints)])
+    gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
+    if plan.finite:
+        stage = problem.stage_cost + bounding_cost(problem, controls)
+        other = problem._with(stage_cost=stage, control_rate=None)
+        other = other._with(_terms=problem._terms | {"stage_cost": other._bound(stage.terms)})
+        gain, cost_to_go = _gains(other, states, controls, multipliers[: len(problem.constraints)])
     gain, offset = compiled.law_about(states, controls, gain)
     policy = AffinePolicy(
         gain=gain, offset=offset, nominal=states[:-1].copy(), dt=problem.dt,
@@ -91,17 +93,16 @@ def feedback(
 def _gains(
     problem: Problem, states: Array, controls: Array, multipliers: tuple[Multipliers, ...]
 ) -> tuple[Array, Quadratic | None]:
-    """Gains (T, m, n) about a plan, and the cost-to-go; zeros and None if there are none."""
+    """Gains (T, m, n) about a finite plan, and the cost-to-go; zeros and None if there are none."""
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
-    if np.isfinite(states).all() and np.isfinite(controls).all():
-        guess = InitialGuess(gain, controls, multipliers=multipliers)
-        run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
-        run.work.take(states, controls, float(compiled.costs_of(problem, states[None], controls[None])[0]))
-        with problem.dynamics.quiet():
-            if np.isfinite(run.linearize_about_plan()):
-                gain = run.work.arrays.policy.gain.copy()
-                cost_to_go = copy_of(Quadratic(*run.work.arrays.to_go))
-        run.give_back()
+    guess = InitialGuess(gain, controls, multipliers=multipliers)
+    run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
+    run.work.take(states, controls, float(compiled.costs_of(problem, states[None], controls[None])[0]))
+    with problem.dynamics.quiet():
+        if np.isfinite(run.linearize_about_plan()):
+            gain = run.work.arrays.policy.gain.copy()
+            cost_to_go = copy_of(Quadratic(*run.work.arrays.to_go))
+    run.give_back()
     return gain, cost_to_go
 
 
@@ -135,7 +136,7 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
     if rate.previous is not None:
         states[0, n:] = np.asarray(rate.previous)
     kept = widened(solution, problem, wide).multipliers
-    gain, found = _gains(wide, states, plan.controls, kept)
+    gain, found = _gains(wide, states, plan.controls, kept) if plan.finite else (np.zeros(0), None)
     if found is None:
         raise InputError(f"solution: got a plan without feedback ({solution.status.name}), want one that converged")
     steps, m = plan.controls.shape
