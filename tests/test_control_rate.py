@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_plans import DT, Linear, linear
-from sampling import examples
+from sampling import examples, rarely
 from scipy.optimize import minimize
 
 import lqrsim as ls
@@ -149,6 +149,39 @@ def test_a_nonlinear_plan_is_that_of_single_shooting(solver: Any) -> None:
     np.testing.assert_allclose(solution.trajectory.controls[:, 0], found.x, atol=1e-3)
     many = ls.smooth_many([problem, problem], tolerance=1e-10)
     assert solver is ls.ilqr or [one.cost for one in many] == [solution.cost] * 2
+
+
+@pytest.mark.parametrize("level", ["symbolic", *rarely("plain")])
+def test_balls_at_places_that_depend_on_parameters_keep_clear(level: str) -> None:
+    """The end of a pendulum stops at a post, at the distance that its angle and its length say."""
+
+    def end(x: Any, p: Any) -> list[list[Any]]:
+        from sympy import cos, sin
+
+        wide, high = (sin, cos) if level == "symbolic" else (np.sin, np.cos)
+        return [[p.length * wide(x[0]), 0, -p.length * high(x[0])]]
+
+    def rate(x: Any, u: Any, p: Any) -> list[Any]:
+        from sympy import sin
+
+        return [x.speed, (u.torque - sin(x.angle)) / p.length]
+
+    dynamics = ls.Dynamics(
+        rate, states={"angle": "rad", "speed": "rad/s"}, controls={"torque": "N m"}, parameters={"length": 0.5}
+    )
+    post = ls.Obstacle("post", "sphere", np.array([0.55, 0.0, 0.0]), np.eye(3), np.array([0.1, 0.0, 0.0]))
+    balls = ls.CollisionSpheres(end, [0.05], level=level)
+    clear = ls.Clearance(ls.World([post]), balls=balls)
+    final = ls.QuadraticCost([100.0, 1.0], about=[1.55, 0.0])
+    rates = ls.ControlRate(weight=1e-3)
+    problem = replace(pendulum(), dynamics=dynamics, constraints=[clear], final_cost=final, control_rate=rates)
+    solution = ls.smooth(problem)
+    assert solution.success
+    ends = 0.5 * np.stack([np.sin(solution.trajectory.states[:, 0]), -np.cos(solution.trajectory.states[:, 0])], axis=1)
+    distances = np.linalg.norm(ends - [0.55, 0.0], axis=1) - 0.15
+    assert solution.clearance is not None
+    np.testing.assert_allclose(solution.clearance, distances, atol=1e-12)
+    assert 0 <= distances.min() < 1e-5
 
 
 class TestPolicies:

@@ -66,11 +66,16 @@ class LastCommand(Dynamics):
     def curvature_source(self) -> Source | None:
         return self.step_source if self.of.step_curvature else None
 
+    @property
+    def data(self) -> Array:
+        """The addresses that the kernels read."""
+        functions = *self.of.compiled.addresses("advance", "step_jacobian"), self.of.step_curvature
+        return np.array([*functions, self._own_numbers.ctypes.data], dtype=np.float64)
+
     @cached_property
-    def data(self) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride, reportIncompatibleVariableOverride]
-        self._numbers_of = numbers_of(self.of)  # kept, for its address is in use
-        found = *self.of.compiled.addresses("advance", "step_jacobian"), self.of.step_curvature
-        return np.array([*found, self._numbers_of.ctypes.data], dtype=np.float64)
+    def _own_numbers(self) -> Array:
+        """The numbers of the dynamics without, kept where their address is in use."""
+        return numbers_of(self.of)
 
     def _own(self, states: npt.ArrayLike) -> Array:
         """States (..., n) without the last command."""
