@@ -28,7 +28,9 @@ def drawn(rng: np.random.Generator, n: int, m: int, steps: int = 8) -> Linear:
 
 def standing() -> Linear:
     """A pendulum that stands on its pivot, linearised, pushed by one control."""
-    return linear([[0.0, 1.0], [9.81, 0.0]], [[0.0], [1.0]], np.zeros((2, 1)), start=[0.1, 0.0], steps=30)
+    return linear(
+        [[0.0, 1.0], [9.81, 0.0]], [[0.0], [1.0]], np.zeros((2, 1)), start=[0.1, 0.0], controls=np.zeros((60, 1))
+    )
 
 
 def quadratic_program(problem: ls.Problem, one: Linear) -> tuple[Array, Array, float]:
@@ -111,6 +113,22 @@ def pendulum(**parts: Any) -> ls.Problem:
         dynamics=dynamics, dt=0.05, steps=20, initial=ls.FixedState([0.0, 0.0]), stage_cost=ls.ControlCost([0.05]),
         final_cost=ls.QuadraticCost([20.0, 1.0], about=[1.5, 0.0]), **parts,
     )  # fmt: skip
+
+
+SOLUTIONS: dict[str, ls.Solution] = {}  # by the problem's hash, for problems that several tests solve
+SOLVERS: dict[str, ls.types.PreparedSolver] = {}
+
+
+def solved(problem: ls.Problem) -> ls.Solution:
+    if problem.digest not in SOLUTIONS:
+        SOLUTIONS[problem.digest] = ls.smooth(problem)
+    return SOLUTIONS[problem.digest]
+
+
+def prepared(problem: ls.Problem) -> ls.types.PreparedSolver:
+    if problem.digest not in SOLVERS:
+        SOLVERS[problem.digest] = ls.prepare(problem)
+    return SOLVERS[problem.digest]
 
 
 def swinging_plainly(x: Array, u: Array) -> list[float]:
@@ -252,7 +270,7 @@ class TestPolicies:
         dropped = best * [1.0, 1.0, 0.0]
         least = expected(best)
         assert least < expected(own) < 4 * least
-        assert expected(dropped) > 10 * least  # the pendulum falls
+        assert expected(dropped) > 1000 * least  # the pendulum falls
         remembering = ls.lq.rate_feedback(problem, ls.smooth(problem))
         best[0, :, 2] = 0.0  # the first last command does not deviate
         np.testing.assert_allclose(remembering.gain, best, rtol=1e-8, atol=1e-12)
@@ -263,11 +281,11 @@ class TestReplans:
     @settings(max_examples=examples(12))
     def test_a_replan_goes_on_from_the_last_command(self, seed: int) -> None:
         problem = pendulum(control_rate=ls.ControlRate(weight=1e-4, limits=4.0))
-        before, rng = SOLVED(problem), np.random.default_rng(seed)
+        before, rng = solved(problem), np.random.default_rng(seed)
         state = before.trajectory.states[3] + 0.05 * rng.normal(size=2)
         last = before.trajectory.controls[2] + 0.1 * rng.normal(size=1)
         start = before.shifted(3, horizon="shrinking")
-        again = PREPARED(problem).solve(state, start, after=3, previous=last)
+        again = prepared(problem).solve(state, start, after=3, previous=last)
         assert again.success
         controls = np.vstack([last, again.trajectory.controls])
         assert np.abs(np.diff(controls, axis=0)).max() <= 4.0 * 0.05
@@ -277,7 +295,7 @@ class TestReplans:
     @pytest.mark.parametrize("options", [{"deadline": 0.0}, {}, {"horizon": "moving"}, {"predict": False}])
     def test_commands_never_jump_more_than_the_limit(self, options: dict[str, Any]) -> None:
         problem = pendulum(control_rate=ls.ControlRate(weight=1e-4, limits=4.0))
-        run = ls.Replanner(problem, SOLVED(problem), every=0.1, **options).start(2)
+        run = ls.Replanner(problem, solved(problem), every=0.1, **options).start(2)
         rng, x, commands = np.random.default_rng(3), np.zeros((2, 2)), []
         for t in range(16):
             commands.append(run.control(t, x + 0.03 * rng.normal(size=x.shape)))
@@ -287,7 +305,7 @@ class TestReplans:
 
     def test_other_numbers_of_rates_need_no_compiling(self) -> None:
         problem = pendulum(control_rate=ls.ControlRate(weight=1e-4, limits=4.0))
-        solver, start, state = PREPARED(problem), SOLVED(problem), np.zeros(2)
+        solver, start, state = prepared(problem), solved(problem), np.zeros(2)
         tight = replace(problem, control_rate=ls.ControlRate(weight=2e-4, limits=3.0))
         found = solver.solve(state, start, problem=tight)
         assert found.cost == pytest.approx(ls.smooth(tight).cost, rel=1e-5)
@@ -299,23 +317,9 @@ class TestReplans:
 
     def test_a_live_replanner_keeps_the_limit_too(self) -> None:
         problem = pendulum(control_rate=ls.ControlRate(limits=4.0))
-        with ls.Replanner(problem, SOLVED(problem), every=0.1).live(clock=lambda: 0.0) as live:
+        with ls.Replanner(problem, solved(problem), every=0.1).live(clock=lambda: 0.0) as live:
             first = live.step([0.0, 0.0], 0.0)
             assert np.abs(live.step([0.5, 2.0], 0.05) - first).max() <= 4.0 * 0.05 + 1e-12
-
-
-SOLUTIONS: dict[str, ls.Solution] = {}
-SOLVERS: dict[str, ls.types.PreparedSolver] = {}
-
-
-def SOLVED(problem: ls.Problem) -> ls.Solution:
-    return SOLUTIONS.setdefault(problem.digest, ls.smooth(problem))
-
-
-def PREPARED(problem: ls.Problem) -> ls.types.PreparedSolver:
-    if problem.digest not in SOLVERS:
-        SOLVERS[problem.digest] = ls.prepare(problem)
-    return SOLVERS[problem.digest]
 
 
 ARM = """<mujoco>
@@ -375,7 +379,7 @@ class TestProblems:
 
     def test_a_plan_that_is_not_finite_has_no_feedback(self) -> None:
         problem = pendulum(control_rate=ls.ControlRate(weight=0.002))
-        solution = SOLVED(problem)
+        solution = solved(problem)
         lost = ls.Trajectory(np.full((21, 3), np.nan), np.full((20, 1), np.nan), problem.dt)
         policy, cost_to_go = feedback(problem, lost)
         assert cost_to_go is None
@@ -388,7 +392,7 @@ class TestProblems:
         """The cost of a plan that pays to exceed them is below that of one that keeps them, and the detail says so."""
         rate = ls.ControlRate(limits={"torque": 0.5}, previous=0.0)
         problem = pendulum(control_rate=rate)
-        cheap, kept = ls.smooth(problem, elastic=1e-3), SOLVED(problem)
+        cheap, kept = ls.smooth(problem, elastic=1e-3), solved(problem)
         assert cheap.success
         assert cheap.cost < kept.cost
         assert np.abs(rates_of(problem, cheap.trajectory.controls)).max() > 0.5
@@ -401,7 +405,7 @@ class TestProblems:
         others = [None, replace(rate, weight=0.003), replace(rate, limits=4.0), replace(rate, previous=0.0)]
         assert len({problem.digest, *(pendulum(control_rate=one).digest for one in others)}) == 5
         assert pickle.loads(pickle.dumps(problem)).digest == problem.digest
-        solution = SOLVED(problem)
+        solution = solved(problem)
         assert solution.problem_digest == problem.digest
         ls.save(solution, tmp_path / "solution.npz")
         kept = ls.load(tmp_path / "solution.npz", kind=ls.Solution)
@@ -414,9 +418,9 @@ class TestProblems:
     )
     def test_starts_are_those_of_the_problem(self, start: Any) -> None:
         problem = pendulum(control_rate=ls.ControlRate(weight=0.002, limits=5.0))
-        assert ls.smooth(problem, start=start).cost == pytest.approx(SOLVED(problem).cost, rel=1e-7)
-        for given_one in (SOLVED(problem).trajectory, SOLVED(problem).policy):
-            assert ls.smooth(problem, start=given_one).cost == pytest.approx(SOLVED(problem).cost, rel=1e-7)
+        assert ls.smooth(problem, start=start).cost == pytest.approx(solved(problem).cost, rel=1e-7)
+        for given_one in (solved(problem).trajectory, solved(problem).policy):
+            assert ls.smooth(problem, start=given_one).cost == pytest.approx(solved(problem).cost, rel=1e-7)
 
     def test_a_soft_start(self) -> None:
         """Weights on the start add a cost that vanishes as they grow: relative to 1e8, by some 1e-7."""
@@ -424,7 +428,7 @@ class TestProblems:
         soft = ls.QuadraticCost([1e8, 1e8], about=[0.0, 0.0])
         found = ls.smooth(replace(pendulum(control_rate=rate), initial=soft))
         assert found.success
-        assert found.cost == pytest.approx(SOLVED(pendulum(control_rate=rate)).cost, rel=1e-5)
+        assert found.cost == pytest.approx(solved(pendulum(control_rate=rate)).cost, rel=1e-5)
 
     @pytest.mark.parametrize(
         ("stated", "message"),
