@@ -438,6 +438,7 @@ class TestProblems:
             ({"limits": (1.0, 2.0)}, "want a range with 0 inside"),
             ({"limits": -1.0}, "want a range with 0 inside"),
             ({"weight": [1.0, 2.0]}, "got 2 numbers, want 1"),
+            ({"limits": {"torque": ([-1.0, -2.0], 1.0)}}, "want one range for a control"),
             ({"weight": {"force": 1.0}}, "'force'"),
             ({"limits": 1.0, "previous": np.nan}, "want finite numbers"),
         ],

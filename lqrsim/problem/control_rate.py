@@ -75,7 +75,7 @@ class ControlRate:
         limits: Any = self.limits
         if isinstance(limits, Mapping):
             sides = np.tile([[-inf], [inf]], len(space))
-            for i, (low, high) in space._by_name("ControlRate: limits", limits, _range).items():
+            for i, (low, high) in space._by_name("ControlRate: limits", limits, _range_of_one).items():
                 sides[:, i] = low, high
             limits = sides[0], sides[1]
         if limits is not None:
@@ -123,6 +123,14 @@ def _range(field: str, given: Any) -> tuple[Array, Array]:
         low = -high
     if not ((low < 0).all() and (high > 0).all()):
         raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want a range with 0 inside")
+    return low, high
+
+
+def _range_of_one(field: str, given: Any) -> tuple[Array, Array]:
+    """As `_range`, for one control."""
+    low, high = _range(field, given)
+    if low.ndim or high.ndim:
+        raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want one range for a control")
     return low, high
 
 
