@@ -19,6 +19,7 @@ from .errors import InputError as InputError
 from .problem.clearance import Clearance as Clearance
 from .problem.collision_spheres import CollisionSpheres as CollisionSpheres
 from .problem.constraints import Constraint as Constraint
+from .problem.control_rate import ControlRate as ControlRate
 from .problem.costs import Cost as Cost
 from .problem.derivative_check import check_derivatives as check_derivatives
 from .problem.dynamics import Dynamics as Dynamics

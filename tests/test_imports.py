@@ -61,8 +61,18 @@ FLOORS_WITHIN = {
         ("collision_shape",),
         ("costs",),
         ("constraints",),
-        ("clearance", "formulas", "limit_cost", "obstacle_cost", "plain_term", "quadratic_cost", "state_bounds"),
+        (
+            "clearance",
+            "control_rate",
+            "formulas",
+            "limit_cost",
+            "obstacle_cost",
+            "plain_term",
+            "quadratic_cost",
+            "state_bounds",
+        ),
         ("problem",),
+        ("last_command",),
     ),
     "solvers": (
         ("budget", "compiled", "initial_guess"),
@@ -70,7 +80,7 @@ FLOORS_WITHIN = {
         ("curvature",),
         ("engine", "interior_point", "parallel"),
         ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
-        ("interior_run", "restoration", "risk"),
+        ("control_rates", "interior_run", "restoration", "risk"),
         ("constrained", "free_duration", "reach"),
         ("strategy",),
     ),
@@ -209,4 +219,4 @@ def test_help_is_fast(command: str) -> None:
 
 
 def test_the_top_has_what_most_users_need_and_the_rest_has_rooms() -> None:
-    assert len(lqrsim.__all__) <= 71
+    assert len(lqrsim.__all__) <= 72

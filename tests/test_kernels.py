@@ -91,6 +91,8 @@ from lqrsim.kernels.records import (
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
+from lqrsim.problem.control_rate import RateCost, RateLimits
+from lqrsim.problem.last_command import LastCommand
 from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.results.archive import sha256
 from lqrsim.robots.force_limits import ForceLimits
@@ -925,6 +927,10 @@ class TestParts:
         low, high = {"x": X[0] + 0.3, "y": X[1] - 0.3}, {"x": X[0] + 0.4, "y": X[1] - 0.4}
         of_term(LimitCost(low, high, weight=3.0).bind(CART))
 
+    def test_costs_of_rates(self) -> None:
+        rate = ls.ControlRate(weight=[2.0, 3.0])._in(CART)
+        of_term(RateCost(rate, 0.2).bind(LastCommand(CART)), np.append(X, U - 0.3))
+
     @pytest.mark.parametrize("given", [False, True])
     def test_costs_that_are_functions(self, given: bool) -> None:
         def cost(x, u, p):
@@ -957,6 +963,8 @@ class TestParts:
         of_constraint(ls.StateBounds(x=(0.5, np.inf), y=(-np.inf, 0.2)).bind(CART))
         of_constraint(ls.GoalState([1.0, 0.0, 0.0]).bind(CART), equality=1)
         rng = np.random.default_rng(0)
+        wide, rate = LastCommand(CART), ls.ControlRate(weight=2.0, limits=0.5)._in(CART)
+        of_constraint(RateLimits(rate, 0.2).bind(wide), x=np.append(X, U - 0.3))
         limits = [ForceLimit(f"of a{i}", "N", -1.0, 2.0, rng.normal(size=6), False, i) for i in range(2)]
         of_constraint(ForceLimits(limits, rng.normal(size=(4, 2, 6))).bind(CART))
 
@@ -1013,6 +1021,14 @@ class TestParts:
             jacobian=jacobian if given else None, level="plain",
         )  # fmt: skip
         self.steps(dynamics, X, U, 0.1)
+
+    def test_dynamics_with_the_last_command(self) -> None:
+        wide, w = LastCommand(CART), 7
+        x, sizes, numbers = np.append(X, U - 0.3), {"N": 5, "M": 2, "W": w}, numbers_of(wide)
+        replay(wide.step_source, sizes, "advance", x, U, numbers, 0.1, np.zeros(5))
+        replay(wide.step_source, sizes, "step_jacobian", x, U, numbers, 0.1, np.zeros(5), np.zeros((5, w)))
+        arrays = np.linspace(-1.0, 2.0, 5), np.zeros(5), np.zeros((5, w)), np.zeros((w, w))
+        replay(wide.step_source, sizes, "step_curvature", x, U, numbers, 0.1, *arrays)
 
     @staticmethod
     def steps(dynamics: ls.Dynamics, x: Array, u: Array, dt: float) -> None:

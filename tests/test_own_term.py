@@ -137,7 +137,7 @@ def test_costs_that_cannot_have_another_state_say_so() -> None:
         return x[0] ** 2
 
     own = ls.FunctionCost(function, depends_on=("vx",))
-    with pytest.raises(ls.InputError, match="duration: got a FunctionCost beside it"):
+    with pytest.raises(ls.InputError, match="duration and control_rate: got a FunctionCost beside"):
         ls.smooth(stated(OWN + own, duration=(1.0, 9.0)))
 
 

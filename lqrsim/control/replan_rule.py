@@ -59,13 +59,17 @@ class ActivePlan:
 
 @dataclass(frozen=True, eq=False)
 class SolveRequest:
-    """A solve to be done at a step, from a state (n,) and with a law, for a plan that begins at a later step."""
+    """A solve to be done at a step, from a state (n,) and with a law, for a plan that begins at a later step.
+
+    `previous` (m,) is the last command before that step; None unless the problem has a `control_rate`.
+    """
 
     step: int
     first: int
     state: Array
     start: Plan | InitialGuess
     problem: Problem
+    previous: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,35 +296,60 @@ class ReplanRule:
         return not (level > 0 and self.when.deviation(state, t, about=about) <= level)
 
     def request(
-        self, active: ActivePlan, step: int, state: Array, problem: Problem, *, late: float = 0.0
-    ) -> SolveRequest:
-        """The solve for a control period, from a state (n,) that was measured `late` seconds after the period began."""
+        self, active: ActivePlan, step: int, state: Array, problem: Problem, *, late: float = 0.0,
+        sent: Array | None = None,
+    ) -> SolveRequest:  # fmt: skip
+        """The solve for a control period, from a state (n,) that was measured `late` seconds after the period began.
+
+        `sent` (m,) is the command of the period before it, if there was one.
+        """
         plan, first = active.plan, step + self.delay
         row = active.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
-        if self.delay and self.predict:
-            here = self._ahead(active, step, here, problem, late)
+        if self.delay and (self.predict or problem.control_rate is not None):
+            there, command = self._ahead(active, step, here, problem, late)
+            here, sent = there if self.predict else here, sent if command is None else command
         done = min(first - active.first, plan.trajectory.steps - 1)
-        return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem)
+        previous = sent if problem.control_rate is not None else None
+        return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem, previous)
 
-    def _ahead(self, active: ActivePlan, step: int, state: Array, problem: Problem, late: float) -> Array:
-        """The state that the law in force reaches by the deadline, according to the model."""
+    def _ahead(
+        self, active: ActivePlan, step: int, state: Array, problem: Problem, late: float
+    ) -> tuple[Array, Array | None]:
+        """The state that the law in force reaches by the deadline, according to the model, and its last command."""
         policy, dt = active.plan.policy, problem.dt
-        rows = [active.row(step + i) for i in range(self.delay)]
+        rows, controls = [active.row(step + i) for i in range(self.delay)], None
         if late > 1e-9 * dt:
             rest, now = problem.dynamics.period_near(dt - late), rows.pop(0)
             if rest > 0:
-                state = compiled.rollout(problem, policy.gain[[now]], policy.offset[[now]], state, dt=rest)[0][-1]
+                states, controls = compiled.rollout(problem, policy.gain[[now]], policy.offset[[now]], state, dt=rest)
+                state = states[-1]
         if rows:
-            state = compiled.rollout(problem, policy.gain[rows], policy.offset[rows], state)[0][-1]
-        return state
+            states, controls = compiled.rollout(problem, policy.gain[rows], policy.offset[rows], state)
+            state = states[-1]
+        return state, None if controls is None else controls[-1]
 
     def solve(self, request: SolveRequest, time_limit: float | None = None) -> Replan:
         """The answer to a request."""
         problem, after = request.problem, request.first
         if self.horizon == "moving":
             problem, after = problem.later(request.first * problem.dt), 0
-        return self.solver.solve(request.state, request.start, problem=problem, after=after, time_limit=time_limit)
+        return self.solver.solve(
+            request.state, request.start, problem=problem, after=after, time_limit=time_limit,
+            previous=request.previous,
+        )  # fmt: skip
+
+
+def within_rates(commands: Array, problem: Problem, sent: Array | None) -> Array:
+    """Commands (..., m) within the limits of rates after those of the period before; `sent` is None if there is none.
+
+    Plans keep these limits, but feedback adds to their rates.
+    """
+    rate = problem.control_rate
+    if rate is None or rate.limits is None or sent is None:
+        return commands
+    low, high = np.asarray(rate.limits) * problem.dt
+    return np.clip(commands, sent + low, sent + high)
 
 
 def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str) -> Funnel | None:

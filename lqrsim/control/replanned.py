@@ -56,7 +56,7 @@ class ReplannedRun(ControllerRun):
             for k in range(trials)
         ]
         self.plans: list[dict[int, Trajectory]] = [{} for _ in range(trials)]
-        self.log = ReplanLog()
+        self.log, self._sent = ReplanLog(), list[Array | None]([None] * trials)
 
     def control(self, step: int, measured: Array) -> Array:
         commands: list[Array] = []
@@ -65,6 +65,7 @@ class ReplannedRun(ControllerRun):
             if self._rule.due(step, max(step - 1, 0)) and not run.estimator_diverged():
                 self._replan(run, k, step)
             commands.append(run.command(step))
+            self._sent[k] = commands[-1][0]
         return np.concatenate(commands)
 
     def estimator_diverged(self) -> Mapping[int, str]:
@@ -109,7 +110,8 @@ class ReplannedRun(ControllerRun):
             return
         plan = law.plan
         start = InitialGuess(gain, in_c_order(offset), cost_to_go=plan.shifted(done, horizon="shrinking").cost_to_go)
-        solution = self._rule.solve(SolveRequest(step, step, here, start, problem))
+        sent = self._sent[trial] if problem.control_rate is not None else None
+        solution = self._rule.solve(SolveRequest(step, step, here, start, problem, sent))
         if not self.log.enter(step, trial, solution):
             return
         self.plans[trial][step] = solution.trajectory

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
-from lqrsim.control.replan_rule import ActivePlan, ReplanLog, ReplanRule, SolveRequest
+from lqrsim.control.replan_rule import ActivePlan, ReplanLog, ReplanRule, SolveRequest, within_rates
 from lqrsim.errors import (
     Array,
     InputError,
@@ -80,6 +80,7 @@ class LiveReplanner:
         self._interpolate = check_flag("Replanner.live: interpolate", interpolate)
         self.problem, self.active, self.log = rule.problem, ActivePlan(rule.solution, 0), ReplanLog()
         self._asked = -1  # the step at which a solve was last due
+        self._step, self._command, self._sent = -1, None, None  # of the last call, and the command of a period before
         self._solve: _Solve | None = None
         self._queue: queue.SimpleQueue[_Solve | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -146,7 +147,11 @@ class LiveReplanner:
         if self._solve is None and self._rule.due(step, self._asked):
             self._ask(state, t, step)
         policy = self.active.plan.policy
-        return policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
+        command = policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
+        if step != self._step:
+            self._step, self._sent = step, self._command
+        self._command = within_rates(command, self.problem, self._sent)
+        return self._command
 
     def _ask(self, state: Array, t: float, step: int) -> None:
         """Begin a solve, of a state that is measured within a control period, unless that is in the funnel."""
@@ -155,7 +160,7 @@ class LiveReplanner:
         if not self._rule.outside(self.active, step, state, late=max(late, 0.0)):
             return
         problem = self._rule.problem_at(step, self.problem)
-        request = self._rule.request(self.active, step, state, problem, late=late)
+        request = self._rule.request(self.active, step, state, problem, late=late, sent=self._command)
         solve = _Solve(request, begun + self._rule.delay * dt - late)
         self._solve = solve
         self._queue.put(solve)
@@ -199,8 +204,9 @@ class Replanner(Controller):
 
     Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
     plan that is not ready by the deadline is not used. A reference moves with time, see `QuadraticCost`; other costs
-    that depend on the step's number are not supported. Running a re-planner does not change it, so several runs can
-    share it.
+    that depend on the step's number are not supported. With a `control_rate`, each plan goes on from the last command,
+    and commands are clipped to the limits of rates. Running a re-planner does not change it, so several runs can share
+    it.
 
     In a simulation a solve takes as long as `computing` says. With a number or a function, the results are
     bit-identical on all machines. With "measured" they depend on the speed of the machine. The rollout's
@@ -314,6 +320,7 @@ class ReplannerRun(ControllerRun):
         self._problem = of.problem  # as last known
         self.active = [ActivePlan(of.solution, 0)] * trials
         self._next: list[ActivePlan | None] = [None] * trials  # put into force at the step at which they begin
+        self._sent: Array | None = None  # the commands of the period before
 
     def control(self, step: int, measured: Array) -> Array:
         self._activate(step)
@@ -324,7 +331,8 @@ class ReplannerRun(ControllerRun):
         for trial, active in enumerate(self.active):
             row, policy, one = active.row(step), active.plan.policy, measured[trial : trial + 1]
             commands[trial] = self._evaluate(one, policy.gain[row], policy.offset[row], policy.nominal[row])[0]
-        return commands
+        self._sent = within_rates(commands, self._problem, self._sent)
+        return self._sent
 
     def moved_goal(self) -> Array | None:
         goal, first = self._problem.weighed_goal, self._of.problem.weighed_goal
@@ -345,7 +353,8 @@ class ReplannerRun(ControllerRun):
         rule = self._rule
         self._problem = problem = rule.problem_at(step, rule.problem)
         trials = [k for k, active in enumerate(self.active) if rule.outside(active, step, measured[k])]
-        requests = [rule.request(self.active[k], step, measured[k], problem) for k in trials]
+        sent = [None] * len(measured) if self._sent is None else self._sent
+        requests = [rule.request(self.active[k], step, measured[k], problem, sent=sent[k]) for k in trials]
         for trial, request, replan in zip(trials, requests, self._solve(requests), strict=True):
             if self.log.enter(step, trial, replan, late=self._late(measured[trial], step, replan)):
                 self._next[trial] = ActivePlan(replan, request.first)

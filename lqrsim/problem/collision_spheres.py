@@ -190,14 +190,15 @@ class CollisionSpheres:
         """
         if self.level != "symbolic":
             return self._bind_functions(dynamics)
-        states, constants = dynamics.state_coordinates.names, dynamics.constants
-        details = ("balls", states, len(self), tuple(dynamics.parameters), *constants.items())
+        own = dynamics.calling
+        states, constants = dynamics.state_coordinates.names, own.constants
+        details = ("balls", states, len(self), tuple(own.parameters), *constants.items())
         made = symbolic.kept(
-            self.function, details, lambda: self._trace(states, dynamics.parameters, constants),
+            self.function, details, lambda: self._trace(states, own.parameters, constants),
             source=str, size=int, depends_on=list,
         )  # fmt: skip
         self._check_plane(made["size"], dynamics.state_coordinates)
-        return SphereCenters(made["source"], dynamics.data, tuple(made["depends_on"]), made["size"] == 2)
+        return SphereCenters(made["source"], own.data, tuple(made["depends_on"]), made["size"] == 2)
 
     def _trace(
         self, states: Sequence[str], parameters: Mapping[str, float], constants: Mapping[str, float]
@@ -235,22 +236,22 @@ class CollisionSpheres:
         }
 
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
-        names, size = dynamics.state_coordinates.names, self._size_of(dynamics)
+        names, size, own = dynamics.state_coordinates.names, self._size_of(dynamics), dynamics.calling
         axes, unused = axes_of("CollisionSpheres", self.depends_on, names)
         returned = {"values": size * len(self), "entries": self.names, "columns": size, "unused": unused}
         functions = with_derivatives(
             self.function, returned, self.jacobian, ((len(self), size, len(names)),),
-            level=self.level, states=len(names), controls=0, parameters=tuple(dynamics.parameters), with_control=False,
+            level=self.level, states=len(names), controls=0, parameters=tuple(own.parameters), with_control=False,
         )  # fmt: skip
         source = source_of(user_functions, BALLS=len(self), COORDINATES=size)
         if self.jacobian is None:
             source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
-        return SphereCenters(source, dynamics.data, axes, size == 2, functions=functions)
+        return SphereCenters(source, own.data, axes, size == 2, functions=functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
         """The number of coordinates that a compiled or plain function returns for each ball, found by calling it."""
         plain: Any = getattr(self.function, "py_func", self.function)
-        p = symbolic.Parameters(**dynamics.parameters)
+        p = symbolic.Parameters(**dynamics.calling.parameters)
         try:
             with np.errstate(all="ignore"):
                 size = len(_points(plain(np.zeros(len(dynamics.state_coordinates)), p), len(self))[0])

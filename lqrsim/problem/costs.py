@@ -126,7 +126,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         return None
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
-        """The same for a system with one more state, the last, of which it is independent: for a free duration.
+        """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
+        each control with a `control_rate`.
 
         Args:
           dynamics: dynamics of the system without that state.
@@ -135,7 +136,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
           InputError: its kind cannot be stated for one more state.
         """
         raise InputError(
-            f"duration: got a {type(self).__name__} beside it, which cannot have one more state, want none"
+            f"duration and control_rate: got a {type(self).__name__} beside one of them, which cannot have one more"
+            " state, want none"
         )
 
     def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:

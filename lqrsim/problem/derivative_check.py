@@ -30,7 +30,7 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
     for part in _parts(problem):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
-            values = function.call(x, u, parameters)
+            values = function.call(x[: function.states], u, parameters)
             for i, name in function.unused:
                 z = np.concatenate([x, u])
                 z[i] += 1e-2 * max(1.0, abs(z[i]))
@@ -42,7 +42,7 @@ def _parts(problem: Problem) -> list[Dynamics | Term]:
     """The dynamics, and all terms that are bound to them."""
     terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
     noise = () if problem.noise_term is None else (problem.noise_term,)
-    return [problem.dynamics, *terms, *problem.constraint_terms, *noise]
+    return [problem.dynamics.calling, *terms, *problem.constraint_terms, *noise]
 
 
 def check_start(problem: Problem, x: Array, u: Array) -> None:

@@ -222,6 +222,11 @@ class Dynamics:
         return other
 
     @property
+    def calling(self) -> "Dynamics":
+        """The dynamics whose functions compiled code calls for a step: these, unless they are made of others."""
+        return self
+
+    @property
     def data(self) -> Array:
         """The parameters' values, in order."""
         return np.array(list(self.parameters.values()), dtype=np.float64)

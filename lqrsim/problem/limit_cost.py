@@ -1,6 +1,7 @@
 """A soft limit of states: class and kernel."""
 
 from collections.abc import Mapping
+from typing import Self
 
 import numpy as np
 
@@ -31,6 +32,9 @@ class LimitCost(Cost):
             for sign, bounds in ((1.0, low), (-1.0, high))
             for name, bound in (bounds or {}).items()
         ]
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         names = dynamics.state_coordinates.names

@@ -33,6 +33,7 @@ from lqrsim.problem.constraints import (
     goals_of,
     names_of,
 )
+from lqrsim.problem.control_rate import ControlRate, RateLimits
 from lqrsim.problem.costs import Cost, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
@@ -109,6 +110,11 @@ class Problem(OneVersion):
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
         (lowest, highest); by default the actuators' range. Infinite limits mean that the plan has none. Plan and policy
         respect these limits exactly; the policy also respects those of the actuators.
+      control_rate: the cost and the limits of the rates of controls, see `ControlRate`; None for neither. A plan keeps
+        the limits, and the cost of a solution includes that of rates; costs of runs do not. The policy is a function of
+        the state alone; `lq.rate_feedback` makes the best feedback, which also depends on the last command. Feedback
+        adds to the rates of the plan: a `Replanner` clips its commands to the limits, other controllers do not, and
+        `violations` says by how much they exceed them.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
       begin: time in s of the first knot. The positions of moving obstacles are those at time 0.
@@ -140,6 +146,7 @@ class Problem(OneVersion):
     risk: float = 0.0
     duration: tuple[float, float] | None = None
     time_weight: float = 0.0
+    control_rate: ControlRate | None = None
     _terms: dict[str, tuple[CostTerm, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
     _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
@@ -176,6 +183,7 @@ class Problem(OneVersion):
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         self._check_duration()
+        self._check_rate()
         controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
@@ -202,7 +210,7 @@ class Problem(OneVersion):
             for cost in costs
         )
 
-    def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
+    def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
         """The rest of the problem after some steps, from a state that is given exactly.
 
         Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it.
@@ -210,9 +218,12 @@ class Problem(OneVersion):
         Args:
           state: (n,).
           after: number of steps that are over.
+          previous: (m,) the last command, from which a `control_rate` counts; by default the problem's own, and after
+            some steps none.
 
         Raises:
-          InputError: the state is not (n,) finite numbers, or no step is left.
+          InputError: the state is not (n,) finite numbers, no step is left, or there is a last command without a
+            `control_rate`.
         """
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
@@ -221,12 +232,21 @@ class Problem(OneVersion):
             term = about_state(self._terms["initial"][0], here)
         else:
             term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
-        other = self._with(initial=start, _terms=self._terms | {"initial": (term,)})
+        rate = self._rate_after(previous) if after or previous is not None else self.control_rate
+        other = self._with(initial=start, control_rate=rate, _terms=self._terms | {"initial": (term,)})
         if not after:
             return other
         left, begin = tuple(one.ahead(after) for one in self.constraints), self.begin + after * self.dt
         stage = self.stage_cost.ahead(after)
         return other._with(steps=self.steps - after, begin=begin, constraints=left, stage_cost=stage)._bound_anew()
+
+    def _rate_after(self, previous: npt.ArrayLike | None) -> ControlRate | None:
+        """The `control_rate` after a command (m,), or None for one that is free. Raises InputError as `from_state`."""
+        if self.control_rate is None and previous is not None:
+            raise InputError("previous: got a command for a problem without control_rate, want None")
+        size = (len(self.dynamics.control_coordinates),)
+        known = None if previous is None else check_array("previous", previous, size)
+        return None if self.control_rate is None else self.control_rate._after(known)
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
         """The problem with other costs. It may begin inside an obstacle if this one does; see `from_state`.
@@ -437,6 +457,7 @@ class Problem(OneVersion):
             "dynamics": f"{self.dynamics.name}; {self.steps} steps of {self.dt:.6g} s, {seconds} in all",
             "states": ", ".join(space.labels), "controls": ", ".join(controls.labels), "limits": ", ".join(limited),
             "start": repr(self.initial), "stage cost": repr(self.stage_cost), "final cost": repr(self.final_cost),
+            "control rate": "" if self.control_rate is None else repr(self.control_rate),
             "constraints": "; ".join(map(repr, self.constraints)),
             "noise": "" if self.noise is None else f"{self.noise!r}, risk {self.risk:g}",
             "cost of time": f"{self.time_weight:g} a second" if self.time_weight else "",
@@ -469,6 +490,8 @@ class Problem(OneVersion):
             functions += self._noise_term.functions
         if self.duration is not None:
             parts.append(repr((self.duration, self.time_weight)))
+        if (rate := self.control_rate) is not None:
+            parts.append(repr([None if one is None else np.asarray(one).tolist() for one in vars(rate).values()]))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_duration(self) -> None:
@@ -496,6 +519,16 @@ class Problem(OneVersion):
         if why:
             raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
 
+    def _check_rate(self) -> None:
+        """Raises InputError if the rates do not fit the controls, or there must be none for this kind of problem."""
+        check_kind("control_rate", self.control_rate, (ControlRate, type(None)), "a ControlRate, or None")
+        if self.control_rate is None:
+            return
+        for what, stated in (("noise", self.noise), ("a free duration", self.duration)):
+            if stated is not None:
+                raise InputError(f"control_rate: got {self.control_rate!r} with {what}, want one of the two")
+        keep(self, control_rate=self.control_rate._in(self.dynamics))
+
     def _check_start_clear(self) -> None:
         """Raises InputError if the robot starts inside an obstacle."""
         kept = [cost.kept_clear for cost in self.obstacle_costs]
@@ -515,9 +548,10 @@ class Problem(OneVersion):
         Returns:
           Name -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in seconds; zeros
           for a trial that violates it by at most 1e-6. Names do not depend on the runs or on the constraints' numbers:
-          "StateBounds: x low", "GoalState: x", "SymbolicConstraint: NAME", its `name` or that of its function, with
-          "[0]" for the first of several entries. Only a lambda without a name is called by its expressions, which may
-          have numbers. If an earlier constraint has the same name, " (2)" follows, and so on.
+          "StateBounds: x low", "GoalState: x", "ControlRate: torque high" of the commands, "SymbolicConstraint: NAME",
+          its `name` or that of its function, with "[0]" for the first of several entries. Only a lambda without a name
+          is called by its expressions, which may have numbers. If an earlier constraint has the same name, " (2)"
+          follows, and so on.
 
         Raises:
           InputError: the runs have other states, controls or steps.
@@ -529,12 +563,20 @@ class Problem(OneVersion):
             got, want = ("{} states, {} controls, {} steps".format(*one) for one in (own, sizes))
             raise InputError(f"rollout: got {got}, want the problem's: {want}")
         found: dict[str, Array] = {}
-        for constraint, term in zip(self.constraints, self.constraint_terms, strict=True):
-            if constraint.kept_clear is not None:
-                continue
+        stated = [
+            (rollout.states, rollout.applied, term, names_of(constraint, term))
+            for constraint, term in zip(self.constraints, self.constraint_terms, strict=True)
+            if constraint.kept_clear is None
+        ]
+        if self.control_rate is not None and self.control_rate.limits is not None:
+            last = np.pad(rollout.commanded, [(0, 0), (1, 0), (0, 0)])  # of the first step the term knows it itself
+            term = RateLimits(self.control_rate, self.dt).bind(self.dynamics)
+            wide = np.concatenate([rollout.states, last], axis=2)
+            stated.append((wide, rollout.commanded, term, [f"ControlRate: {name}" for name in term.names]))
+        for states, controls, term, names in stated:
             each: dict[str, Array] = {}
-            rows = violated(term, rollout.states, rollout.applied, rollout.counts, EQUALITY_TOLERANCE)
-            for name, (by, knots) in zip(names_of(constraint, term), rows, strict=True):
+            rows = violated(term, states, controls, rollout.counts, EQUALITY_TOLERANCE)
+            for name, (by, knots) in zip(names, rows, strict=True):
                 worst = np.stack([by, rollout.times[knots]], axis=1)
                 each[name] = np.where(by[:, None] > each[name][:, :1], worst, each[name]) if name in each else worst
             for name, worst in each.items():

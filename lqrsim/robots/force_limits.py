@@ -7,6 +7,7 @@ never clips, and both models are the same along it.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,8 +71,26 @@ class ForceLimits(Constraint):
             forces.append(np.hstack([at_zero, by_state @ a, by_state @ b + by_control]))
         return np.concatenate(forces)
 
+    def with_added_state(self, dynamics: Dynamics) -> "ForceLimits":
+        return self._widened(len(dynamics.control_coordinates), 1)
+
+    def _widened(self, controls: int, count: int) -> "ForceLimits":
+        """The same beside further states, the last ones, which do not count."""
+
+        def wide(slopes: Array) -> Array:
+            return np.insert(slopes, [slopes.shape[-1] - controls] * count, 0.0, axis=-1)
+
+        limits = [one._replace(slopes=wide(one.slopes)) for one in self.limits]
+        return ForceLimits(limits, None if self.later is None else wide(self.later))
+
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
-        assert isinstance(dynamics, MjcfDynamics)
+        own, n, m = dynamics.calling, len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        assert isinstance(own, MjcfDynamics)
+        if more := n - len(own.state_coordinates):
+            limits = [one._replace(slopes=np.delete(one.slopes, np.s_[1 + n - more : 1 + n])) for one in self.limits]
+            narrow = ForceLimits(limits)._refined(own, replace(plan, states=plan.states[:, : n - more]))
+            return None if narrow is None else narrow._widened(m, more)
+        dynamics = own
         count, pairs = round(plan.dt / dynamics.period), zip(plan.states, plan.controls, strict=False)
         later = np.stack([self._ahead(dynamics, x, u, count) for x, u in pairs])
         forces = later[..., 0] + np.einsum("tki,ti->tk", later[..., 1:], np.hstack([plan.states[:-1], plan.controls]))

@@ -25,6 +25,7 @@ from lqrsim.errors import (
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
 from lqrsim.problem.constraints import Constraint
+from lqrsim.problem.control_rate import ControlRate
 from lqrsim.problem.costs import Cost
 from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.problem.obstacle_cost import ObstacleCost
@@ -374,6 +375,7 @@ class MjcfRobot(Robot):
         clearance: float | None = None,
         self_clearance: float | None = None,
         force_limits: bool = True,
+        control_rate: ControlRate | None = None,
     ) -> Problem:
         """Make a problem: from one state to another, within the actuators' limits, with costs on obstacles.
 
@@ -405,6 +407,7 @@ class MjcfRobot(Robot):
           force_limits: whether limits of forces are constraints, as in `force_limits`, and not in the dynamics. Those
             that no control keeps at the start stay in the dynamics, as all do if MuJoCo's steps are unstable without
             them, or with False: then forces may saturate.
+          control_rate: cost and limits of the rates of controls; see `Problem`.
 
         Returns:
           The Problem.
@@ -458,7 +461,7 @@ class MjcfRobot(Robot):
             steps=steps, initial=FixedState(start), stage_cost=cost,
             final_cost=QuadraticCost(_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
-            constraints=kept,
+            constraints=kept, control_rate=control_rate,
         )  # fmt: skip
 
     def _check_limits(self, start: Array, goal: Array) -> None:

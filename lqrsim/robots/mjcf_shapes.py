@@ -69,7 +69,7 @@ class MjcfGeoms(CollisionGeoms):
         self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
     ) -> Array:
         own, numbers = self._bound(dynamics, world)
-        states = vectors_of("states", states, len(own.state_coordinates))
+        states = vectors_of("states", states, len(dynamics.state_coordinates))
         flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(numbers)
         moved = displaced is not None and bool(displaced.any())
         away = in_c_order(displaced.reshape(-1)) if moved and displaced is not None else np.zeros(1)
@@ -77,17 +77,17 @@ class MjcfGeoms(CollisionGeoms):
         out, which, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
         if count:
             _, data = self._to_each(own, numbers)
-            self._module(own).distances_of(len(flat), flat, each, away, int(moved), data, out, which, segments)
+            self._module(dynamics).distances_of(len(flat), flat, each, away, int(moved), data, out, which, segments)
         return out[: len(flat) * count].reshape(*states.shape[:-1], count)
 
     def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
         own, numbers = self._bound(dynamics, world)
-        flat, count = in_c_order(vectors_of("states", states, len(own.state_coordinates))), len(numbers)
+        flat, count = in_c_order(vectors_of("states", states, len(dynamics.state_coordinates))), len(numbers)
         out, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
         which, segments = np.empty(count + 1), np.empty((count + 1, 6))
         if count:
             _, data = self._to_each(own, numbers)
-            self._module(own).slopes_of(len(flat), flat, data, out, slopes, which, segments)
+            self._module(dynamics).slopes_of(len(flat), flat, data, out, slopes, which, segments)
         shape = len(flat), count
         return out[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
 
@@ -96,7 +96,7 @@ class MjcfGeoms(CollisionGeoms):
         flat, count = in_c_order(np.asarray(state, dtype=np.float64)[None]), len(numbers)
         out, which, segments = np.empty(count), np.empty(count + 1), np.empty((count + 1, 6))
         chosen, data = self._to_each(own, numbers)
-        self._module(own).distances_of(1, flat, 1, np.zeros(1), 0, data, out, which, segments)
+        self._module(dynamics).distances_of(1, flat, 1, np.zeros(1), 0, data, out, which, segments)
         pair = self._pairs[chosen[int(which[int(out.argmin())])]]
         first, second = (self.scene.model.body(body).name for body in self.scene.model.geom_bodyid[pair].tolist())
         return first, second
@@ -109,22 +109,22 @@ class MjcfGeoms(CollisionGeoms):
         return np.abs(after[..., :nv] - before[..., :nv]) @ self._levers
 
     def _bound(self, dynamics: Dynamics, world: World) -> tuple[MjcfDynamics, npt.NDArray[np.int64]]:
-        """The dynamics, and the index in the scene of each obstacle of the world. Raises InputError."""
-        if not isinstance(dynamics, MjcfDynamics):
+        """MuJoCo's dynamics, and the index in the scene of each obstacle of the world. Raises InputError."""
+        if not isinstance(own := dynamics.calling, MjcfDynamics):
             raise InputError(f"geoms: got an MJCF's geoms for {dynamics.name}, want its own dynamics, robot.dynamics")
         if world is self.scene.world:
-            return dynamics, np.arange(len(world))
+            return own, np.arange(len(world))
         known = {one.name: (number, one) for number, one in enumerate(self.scene.world.obstacles)}
         found = []
         for one in world.obstacles:
-            number, own = known.get(one.name, (-1, None))
-            if not _same(one, own):
+            number, stated = known.get(one.name, (-1, None))
+            if not _same(one, stated):
                 raise InputError(
                     f"geoms: got the obstacle {one.name!r}, which is not one of the robot's MJCF, want those of"
                     f" robot.scene.world: {', '.join(known) or 'there are none'}; or balls=robot.balls"
                 )
             found.append(number)
-        return dynamics, np.array(found, dtype=np.int64)
+        return own, np.array(found, dtype=np.int64)
 
     def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
         """The kernel's data, except the address of p."""
@@ -139,7 +139,7 @@ class MjcfGeoms(CollisionGeoms):
         data = self._data(chosen, rows[chosen], len(numbers), _FAR)
         return chosen, np.concatenate([[float(dynamics.physics.address())], data])
 
-    def _module(self, dynamics: MjcfDynamics) -> Any:
+    def _module(self, dynamics: Dynamics) -> Any:
         n = len(dynamics.state_coordinates)
         return module_of(source_of(mjcf_distances), f"MuJoCo's distances ({n} states)", N=n)
 
@@ -161,10 +161,10 @@ class MjcfBalls(CollisionSpheres):
         return "MuJoCo's kinematics"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
-        if not isinstance(dynamics, MjcfDynamics):
+        if not isinstance(own := dynamics.calling, MjcfDynamics):
             raise InputError(f"balls: got an MJCF's balls for {dynamics.name}, want its own dynamics, robot.dynamics")
-        memory = MjcfMemory.of(dynamics)
-        positions = tuple(range(dynamics.physics.model.nv))
+        memory = MjcfMemory.of(own)
+        positions = tuple(range(own.physics.model.nv))
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
         source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_places))
         return SphereCenters(source, data, positions, functions=(memory,))

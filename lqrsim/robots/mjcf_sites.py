@@ -1,6 +1,7 @@
 """Costs and constraints on sites of an MJCF, such as a gripper at a desired pose: classes and kernel."""
 
 from math import atan2, sqrt
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -71,9 +72,9 @@ class _Pose:
 
     def bind(self, dynamics: Dynamics) -> Residual:
         """The errors, for a system. Raises InputError."""
-        if not isinstance(dynamics, MjcfDynamics):
+        if not isinstance(own := dynamics.calling, MjcfDynamics):
             raise InputError(f"{self.what}: got {dynamics.name}, want the dynamics of an MjcfRobot")
-        model = dynamics.physics.model
+        model = own.physics.model
         names = [model.site(number).name for number in range(model.nsite)]
         number = names.index(check_name(f"{self.what}: site", self.site, [name for name in names if name]))
         body, offset, axes = site_frame(model, number)
@@ -82,7 +83,7 @@ class _Pose:
         wanted = wanted if self.axes is None else self.axes
         source = source_of(__name__, PLACED=int(self.position is not None), TURNED=int(self.axes is not None))
         data = np.concatenate([[body], offset, axes.ravel(), position, wanted.ravel()])
-        return Residual(source, data, tuple(self.rows), model.nv, functions=(MjcfMemory.of(dynamics),))
+        return Residual(source, data, tuple(self.rows), model.nv, functions=(MjcfMemory.of(own),))
 
 
 class SiteCost(Cost):
@@ -116,6 +117,9 @@ class SiteCost(Cost):
             for name, given in (("weight", weight), ("turn_weight", turn_weight))
         )
 
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
+
     def bind(self, dynamics: Dynamics) -> CostTerm:
         errors, (placed, turned) = self.pose.bind(dynamics), self.weights
         used = [placed] if self.pose.position is not None else []
@@ -145,6 +149,9 @@ class SiteConstraint(Constraint):
     ) -> None:
         self.pose = _Pose("SiteConstraint", site, position, orientation)
         self.at = check_name("SiteConstraint: at", at, STEPS)
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         errors = self.pose.bind(dynamics)

@@ -1,5 +1,7 @@
 """The constraint that links of a robot from an MJCF keep clear of each other."""
 
+from typing import Self
+
 import numpy as np
 import numpy.typing as npt
 
@@ -41,8 +43,11 @@ class SelfClearance(Constraint):
         self._rows = np.asarray(rows, dtype=np.int64).ravel()
         self.links = tuple((model.body(one).name, model.body(other).name) for one, other in keys.tolist())
 
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
+
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        if not isinstance(dynamics, MjcfDynamics):
+        if not isinstance(own := dynamics.calling, MjcfDynamics):
             raise InputError(f"SelfClearance: got dynamics {dynamics.name}, want the robot's own, robot.dynamics")
         model = self._mjcf.model
         reach = self.margin + SEEN * float(model.geom_rbound[self._pairs].max(initial=0.0))
@@ -55,7 +60,7 @@ class SelfClearance(Constraint):
         count = max(1, len(told))
         distances = Residual(
             source_of(mjcf_distances, ROWS=count), distance_data(model, self._pairs, rows, count, reach),
-            parts=tuple(told), moved=model.nv, functions=(MjcfMemory.of(dynamics),),
+            parts=tuple(told), moved=model.nv, functions=(MjcfMemory.of(own),),
         )  # fmt: skip
 
         def describe(row: int) -> str:

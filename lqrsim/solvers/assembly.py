@@ -65,7 +65,7 @@ def assemble(
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
         "clearance": lambda: clearance_of(problem, nominal),
         "problem_digest": lambda: problem.digest,
-        "problem_parts": lambda: {name: _line(text) for name, text in problem.parts.items() if text},
+        "problem_parts": lambda: parts_of(problem),
     }
     return Solution._assembled(
         later,
@@ -87,6 +87,11 @@ def assemble(
         goal=problem.weighed_goal,
         goal_radius=goal_radius_of(problem, states),
     )
+
+
+def parts_of(problem: Problem) -> dict[str, str]:
+    """What the problem asks for, by part, as a file can hold it."""
+    return {name: _line(text) for name, text in problem.parts.items() if text}
 
 
 def _line(text: str) -> str:

@@ -338,6 +338,8 @@ def smooth_continuous(
         )
     if problem.constraints:
         raise InputError("constraints: got a problem with constraints, want none in continuous time; use `smooth`")
+    if problem.control_rate is not None:
+        raise InputError("control_rate: got rates, which are per control period, want none; use `smooth`")
     if problem.noise is not None:
         raise InputError("noise: got a problem with noise, which is per control period, want none; use `smooth`")
     for cost in terms_of(problem.stage_cost):

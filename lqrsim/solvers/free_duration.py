@@ -5,7 +5,7 @@ Runge-Kutta step over `dt` becomes a step over `share * dt`. The interior point 
 once. With the duration found, the problem is an ordinary one, and the plan is already at its optimum.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
+from lqrsim.problem.last_command import unused
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
@@ -216,7 +217,7 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
     """The dynamics with the duration as last state; at the stated duration they are unchanged."""
     space, controls, n = dynamics.state_coordinates, dynamics.control_coordinates, len(dynamics.state_coordinates)
     names = space.names
-    state, parameter = _unused(STATE, names), _unused(STATED, (*dynamics.parameters, *dynamics.disturbances))
+    state, parameter = unused(STATE, names), unused(STATED, (*dynamics.parameters, *dynamics.disturbances))
 
     def f(x: Any, u: Any, p: Any) -> list[Any]:
         share = x[n] / getattr(p, parameter)
@@ -232,10 +233,3 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
         rotation_vectors=tuple(names[i : i + 3] for i in space.rotation_vectors),
         control_limits=(controls.low, controls.high),
     )  # fmt: skip
-
-
-def _unused(name: str, names: Collection[str]) -> str:
-    """A name that is not among others: with underscores after it if it is."""
-    while name in names:
-        name += "_"
-    return name

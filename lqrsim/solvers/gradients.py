@@ -87,8 +87,8 @@ def gradients(
       scale: (P,) typical changes of the parameters; by default their sizes, at least 1e-3 each.
 
     Raises:
-      InputError: an argument is not as described; or the problem has noise or a free duration, the plan is at the edge
-        of its contact modes, or limits of forces were refined within its periods.
+      InputError: an argument is not as described; or the problem has noise, rates or a free duration, the plan is at
+        the edge of its contact modes, or limits of forces were refined within its periods.
     """
     check_function("make", make, "a function of the parameters that returns a Problem", arguments=1, optional=False)
     point = check_array("at", at, (None,))
@@ -142,6 +142,8 @@ def _made(make: Callable[[Array], Problem], point: Array) -> Problem:
     problem = check_kind("make", make(point.copy()), Problem, "a function that returns a Problem")
     if problem.noise is not None:
         raise InputError("make: got a problem with noise, want one without, whose cost does not depend on the policy")
+    if problem.control_rate is not None:
+        raise InputError("make: got a problem with control_rate, want one without, such as a ControlCost instead")
     if problem.duration is not None:
         raise InputError("make: got a free duration, want duration=None, time_weight=0.0 and the dt of the solution")
     return problem

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.budget import Budget, Callback
+from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun, check_finite_at_start
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
@@ -121,7 +123,7 @@ def _check(problem: Problem, settings: Settings) -> None:
         raise InputError(_NO_PRIOR)
     if problem.duration is not None:
         raise InputError("duration: got a free duration, want None for ilqr; use `smooth`, which solves for it")
-    if problem.constraints:
+    if problem.constraints or (problem.control_rate is not None and problem.control_rate.limits is not None):
         raise InputError(
             "constraints: got a problem with constraints, want none for ilqr, which keeps only limits; use smooth"
         )
@@ -135,6 +137,8 @@ def _solve(
     problem: Problem, settings: Settings, *, attentive: bool = False, callback: Callback | None = None
 ) -> Solution:
     """Solve; `attentive`: see `Budget`."""
+    if problem.control_rate is not None:
+        return solve_with_rates(problem, settings, partial(_solve, attentive=attentive, callback=callback))
     assert problem.start is not None
     budget = Budget(settings.max_iterations, callback=callback, attentive=attentive)
     budget.stop.begin(settings.time_limit)

@@ -11,6 +11,7 @@ from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
+from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.plan import Plan, Replan
@@ -23,6 +24,7 @@ from lqrsim.solvers.assembly import clearance_of, copy_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.constrained import Known, Ladder
+from lqrsim.solvers.control_rates import feedback, narrowed, widened
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
@@ -78,10 +80,12 @@ def prepare(
         tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
-    if tolerance is None and getattr(problem, "constraints", ()) and settings.second_order(problem):
-        if _can_yield(problem):
+    check_problem(problem)
+    solved = problem if problem.control_rate is None else with_last_command(problem)
+    if tolerance is None and solved.constraints and settings.second_order(solved):
+        if _can_yield(solved):
             settings = replace(settings, tolerance=COARSE)
-        elif settings.final(problem) == FINE:
+        elif settings.final(solved) == FINE:
             settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings, check_threads(threads))
 
@@ -105,7 +109,18 @@ class PreparedSolver(OneVersion):
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
         self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
-        self._compile()
+        # With a cost or limits of rates: the solver of the problem with the last command as a state.
+        self._wide = self._widened(problem, settings, threads)
+        if self._wide is None:
+            self._compile()
+
+    def _widened(self, problem: Problem, settings: SmootherSettings, threads: int) -> "PreparedSolver | None":
+        if problem.control_rate is None:
+            return None
+        wide, controls = with_last_command(problem), np.tile(problem.nominal_control, (problem.steps, 1))
+        n = len(wide.dynamics.state_coordinates)
+        feedback(problem, Trajectory(np.zeros((problem.steps + 1, n)), controls, problem.dt))  # compiles it
+        return PreparedSolver(wide, settings, threads)
 
     def __repr__(self) -> str:
         return f"PreparedSolver({len(self._states)} states, {len(self._controls)} controls, {self.problem.steps} steps)"
@@ -147,11 +162,14 @@ class PreparedSolver(OneVersion):
           InputError: the problem would have to be compiled.
         """
         check_problem(problem)
-        if compiled.structure(problem) != self._structure:
+        other = (problem.control_rate is None) != (self._wide is None)
+        if other or compiled.structure(problem) != self._structure:
             raise InputError(
                 "problem: got another structure, want the prepared one with other numbers: goal, weights,"
                 " obstacles, parameters, limits, steps"
             )
+        if self._wide is not None:
+            self._wide.check(with_last_command(problem))
         return problem
 
     def solve(
@@ -162,6 +180,7 @@ class PreparedSolver(OneVersion):
         problem: Problem | None = None,
         after: int = 0,
         time_limit: float | None = None,
+        previous: npt.ArrayLike | None = None,
     ) -> Replan:
         """Solve from a state, starting from a plan. The answer is no worse than continuing with that plan; see
         `Replan`.
@@ -172,13 +191,17 @@ class PreparedSolver(OneVersion):
           problem: the problem to solve from that state; by default the prepared one.
           after: number of steps that are over; the rest is solved.
           time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
+          previous: (m,) the last command before the plan, from which a `control_rate` counts; None if it is free.
 
         Raises:
           InputError: an argument is not as described.
         """
         clock = time.perf_counter()
-        problem = (self.problem if problem is None else self.check(problem)).from_state(state, after=after)
+        own = self.problem if problem is None else self.check(problem)
+        problem = own.from_state(state, after=after, previous=previous)
         check_kind("start", start, (Plan, InitialGuess), "a Plan, such as a Solution or a Replan")
+        if self._wide is not None:
+            return self._solve_wide(self._wide, problem, start, time_limit, clock)
         stop = Stop(reserve=self._pace + self._closing)
         if time_limit is not None:
             stop.deadline = clock + check_number("time_limit", time_limit, above=0.0)
@@ -213,6 +236,22 @@ class PreparedSolver(OneVersion):
         run.give_back()  # this is skipped after an exception
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
+
+    def _solve_wide(
+        self, solver: "PreparedSolver", problem: Problem, start: Plan | InitialGuess, time_limit: float | None,
+        clock: float,
+    ) -> Replan:  # fmt: skip
+        """The answer to a problem with a cost or limits of rates, begun at `clock`."""
+        wide = with_last_command(problem)
+        assert wide.start is not None
+        if time_limit is not None:
+            left = check_number("time_limit", time_limit, above=0.0) - (time.perf_counter() - clock) - self._closing
+            time_limit = max(left, 1e-9)
+        found = solver.solve(wide.start, widened(start, problem, wide), problem=wide, time_limit=time_limit)
+        ended = time.perf_counter()
+        plan = narrowed(found, problem, *feedback(problem, found.trajectory, found.multipliers), seconds=0.0)
+        self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
+        return replace(plan, seconds=time.perf_counter() - clock)
 
     def _answer(
         self, problem: Problem, best: "_Best", found: RunResult, budget: Budget, clock: float, iterating: float

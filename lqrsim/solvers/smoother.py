@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from lqrsim.errors import InputError
+from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
@@ -159,6 +160,11 @@ def smooth_many(
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
+    if problem.control_rate is not None:
+        for option, got, want in (("form", settings.form, "dual"), ("first_pass", settings.first_pass, "forward")):
+            if got != want:
+                raise InputError(f"{option}: got {got!r} with control_rate, want {want!r}: no step leads back from it")
+        problem = with_last_command(problem)  # its constraints have the limits of rates
     if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
         if problem.constraints:
             why = 'None without finish="newton" and stop="optimal"'

@@ -36,6 +36,7 @@ from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.budget import Budget, Callback, Stop
 from lqrsim.solvers.constrained import Known, Ladder
+from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
 from lqrsim.solvers.infeasibility import Evidence, alike
@@ -106,6 +107,12 @@ def solve(
             return solve(settled, options, attentive=attentive, threads=threads, callback=callback, stop=whole)
 
         return solve_for_duration(problem, settings, fixed, attentive=attentive, callback=callback)
+    if problem.control_rate is not None:
+
+        def wide(other: Problem, options: SmootherSettings) -> Solution:
+            return solve(other, options, attentive=attentive, threads=threads, callback=callback, stop=stop)
+
+        return solve_with_rates(problem, settings, wide)
     if stop is None:
         stop = Stop()
         stop.begin(settings.time_limit)

@@ -105,6 +105,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     file = place.folder / "cart.xml"
     file.write_text(CART, encoding="utf-8")
     slider = ls.MjcfRobot(file)
+    rated = slider.problem(
+        slider.at(), slider.at(slider=0.3), steps=4, control_rate=ls.ControlRate(weight=1e-3, previous=[0.0])
+    )
     links = place.folder / "folded.xml"
     links.write_text(FOLDED, encoding="utf-8")
     folded = ls.MjcfRobot(links)
@@ -249,6 +252,12 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Problem": (stated | {
             "control_limits": (-0.4, 0.4), "constraints": [], "noise": ls.Noise(np.eye(3)), "risk": 0.1,
         },),
+        "ControlRate": ({"weight": 1.0, "limits": (-2.0, 3.0), "previous": [0.0, 0.0]},),
+        "ControlRate of a Problem": ({
+            "call": lambda **stated: dataclasses.replace(place.problem, control_rate=ls.ControlRate(**stated)),
+            "weight": {"m/s": 1.0}, "limits": {"left": 2.0, "right": (-1.0, 2.0)}, "previous": {"left": 0.1},
+        },),
+        "rate_feedback": ({"problem": rated, "solution": ls.smooth(rated)},),
         "Problem.driven_by": ({"self": place.problem, "noise": ls.Noise(np.eye(3)), "risk": 0.1},),
         "Noise": ({
             "function": shaken, "size": 1, "parameters": {"share": 0.1}, "depends_on": ("force",), "level": "plain",

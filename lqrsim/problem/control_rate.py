@@ -1,0 +1,247 @@
+"""Costs and limits of the rates of controls: class and kernels.
+
+A rate joins two controls. A solver that looks at one step at a time needs the last command as a state; the cost and the
+constraint here are for such dynamics, `last_command.py`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.sources import source_of
+from lqrsim.errors import Array, InputError, brief, check_array, check_items, keep, numbers_of
+from lqrsim.kernels.declarations import M, N
+from lqrsim.problem.constraints import Constraint, ConstraintTerm
+from lqrsim.problem.costs import Cost, CostTerm
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import Coordinates, PerEntry
+
+Range = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]  # a number r for -r to r, or (low, high)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlRate:
+    """The cost and the limits of the rates of controls: of (u_t - u_{t-1}) / dt, in a control's unit per second.
+
+        ls.Problem(..., control_rate=ls.ControlRate(weight=0.01, limits=5.0))
+
+    A step costs `1/2 sum_i weight_i rate_i^2`; like any stage cost it is not multiplied by dt. Limits hold at each step
+    of a plan. A first plan may begin with any command, unless `previous` says which was the last; a re-plan knows it.
+    Feedback adds to the rates of a plan; see `Problem.control_rate` for what holds then.
+
+    Args:
+      weight: cost per square of a rate: a number, (m,), or a dictionary of name or unit of a control: number, with 0
+        for controls that it leaves out. None for no cost.
+      limits: the range of the rates, with 0 inside: r for -r to r, (low, high), each a number or (m,), or a dictionary
+        of name or unit of a control: r or (low, high). Infinite for no limit.
+      previous: the command (m,) before the first step, or a dictionary of name or unit: number, with 0 for the rest.
+        None: the first command is free, and has no rate.
+
+    Raises:
+      InputError: neither a weight nor limits, a negative weight, or limits without 0 inside. A problem refuses sizes
+        and names that are not those of its controls.
+    """
+
+    weight: PerEntry | None = None
+    limits: Range | Mapping[str, Any] | None = None
+    previous: PerEntry | None = None
+
+    def __post_init__(self) -> None:
+        if self.weight is None and self.limits is None:
+            raise InputError("ControlRate: got neither a weight nor limits, want one of the two at least")
+        for name, check in (("weight", _weight), ("previous", _finite)):
+            given = getattr(self, name)
+            if given is not None and not isinstance(given, Mapping):
+                keep(self, **{name: check(f"ControlRate: {name}", given)})
+        if self.limits is not None and not isinstance(self.limits, Mapping):
+            keep(self, limits=_range("ControlRate: limits", self.limits))
+
+    def __repr__(self) -> str:
+        named = ((name, getattr(self, name)) for name in ("weight", "limits", "previous"))
+        return f"ControlRate({', '.join(f'{name}={brief(value)}' for name, value in named if value is not None)})"
+
+    def _in(self, dynamics: Dynamics) -> "ControlRate":
+        """The same with an array (m,) for all that is given. Raises InputError if it does not fit the controls."""
+        space, found = dynamics.control_coordinates, dict[str, Any]()
+        for name, check in (("weight", _weight), ("previous", _finite)):
+            given = getattr(self, name)
+            if isinstance(given, Mapping):
+                given = check(f"ControlRate: {name}", space._numbers(f"ControlRate: {name}", given))
+            found[name] = None if given is None else _each(f"ControlRate: {name}", given, space)
+        limits: Any = self.limits
+        if isinstance(limits, Mapping):
+            sides = np.tile([[-inf], [inf]], len(space))
+            for i, (low, high) in space._by_name("ControlRate: limits", limits, _range_of_one).items():
+                sides[:, i] = low, high
+            limits = sides[0], sides[1]
+        if limits is not None:
+            limits = tuple(_each("ControlRate: limits", side, space) for side in limits)
+        return ControlRate(weight=found["weight"], limits=limits, previous=found["previous"])
+
+    def _after(self, previous: npt.ArrayLike | None) -> "ControlRate":
+        """The same after another command (m,); None for one that is free."""
+        return ControlRate(weight=self.weight, limits=self.limits, previous=previous)
+
+    def _numbers(self, dt: float, dynamics: Dynamics) -> Array:
+        """What both kernels begin with."""
+        known = self.previous is not None
+        previous = np.asarray(self.previous) if known else np.zeros(len(dynamics.control_coordinates))
+        return np.concatenate([[float(known), dt], previous])
+
+
+def _weight(field: str, given: object) -> Array:
+    weight = _finite(field, given)
+    if (weight < 0).any():
+        raise InputError(f"{field}: got {brief(weight)}, want numbers >= 0")
+    return weight
+
+
+def _finite(field: str, given: object) -> Array:
+    return _sized(field, given, "a number, or one for each control")
+
+
+def _sized(field: str, given: object, want: str, *, infinite: bool = False) -> Array:
+    """A number, (), or numbers (m,)."""
+    numbers = numbers_of(field, given, want)
+    return check_array(field, numbers, (None,) * min(numbers.ndim, 1), infinite=infinite)
+
+
+def _range(field: str, given: Any) -> tuple[Array, Array]:
+    """(low, high), each () or (m,), of r or (low, high). Raises InputError."""
+    want = "a number, or (low, high), each a number or one for each control"
+    if isinstance(given, (tuple, list)):
+        sides = check_items(field, given, object, want)
+        if len(sides) != 2:
+            raise InputError(f"{field}: got {len(sides)} items, want {want}")
+        low, high = (_sized(field, side, want, infinite=True) for side in sides)
+    else:
+        high = check_array(field, numbers_of(field, given, want), (), infinite=True)
+        low = -high
+    if not ((low < 0).all() and (high > 0).all()):
+        raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want a range with 0 inside")
+    return low, high
+
+
+def _range_of_one(field: str, given: Any) -> tuple[Array, Array]:
+    """As `_range`, for one control."""
+    low, high = _range(field, given)
+    if low.ndim or high.ndim:
+        raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want one range for a control")
+    return low, high
+
+
+def _each(field: str, numbers: Array, space: Coordinates) -> Array:
+    """One number for each control, (m,)."""
+    if numbers.ndim and len(numbers) != len(space):
+        raise InputError(f"{field}: got {len(numbers)} numbers, want {len(space)}, one for each control")
+    return np.broadcast_to(numbers, len(space)).astype(np.float64)
+
+
+class RateCost(Cost):
+    """The cost of rates, for dynamics whose last m states are the last command.
+
+    Args:
+      rate: weights and the command before the first step. dt: the control period in s.
+    """
+
+    def __init__(self, rate: ControlRate, dt: float) -> None:
+        self.rate, self.dt = rate, dt
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        numbers = np.concatenate([self.rate._numbers(self.dt, dynamics), np.asarray(self.rate.weight)])
+        return CostTerm(source_of(__name__), numbers, uses_control=True)
+
+
+class RateLimits(Constraint):
+    """The limits of rates, for such dynamics."""
+
+    def __init__(self, rate: ControlRate, dt: float) -> None:
+        self.rate, self.dt = rate, dt
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        assert isinstance(self.rate.limits, tuple)
+        space, (low, high) = dynamics.control_coordinates, np.asarray(self.rate.limits)
+        rows = [
+            (i, sign, bound, name, unit)
+            for sign, sides in ((1.0, low), (-1.0, high))
+            for i, (bound, name, unit) in enumerate(zip(sides, space.names, space.units, strict=True))
+            if np.isfinite(bound)
+        ]
+        words = {1.0: "at least", -1.0: "at most"}
+        described = [
+            f"a rate of {name} of {words[sign]} {bound:g} {unit}/s".replace(" /s", " 1/s")
+            for _, sign, bound, name, unit in rows
+        ]
+        numbers = np.concatenate(
+            [self.rate._numbers(self.dt, dynamics), *([i, sign, bound] for i, sign, bound, *_ in rows)]
+        )
+        kernels = source_of(__name__)
+        return ConstraintTerm(
+            kernels.filled(value=(kernels, "room"), slope=(kernels, "room_slope")), numbers, len(rows),
+            described.__getitem__, uses_control=True, convex=True, linear=True,
+            ranges=np.array([high[i] - low[i] for i, *_ in rows]),
+            names=tuple(f"{name} {'low' if sign > 0 else 'high'}" for _, sign, _, name, _ in rows),
+        )  # fmt: skip
+
+
+# The kernels. `data` has 1 if the command before the first step is known, else 0; dt in s; and that command (M,). Then
+# follow the weights (M,) of a cost; or, for each row of limits, the control, 1 for a lower or -1 for an upper limit,
+# and the limit.
+KNOWN, DT, PREVIOUS = 0, 1, 2
+
+
+def value(x, u, t, data):
+    """The cost of the rates."""
+    total = 0.0
+    for i in range(M):
+        rate = rate_of(i, x, u, t, data)
+        total += 0.5 * data[PREVIOUS + M + i] * rate * rate
+    return total
+
+
+def derivatives(x, u, t, data, hessian, gradient):
+    """Add the Hessian (W, W) and the gradient (W,), and return the cost."""
+    total = 0.0
+    for i in range(M):
+        rate, weight, last = rate_of(i, x, u, t, data), data[PREVIOUS + M + i], N - M + i
+        slope, curve = weight * rate / data[DT], weight / (data[DT] * data[DT])
+        total += 0.5 * weight * rate * rate
+        if t > 0 or data[KNOWN] > 0:
+            gradient[N + i] += slope
+            hessian[N + i, N + i] += curve
+        if t > 0:
+            gradient[last] -= slope
+            hessian[last, last] += curve
+            hessian[last, N + i] -= curve
+            hessian[N + i, last] -= curve
+    return total
+
+
+def room(x, u, t, row, data):
+    """The distance of a rate to a limit; infinite for a first command that is free."""
+    if t == 0 and data[KNOWN] == 0:
+        return inf
+    first = PREVIOUS + M + 3 * row
+    return data[first + 1] * (rate_of(int(data[first]), x, u, t, data) - data[first + 2])
+
+
+def room_slope(x, u, t, row, data, gradient):
+    """Add its gradient (W,)."""
+    first = PREVIOUS + M + 3 * row
+    i, slope = int(data[first]), data[first + 1] / data[DT]
+    gradient[N + i] += slope
+    if t > 0:
+        gradient[N - M + i] -= slope
+
+
+def rate_of(i, x, u, t, data):
+    """The rate of a control, in its unit per second; 0 for a first command that is free."""
+    if t > 0:
+        return (u[i] - x[N - M + i]) / data[DT]
+    if data[KNOWN] > 0:
+        return (u[i] - data[PREVIOUS + i]) / data[DT]
+    return 0.0

@@ -1,0 +1,194 @@
+"""A problem with costs or limits of rates as one with the last command among the states, which solvers can solve.
+
+With `x = (y, z)`, `y_{t+1} = g(y_t, u_t)` and `z_{t+1} = u_t`, a rate is that of u_t and z_t.
+"""
+
+import contextlib
+from collections.abc import Collection, Iterator
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.sources import Source, source_of
+from lqrsim.codegen.user_functions import numbers_of
+from lqrsim.errors import Array
+from lqrsim.kernels import last_command as kernel
+from lqrsim.problem.constraints import bind_all
+from lqrsim.problem.control_rate import RateCost, RateLimits
+from lqrsim.problem.costs import Cost, ProblemPart, terms_of
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.problem.quadratic_cost import QuadraticCost
+from lqrsim.results.coordinates import Coordinates
+
+Part = TypeVar("Part", bound=ProblemPart[Any])
+
+
+class LastCommand(Dynamics):
+    """Dynamics with the last command as their last m states.
+
+    Attributes:
+      of: the dynamics without.
+    """
+
+    def __init__(self, of: Dynamics) -> None:
+        self.of, self.level, self.functions = of, of.level, ()
+        self.parameters, self.disturbances = dict[str, float](), dict[str, float]()  # those of `of` are its own
+        space, controls = of.state_coordinates, of.control_coordinates
+        names = list(space.names)
+        for name in controls.names:
+            names.append(unused(f"last_{name}", names))
+        self.control_coordinates = controls
+        self.state_coordinates = Coordinates(
+            names=tuple(names), units=(*space.units, *controls.units), position=space.position, plane=space.plane,
+            offset=space.offset, angles=space.angles, rotation_vectors=space.rotation_vectors,
+        )  # fmt: skip
+
+    @property
+    def period(self) -> float | None:
+        return self.of.period
+
+    @property
+    def by_mujoco(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.of.by_mujoco
+
+    @property
+    def rounding(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.of.rounding
+
+    @property
+    def name(self) -> str:
+        return self.of.name
+
+    @property
+    def calling(self) -> Dynamics:
+        return self.of.calling
+
+    @cached_property
+    def step_source(self) -> Source:
+        return source_of(kernel)
+
+    @cached_property
+    def curvature_source(self) -> Source | None:
+        return self.step_source if self.of.step_curvature else None
+
+    @property
+    def data(self) -> Array:
+        """The addresses that the kernels read."""
+        functions = *self.of.compiled.addresses("advance", "step_jacobian"), self.of.step_curvature
+        return np.array([*functions, self._own_numbers.ctypes.data], dtype=np.float64)
+
+    @cached_property
+    def _own_numbers(self) -> Array:
+        """The numbers of the dynamics without, kept where their address is in use."""
+        return numbers_of(self.of)
+
+    def _own(self, states: npt.ArrayLike) -> Array:
+        """States (..., n) without the last command."""
+        return np.asarray(states)[..., : len(self.of.state_coordinates)]
+
+    def touches(self, states: Array) -> bool:
+        return self.of.touches(self._own(states))
+
+    def untouched_body(self, states: Array, state: int) -> str:
+        return self.of.untouched_body(self._own(states), state) if state < len(self.of.state_coordinates) else ""
+
+    def _cause_of_failure(self, state: Array) -> str | None:
+        return self.of._cause_of_failure(self._own(state))
+
+    def softened(self, states: Array) -> Iterator[tuple[str, Dynamics]]:
+        return ((name, LastCommand(softer)) for name, softer in self.of.softened(self._own(states)))
+
+    def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, Dynamics, Array]]:
+        m = len(self.control_coordinates)
+        for words, dynamics, motion in self.of.approaches(self._own(states), self._own(moves)):
+            yield words, LastCommand(dynamics), np.pad(motion, [(0, 0), (0, m)], constant_values=np.nan)
+
+    def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
+        return self.of._runge_kutta(self._own(states), controls, dt)
+
+    def _with_finer_steps(self, dt: float, most: float) -> str:
+        return self.of._with_finer_steps(dt, most)
+
+    def period_near(self, dt: float) -> float:
+        return self.of.period_near(dt)
+
+    def check_period(self, dt: float) -> None:
+        self.of.check_period(dt)
+
+    def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
+        return self.of.solving(threads)
+
+    def quiet(self) -> contextlib.AbstractContextManager[None]:
+        return self.of.quiet()
+
+    def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
+        """That of the dynamics; 0 for the last command, which jumps."""
+        return np.pad(self.of.rate(self._own(state), control), (0, len(self.control_coordinates)))
+
+    def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
+        fx, fu = self.of.rate_jacobian(self._own(state), control)
+        m = len(self.control_coordinates)
+        return np.pad(fx, (0, m)), np.pad(fu, [(0, m), (0, 0)])
+
+    def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
+        return np.concatenate([self.of.step(self._own(state), control, dt), np.asarray(control, dtype=np.float64)])
+
+    def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
+        a, b, c = self.of.linearize(self._own(state), control, dt)
+        m = len(self.control_coordinates)
+        return np.pad(a, (0, m)), np.vstack([b, np.eye(m)]), np.pad(c, (0, m))
+
+
+def with_last_command(problem: Problem) -> Problem:
+    """The problem of a problem with a `control_rate`, with the last command as its last m states.
+
+    That before the first step is no state: the cost and the limits of rates have it.
+
+    Raises:
+      InputError: a part of the problem cannot be stated with more states.
+    """
+    rate, dynamics, m = problem.control_rate, problem.dynamics, len(problem.control_coordinates)
+    assert rate is not None
+    wide = LastCommand(dynamics)
+
+    def added(part: Part) -> Part:
+        for _ in range(m):
+            part = part.with_added_state(dynamics)
+        return part
+
+    begun: Cost
+    initial = problem.initial
+    if isinstance(initial, FixedState):
+        initial = FixedState(np.pad(initial.numbers, (0, m)))
+        begun = QuadraticCost(np.zeros(len(initial.numbers)), about=initial.numbers)
+    else:
+        # A weight, which costs nothing: a cost-to-come needs one of each state.
+        weight = np.diag(np.pad(np.ones(m), (len(dynamics.state_coordinates), 0)))
+        begun = added(initial)
+        if isinstance(begun, QuadraticCost):  # else the problem's start would be no longer known
+            begun = QuadraticCost(begun.weight + weight, about=begun.about)
+        else:
+            begun += QuadraticCost(weight, about=np.zeros(len(weight)))
+        initial = begun
+    stage, constraints = added(problem.stage_cost), list(map(added, problem.constraints))
+    if rate.weight is not None:
+        stage += RateCost(rate, problem.dt)
+    if rate.limits is not None:
+        constraints.append(RateLimits(rate, problem.dt))
+    final = added(problem.final_cost)
+    # Without new checks, as the rest of a problem may begin where a new problem may not.
+    other = problem._with(dynamics=wide, initial=initial, stage_cost=stage, final_cost=final, control_rate=None)
+    parts = {"initial": begun, "stage_cost": stage, "final_cost": final}
+    terms = {name: other._bound(terms_of(cost)) for name, cost in parts.items()}
+    bound = bind_all(constraints, wide, problem.times)
+    return other._with(_terms=terms, constraints=tuple(constraints), _constraint_terms=bound)
+
+
+def unused(name: str, names: Collection[str]) -> str:
+    """A name that is not among others: with underscores after it if it is."""
+    while name in names:
+        name += "_"
+    return name
