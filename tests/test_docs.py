@@ -161,7 +161,7 @@ def test_an_arm_goes_round_a_post(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.long
-def test_one_system_at_three_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_system_at_every_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("stating_a_system.md")
     # A plan that depends on time runs in MuJoCo: its clock is exact, and the mass follows the sine as is planned.
@@ -189,6 +189,16 @@ def test_one_system_at_three_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert most - 2e-3 < largest <= most
     assert all(check.good for check in ls.check_derivatives(names["pendulum"]))
     assert all(found.status is ls.Status.CONVERGED for found in names["solutions"])
+    pytest.importorskip("jax", reason="needs the `jax` extra")
+    page = (DOCS / "stating_a_system.md").read_text("utf-8")
+    blocks = re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (block,) = (one for one in blocks if 'level="jax"' in one)
+    exec(compile(block, "stating_a_system.md", "exec"), names)
+    assert names["learned_solution"].status is ls.Status.CONVERGED
+    learned, crane = names["learned"], names["symbolic"]
+    x = np.array([0.1, 0.2, 0.5, -0.3])
+    drag = names["outer"] @ np.tanh(names["inner"] @ x[2:])
+    np.testing.assert_allclose(learned.rate(x, [1.0]), crane.rate(x, [1.0 - drag]), rtol=1e-13)
 
 
 def test_a_policy_is_loaded_with_numpy_alone(
