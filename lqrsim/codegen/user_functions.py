@@ -1,10 +1,10 @@
-"""A user's own numba or plain Python function, at an address that compiled code can call.
+"""A user's own numba, JAX or plain Python function, at an address that compiled code can call.
 
-Compiled code knows only the address, so it serves all functions of the same sizes. A plain function is called back
-through Python, at microseconds per call. A numba function is compiled to a C function, and cached on disk if it has a
-fingerprint: numba compiles it once, to LLVM IR. An object file of this IR is cached. In the file everything except the
-function itself is internal: numba numbers its functions within a process, so files of two processes would contain
-different functions of the same name.
+Compiled code knows only the address, so it serves all functions of the same sizes. A function of JAX or plain Python is
+called back through Python, at microseconds per call. A numba function is compiled to a C function, and cached on disk
+if it has a fingerprint: numba compiles it once, to LLVM IR. An object file of this IR is cached. In the file everything
+except the function itself is internal: numba numbers its functions within a process, so files of two processes would
+contain different functions of the same name.
 """
 
 import collections

@@ -1,4 +1,4 @@
-"""Costs and constraints that are stated as functions: formulas of symbols, and numba or plain Python functions."""
+"""Costs and constraints that are stated as functions: formulas of symbols, and numba, JAX or plain Python functions."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
