@@ -64,7 +64,7 @@ class JaxSteps(UserFunction):
     ) -> None:
         """Write states (K, n) and Jacobians (K, n w), and add Hessians (K, w w), or do the first of this."""
         n, w, last = self.states, self.states + self.controls, len(p) + 1
-        # A single array each way: its transfer takes a third of the time of several.
+        # A single array each way: several take twice as long to transfer.
         packed = np.empty((len(x), w + last + (n if what == HESSIANS else 0)))
         packed[:, :n], packed[:, n:w], packed[:, w], packed[:, w + 1 : w + last] = x, u, h, p
         packed[:, w + last :] = weights if what == HESSIANS else 0.0
