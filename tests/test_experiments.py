@@ -546,3 +546,12 @@ def test_a_network_learns_what_a_formula_lacks() -> None:
     for each in result["times"].values():  # one optimum, by the same iterations
         assert each["formula"]["iterations"] == each["the same in JAX"]["iterations"]
     assert "| with the network |" in script.report(result)
+
+
+@pytest.mark.long
+def test_weights_are_tuned_so_that_the_policy_fails_less() -> None:
+    script: Any = import_module("tune_weights")
+    result = script.main(script.Config(quick=True))
+    rows = result["rows"]
+    assert rows["tuned"]["fails"][1][2] < rows["the scenario's"]["fails"][1][1]  # the intervals are apart
+    assert "| tuned |" in script.report(result)
