@@ -31,6 +31,12 @@ def run_page(name: str) -> dict[str, Any]:
     return namespace
 
 
+def blocks_for_an_extra(name: str, part: str = "") -> list[str]:
+    """The blocks of a page that `run_page` leaves out, with this text in them."""
+    page = (DOCS / name).read_text(encoding="utf-8")
+    return [block for block in re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL) if part in block]
+
+
 def test_getting_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("getting_started.md")
@@ -68,7 +74,7 @@ def test_fitting_to_data_as_on_the_page(tmp_path: Path, monkeypatch: pytest.Monk
     pytest.importorskip("tabulate", reason="needs the `sysid` extra")
     monkeypatch.chdir(tmp_path)
     names = run_page("mjcf_robots.md")
-    (block,) = re.findall(r"^```py\n(.*?)^```$", (DOCS / "mjcf_robots.md").read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    (block,) = blocks_for_an_extra("mjcf_robots.md")
     exec(compile(block, "mjcf_robots.md", "exec"), names)
     fitted = {name: one.value[0] for name, one in names["fitted"].items()}
     # The plant has 1.5 kg in place of 1.2, in cart and pole alike.
@@ -142,6 +148,12 @@ def test_the_gear_that_the_plan_chooses_is_that_of_the_formula() -> None:
     names = run_page("gradients.md")
     assert names["best"].x[0] == pytest.approx(20.0, rel=1e-4)  # BFGS stops at slopes of 1e-5
     assert names["predicted"] == pytest.approx(names["again"].trajectory.controls, abs=1e-7)
+    pytest.importorskip("jax", reason="needs the `jax` extra")
+    (block,) = blocks_for_an_extra("gradients.md", "import jax")
+    exec(compile(block, "gradients.md", "exec"), names)
+    # JAX computes in single precision here, and the optimum is off by 1e-8 of itself.
+    above, below = (float(names["cost_and_gradient"]([(180 + h) / 12, 1.5])[0]) for h in (0.1, -0.1))
+    assert float(names["teeth"]) == pytest.approx((above - below) / 0.2, rel=1e-4)
 
 
 def test_least_time_is_that_of_the_formula() -> None:
@@ -166,7 +178,7 @@ def test_an_arm_goes_round_a_post(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.long
-def test_one_system_at_three_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_system_at_every_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("stating_a_system.md")
     # A plan that depends on time runs in MuJoCo: its clock is exact, and the mass follows the sine as is planned.
@@ -194,6 +206,14 @@ def test_one_system_at_three_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert most - 2e-3 < largest <= most
     assert all(check.good for check in ls.check_derivatives(names["pendulum"]))
     assert all(found.status is ls.Status.CONVERGED for found in names["solutions"])
+    pytest.importorskip("jax", reason="needs the `jax` extra")
+    (block,) = blocks_for_an_extra("stating_a_system.md", 'level="jax"')
+    exec(compile(block, "stating_a_system.md", "exec"), names)
+    assert names["learned_solution"].status is ls.Status.CONVERGED
+    learned, crane = names["learned"], names["symbolic"]
+    x = np.array([0.1, 0.2, 0.5, -0.3])
+    drag = names["outer"] @ np.tanh(names["inner"] @ x[2:])
+    np.testing.assert_allclose(learned.rate(x, [1.0]), crane.rate(x, [1.0 - drag]), rtol=1e-13)
 
 
 def test_a_policy_is_loaded_with_numpy_alone(

@@ -532,3 +532,26 @@ def test_board_of_realaigym() -> None:
     assert board["trials"] == 2
     assert board["columns"] == {"model": 1.0, "velocity noise": 1.0, "score": 1.0}
     assert "| pendubot, version 1 | 100.0 | 100.0 |" in script.report(result)
+
+
+@pytest.mark.long
+def test_a_network_learns_what_a_formula_lacks() -> None:
+    pytest.importorskip("jax", reason="needs the `jax` extra")
+    script: Any = import_module("jax_residual")
+    result = script.main(script.Config(quick=True))
+    assert result["misfit"]["with the network"] < 0.2 * result["misfit"]["formula"]
+    found = result["runs"]
+    assert found["with the network"]["apart"] < 0.1 < found["formula"]["apart"]
+    assert found["with the network"]["stands"][0] > 0.8 > found["formula"]["stands"][0]
+    for each in result["times"].values():  # one optimum, by the same iterations
+        assert each["formula"]["iterations"] == each["the same in JAX"]["iterations"]
+    assert "| with the network |" in script.report(result)
+
+
+@pytest.mark.long
+def test_weights_are_tuned_so_that_the_policy_fails_less() -> None:
+    script: Any = import_module("tune_weights")
+    result = script.main(script.Config(quick=True))
+    rows = result["rows"]
+    assert rows["tuned"]["fails"][1][2] < rows["the scenario's"]["fails"][1][1]  # the intervals are apart
+    assert "| tuned |" in script.report(result)

@@ -51,7 +51,7 @@ FLOORS_WITHIN = {
     "codegen": (
         ("disk_cache", "language", "llvm"),
         ("sources",),
-        ("fingerprint", "plain", "printer"),
+        ("fingerprint", "jitted", "plain", "printer"),
         ("compiled_module", "symbolic"),
         ("user_functions",),
     ),
@@ -92,6 +92,7 @@ ALLOWED = {
     "mujoco": ("scenes", "simulation", "view", "verify"),
     "matplotlib": ("view", "reports"),
     "av": ("view", "verify"),
+    "jax": ("codegen",),
     "numba": ("codegen",),
     "llvmlite": ("codegen", "machine"),
     "sympy": ("codegen", "problem", "rotations", "robots"),

@@ -1043,6 +1043,19 @@ class TestParts:
             arrays = np.linspace(-1.0, 2.0, n), np.zeros(n), np.zeros((n, n + m)), np.zeros((n + m, n + m))
             replay(dynamics.curvature_source, sizes, "step_curvature", x, u, numbers, dt, *arrays)
 
+    def test_steps_of_jax(self) -> None:
+        jnp = pytest.importorskip("jax.numpy", reason="needs the `jax` extra")
+
+        def rate(x, u, p):
+            return [u[0] * jnp.cos(x[2]), u[0] * jnp.sin(x[2]), p.a * u[1]]
+
+        names: dict[str, Any] = {"states": dict.fromkeys("xyh", ""), "controls": {"v": "", "w": ""}}
+        dynamics = ls.Dynamics(rate, **names, parameters={"a": 0.5}, level="jax")
+        self.steps(dynamics, X, U, 0.1)
+        numbers, states, controls = numbers_of(dynamics), np.array([X, -X, X]), np.array([U, -U])
+        arrays = np.ones((3, 3)), np.zeros((2, 3)), np.zeros((2, 3, 5)), np.zeros((3, 5, 5))
+        replay(dynamics.step_source, SIZES, "all_steps", 2, 2, states, controls, numbers, 0.1, *arrays)
+
     @pytest.mark.parametrize("size", [0.05, 1.5])
     def test_rotations(self, size: float) -> None:
         """Near zero by series, and beyond."""

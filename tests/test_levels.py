@@ -362,7 +362,7 @@ def test_what_numba_can_not_compile_gets_one_line() -> None:
         ls.ilqr(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
     with pytest.raises(ls.InputError, match="jacobian: got a derivative of symbolic, which is symbolic, want none"):
         ls.Dynamics(symbolic, jacobian=pendulum_jacobian, **FIELDS)
-    with pytest.raises(ls.InputError, match="level: got 'fast', want one of: symbolic, compiled, plain"):
+    with pytest.raises(ls.InputError, match="level: got 'fast', want one of: symbolic, compiled, jax, plain"):
         ls.Dynamics(symbolic, level="fast", **FIELDS)
     with pytest.raises(ls.InputError, match="level: got 'plain' for pendulum, want 'compiled' for a numba function"):
         ls.Dynamics(numba.njit(pendulum), level="plain", **FIELDS)

@@ -63,7 +63,7 @@ def test_sdist_is_complete(built: Path) -> None:
 WITHOUT = """
 import importlib.metadata, sys
 
-OPTIONAL = ("casadi", "crocoddyl", "distributed", "gymnasium", "numba", "rerun")
+OPTIONAL = ("casadi", "crocoddyl", "distributed", "gymnasium", "jax", "numba", "rerun")
 found = importlib.metadata.Distribution.from_name.__func__
 
 

@@ -1,8 +1,8 @@
 """A hash of a function's code, without running it: the cache key of everything derived from the function.
 
 It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
-that it refers to, recursively. NumPy, SymPy and numba count by their versions. A function that refers to anything else
-(an object that may change, a module of the user's own, a file) has no fingerprint, and nothing derived from it is
+that it refers to, recursively. NumPy, SymPy, numba and JAX count by their versions. A function that refers to anything
+else (an object that may change, a module of the user's own, a file) has no fingerprint, and nothing derived from it is
 cached.
 """
 
@@ -25,7 +25,7 @@ from lqrsim.codegen import disk_cache
 from lqrsim.kernels import rotation_ratios
 
 # Modules that formulas may use; the hash includes their versions instead of their code.
-_PACKAGES = ("math", "numba", "numpy", "sympy")
+_PACKAGES = ("jax", "math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
 # Names that read files, other names or random numbers: a function that uses them has no hash. `getattr` is allowed,
 # because everything that it can reach is covered, except through names like `__globals__`.
@@ -105,7 +105,7 @@ def _parts(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _version(name: str) -> str:
-    """The version of a package. If numba is missing, no function refers to it."""
+    """The version of a package. If numba or JAX is missing, no function refers to it."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -219,6 +219,8 @@ def _value(value: Any, seen: dict[int, Any]) -> Iterator[str]:
         yield f"{type(value).__name__} {value!r}"
     elif (type(value) is np.ndarray or isinstance(value, np.generic)) and not value.dtype.hasobject:
         yield repr((value.dtype.descr, value.shape, value.tobytes()))
+    elif (type(value).__module__ or "").startswith("jaxlib."):  # an array: weights of a network
+        yield from _value(np.asarray(value), seen)
     elif isinstance(value, tuple | list | frozenset | set):
         yield f"{type(value).__name__} {len(value)}"
         parts = ["\n".join(_value(part, seen)) for part in value]

@@ -149,7 +149,7 @@ def trace(
         raise InputError(
             f"{called}: got {type(error).__name__} ({error}) when called with symbols, {len(x)} in x{counted},"
             " want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
-            " for NumPy's functions and for branches there is level='compiled' or 'plain'"
+            " for NumPy's functions and for branches there is level='compiled' or 'plain', for JAX's level='jax'"
         ) from None
     if returned is None:
         raise InputError(f"{called}: got None, want expressions: is a return missing?")

@@ -1,10 +1,10 @@
-"""A user's own numba or plain Python function, at an address that compiled code can call.
+"""A user's own numba, JAX or plain Python function, at an address that compiled code can call.
 
-Compiled code knows only the address, so it serves all functions of the same sizes. A plain function is called back
-through Python, at microseconds per call. A numba function is compiled to a C function, and cached on disk if it has a
-fingerprint: numba compiles it once, to LLVM IR. An object file of this IR is cached. In the file everything except the
-function itself is internal: numba numbers its functions within a process, so files of two processes would contain
-different functions of the same name.
+Compiled code knows only the address, so it serves all functions of the same sizes. A function of JAX or plain Python is
+called back through Python, at microseconds per call. A numba function is compiled to a C function, and cached on disk
+if it has a fingerprint: numba compiles it once, to LLVM IR. An object file of this IR is cached. In the file everything
+except the function itself is internal: numba numbers its functions within a process, so files of two processes would
+contain different functions of the same name.
 """
 
 import collections
@@ -24,6 +24,7 @@ import numpy as np
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.compiled_module import compilations, compiling
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
+from lqrsim.codegen.jitted import Jitted, JittedDerivatives, check_jax
 from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
 from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
@@ -140,7 +141,7 @@ def _reason(error: Exception) -> str:
     return f"its subset of Python ({' '.join(telling[:3])})"
 
 
-LEVELS = ("symbolic", "compiled", "plain")
+LEVELS = ("symbolic", "compiled", "jax", "plain")
 
 
 def level_of(function: Any, asked: str | None) -> str:
@@ -154,6 +155,8 @@ def level_of(function: Any, asked: str | None) -> str:
         return "compiled" if is_compiled else "symbolic"
     if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
         raise InputError(f"level: got {asked!r} for {name_of(function)}, want 'compiled' for a numba function")
+    if asked == "jax":
+        check_jax(name_of(function))
     return asked
 
 
@@ -184,7 +187,7 @@ class UserFunction:
     or two arrays of those shapes, which are zero on entry.
 
     Attributes:
-      level: compiled or plain.
+      level: compiled, jax or plain.
       states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
       unused: (index, name) of the entries of (x, u) on which the value does not depend, according to the user.
@@ -216,7 +219,7 @@ class UserFunction:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it without its address, which is of no use to another process."""
         stated = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
-        return partial(UserFunction, **stated), ()
+        return partial(type(self), **stated), ()
 
     @property
     def name(self) -> str:
@@ -239,7 +242,7 @@ class UserFunction:
         Raises:
           InputError: the function fails, or returns an unsuitable result.
         """
-        plain = getattr(self.function, "py_func", self.function)
+        plain = self.function if self.level == "jax" else getattr(self.function, "py_func", self.function)
         if not self.held:  # before the first call compiles its helpers
             note_helpers(self.function)
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
@@ -257,6 +260,15 @@ class UserFunction:
                 f"{self.name}: got {type(error).__name__} ({error}), want no exception at x = {first_numbers(x)}"
             ) from error
         return written or [self._vector(returned)]
+
+    def plain_call(self, parameters: Mapping[str, float]) -> Callable[..., None]:
+        """The function for kernels in plain Python: it writes the values that the user's function returns."""
+
+        def run(x: Array, u: Array, data: Array, *outputs: Array) -> None:
+            for output, value in zip(outputs, self.call(x, u, parameters), strict=True):
+                output[...] = value.reshape(output.shape)
+
+        return run
 
     def _vector(self, returned: Any) -> Array:
         try:
@@ -289,33 +301,41 @@ class UserFunction:
         end = self.offset + len(self.parameters)
 
         def callback(x: int, u: int, data: int, *outputs: int) -> None:
-            arrays = [_view(address, size) for address, size in zip(outputs, sizes, strict=True)]
-            try:
-                if self.stopped.is_set():
-                    raise KeyboardInterrupt
-                if self.raised is not None:
-                    raise self.raised
-                values = _view(data, end)[self.offset :]
+            arrays = [view(address, size) for address, size in zip(outputs, sizes, strict=True)]
+
+            def write() -> None:
+                values = view(data, end)[self.offset :]
                 p = parameters_class(self.parameters)(*values.tolist())
-                given = (_view(x, self.states).copy(), _view(u, self.controls).copy())[: 1 + self.with_control]
-                with np.errstate(all="ignore"):
-                    if self.writes:
-                        # Copies, because the function may keep them beyond the call.
-                        written = [np.zeros(shape) for shape in self.writes]
-                        self.function(*given, p, *written)
-                        for array, values_written in zip(arrays, written, strict=True):
-                            array[:] = values_written.reshape(-1)
-                    else:
-                        arrays[0][:] = self._vector(self.function(*given, p))
-            except BaseException as error:  # even Ctrl-C: C code cannot pass it on, so the solver checks `raised`
-                self._thread.raised = error
-                for array in arrays:
-                    array[:] = np.nan
+                given = (view(x, self.states).copy(), view(u, self.controls).copy())[: 1 + self.with_control]
+                if self.writes:
+                    # Copies, because the function may keep them beyond the call.
+                    written = [np.zeros(shape) for shape in self.writes]
+                    self.function(*given, p, *written)
+                    for array, values_written in zip(arrays, written, strict=True):
+                        array[:] = values_written.reshape(-1)
+                else:
+                    arrays[0][:] = self._vector(self.function(*given, p))
+
+            self._guarded(write, arrays)
 
         held = prototype(callback)
         address = ctypes.cast(held, ctypes.c_void_p).value
         assert address is not None
         return held, address
+
+    def _guarded(self, write: Callable[[], None], outputs: Sequence[Array]) -> None:
+        """Let a callback write its outputs. After an exception they are NaN, and the solver checks `raised`."""
+        try:
+            if self.stopped.is_set():
+                raise KeyboardInterrupt
+            if self.raised is not None:
+                raise self.raised
+            with np.errstate(all="ignore"):
+                write()
+        except BaseException as error:  # even Ctrl-C: C code cannot pass it on
+            self._thread.raised = error
+            for array in outputs:
+                array[:] = np.nan
 
     @property
     def raised(self) -> BaseException | None:
@@ -363,10 +383,16 @@ class UserFunction:
 
 def with_derivatives(
     function: Callable[..., Any], returned: Mapping[str, Any],
-    derivatives: Callable[..., Any] | None, writes: tuple[tuple[int, ...], ...], **both: Any,
+    derivatives: Callable[..., Any] | None, writes: tuple[tuple[int, ...], ...], *, more: int = 0, **both: Any,
 ) -> tuple[UserFunction, ...]:  # fmt: skip
-    """A function that returns values, and one that writes its derivatives, unless that is None: `**both` is of both."""
-    both["offset"] = 1 if derivatives is None else 2
+    """A function that returns values, and one that writes its derivatives, unless that is None: `**both` is of both.
+
+    Those of a function of JAX are derived, if there is something to write. `more` functions follow in the data.
+    """
+    if both["level"] == "jax":
+        derivatives = JittedDerivatives(function, writes) if writes else None
+        function = Jitted(function)
+    both["offset"] = (1 if derivatives is None else 2) + more
     first = UserFunction(function=function, **returned, **both)
     return (first,) if derivatives is None else (first, UserFunction(function=derivatives, writes=writes, **both))
 
@@ -485,8 +511,8 @@ def axes_of(
 
 def check_derivative(field: str, derivative: Any, function: Any, level: str, arguments: str) -> None:
     """Raises InputError unless a derivative takes these arguments, and is allowed at its function's level."""
-    if level == "symbolic":
-        got = f"a derivative of {name_of(function)}, which is symbolic"
+    if level in ("symbolic", "jax"):
+        got = f"a derivative of {name_of(function)}, which is {level}"
         raise InputError(f"{field}: got {got}, want none (it is derived) or level='compiled' or 'plain'")
     check_function(field, derivative, f"a function of ({arguments})")
     level_of(derivative, level)
@@ -494,16 +520,8 @@ def check_derivative(field: str, derivative: Any, function: Any, level: str, arg
 
 
 def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:
-    """The functions for `plain_functions`. Each writes the values that the user's function returns."""
-
-    def calling(function: UserFunction) -> Callable[..., None]:
-        def run(x: Array, u: Array, data: Array, *outputs: Array) -> None:
-            for output, value in zip(outputs, function.call(x, u, parameters), strict=True):
-                output[...] = value.reshape(output.shape)
-
-        return run
-
-    return [calling(function) for function in functions]
+    """The functions for `plain_functions`."""
+    return [function.plain_call(parameters) for function in functions]
 
 
 def address_of(function: UserFunction) -> float:
@@ -523,7 +541,8 @@ def address_of(function: UserFunction) -> float:
     return float(function.held[0][1])
 
 
-def _view(address: int, size: int) -> Array:
+def view(address: int, size: int) -> Array:
+    """The numbers at an address."""
     memory: Any = (ctypes.c_double * size).from_address(address)
     return np.frombuffer(memory, dtype=np.float64)
 

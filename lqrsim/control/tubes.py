@@ -159,7 +159,7 @@ def predict_tube(
     surroundings, told = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
     late = [f"{field} of {getattr(told, field)}" for field in ("latency", "delay") if getattr(told, field)]
     if samples is None:
-        slow = problem.dynamics.by_mujoco or problem.dynamics.level == "plain" or surroundings.by_mujoco
+        slow = problem.dynamics.by_mujoco or problem.dynamics.level in ("jax", "plain") or surroundings.by_mujoco
         affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST), MOST)
         samples = 0 if slow or not (surroundings.kept or late) else affordable
     if samples and surroundings.by_mujoco:

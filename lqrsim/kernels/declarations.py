@@ -36,6 +36,9 @@ PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 # Tasks of the entry points; see `entry_points.py`.
 ITERATE, DESCEND, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5
 
+# What is written of many steps at once: the states after them, with their Jacobians, and with their Hessians.
+STATES, JACOBIANS, HESSIANS = 0, 1, 2
+
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
 

@@ -4,7 +4,7 @@ Passes and iterations are therefore compiled once per size, and serve all proble
 `records.ProblemModel`.
 """
 
-from lqrsim.kernels.declarations import N, W, call, call_for_value, stack
+from lqrsim.kernels.declarations import HESSIANS, STATES, N, W, call, call_for_value, stack
 from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill
 from lqrsim.kernels.records import NextStep
 
@@ -18,6 +18,7 @@ SIGNATURES = {
     "advance": "x u p h:float out",
     "step_jacobian": "x u p h:float out jacobian:W",
     "step_curvature": "x u p h:float weights out jacobian:W hessian:W",
+    "all_steps": "what:int steps:int states controls p h:float costates arrived jacobian hessian",
     "value": "x u t:int data",
     "derivatives": "x u t:int data hessian:W gradient",
     "project": "hessian:W",
@@ -51,6 +52,32 @@ def step_second_order(x, u, model, weights, out, jacobian, hessian):
         call(dynamics.step_curvature, x, u, dynamics.parameters, model.dt, weights, out, jacobian, hessian)
     else:
         step_jacobian(x, u, model, model.dt, out, jacobian)
+
+
+def advance_all(steps, plan, model, arrived):
+    """Write the state after each step of a plan, (T, N)."""
+    dynamics, none = model.dynamics, arrived
+    if dynamics.all_steps != 0:
+        p = dynamics.parameters
+        call(dynamics.all_steps, STATES, steps, plan.states, plan.controls, p, model.dt, none, arrived, none, none)
+        return
+    for t in range(steps):
+        advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
+
+
+def all_steps_second_order(steps, plan, model, costates, arrived, jacobian, hessian):
+    """As `step_second_order`, for all steps of a plan: arrived (T, N), jacobian (T, N, W), hessian (T+1, W, W).
+
+    Args:
+      costates: (T+1, N), the weights of the state at 0, which has none, and of the next states.
+    """
+    x, u, dynamics = plan.states, plan.controls, model.dynamics
+    if dynamics.all_steps != 0:
+        p = dynamics.parameters
+        call(dynamics.all_steps, HESSIANS, steps, x, u, p, model.dt, costates, arrived, jacobian, hessian)
+        return
+    for t in range(steps):
+        step_second_order(x[t], u[t], model, costates[t + 1], arrived[t], jacobian[t], hessian[t])
 
 
 def cost_value(x, u, t, cost):

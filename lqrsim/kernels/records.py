@@ -24,12 +24,14 @@ class Limits(NamedTuple):
 class DynamicsModel(NamedTuple):
     """Addresses of the functions of the dynamics, and their parameters (any,).
 
-    `step_curvature` is the address of a step's second derivatives; 0 if they vanish or are not needed.
+    `step_curvature` is the address of a step's second derivatives; 0 if they vanish or are not needed. `all_steps` is
+    that of all steps of a plan; 0 if there is only one step at a time.
     """
 
     advance: float
     step_jacobian: float
     step_curvature: float
+    all_steps: float
     parameters: Arrays
 
 

@@ -24,6 +24,8 @@ from lqrsim.kernels.linear_algebra import (
 from lqrsim.kernels.model_functions import (
     USES_CONTROL,
     advance,
+    advance_all,
+    all_steps_second_order,
     cost_of_order,
     cost_quadratic,
     cost_value,
@@ -57,9 +59,13 @@ def look(stages, plan, costates, least):
     """
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
-    total = 0.0
+    total, out = 0.0, stages.models
     for t in range(stages.steps, -1, -1):
-        total += stage_models(t, stages, plan, costates, least)
+        total += cost_model(t, stages, plan)
+    if stages.keeps[0] == 0:
+        all_steps_second_order(stages.steps, plan, stages.model, costates, out.arrived, out.jacobian, out.hessian)
+    for t in range(stages.steps, -1, -1):
+        add_curvatures(t, stages, plan, least)
     if stages.soft == 1:
         total += add_initial(plan.states[0], stages)
     return total
@@ -69,9 +75,13 @@ def look_with_own_costates(stages, plan, costates):
     """As `look`, but write the costates: those of this plan and the forces of its rows."""
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
-    total, slope = 0.0, stack(W)
+    total, slope, out = 0.0, stack(W), stages.models
     for t in range(stages.steps, -1, -1):
-        total += stage_models(t, stages, plan, costates, 0.0)
+        total += cost_model(t, stages, plan)
+        if t < stages.steps and stages.keeps[0] == 0:
+            x, u = plan.states[t], plan.controls[t]
+            step_second_order(x, u, stages.model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+        add_curvatures(t, stages, plan, 0.0)
         if t > 0:
             lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
             copy(slope, N, costates[t])
@@ -80,20 +90,20 @@ def look_with_own_costates(stages, plan, costates):
     return total
 
 
-def stage_models(t, stages, plan, costates, least):
-    """Write the models of cost, step and constraints at t, after `constraint_slopes`; return the cost."""
+def cost_model(t, stages, plan):
+    """Write the model of the cost at t, and return the cost."""
     none, model, out = zeros(M), stages.model, stages.models
-    x, u = plan.states[t], plan.controls[min(t, stages.steps - 1)]
     if t < stages.steps:
-        total = cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
-        if stages.keeps[0] == 0:
-            step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
-    else:
-        total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
-    subtract_curvatures(x, u, t, stages, least, out.hessian[t])
+        return cost_of_order(plan.states[t], plan.controls[t], t, model.stage, 1.0, out.hessian[t], out.gradient[t])
+    return cost_of_order(plan.states[t], none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
+
+
+def add_curvatures(t, stages, plan, least):
+    """Add the Hessians of the constraints at t, after `constraint_slopes`, and what is learned of the step's."""
+    out, u = stages.models, plan.controls[min(t, stages.steps - 1)]
+    subtract_curvatures(plan.states[t], u, t, stages, least, out.hessian[t])
     if stages.slow[0] != 0:
         add_matrix(out.learned[t], W, out.hessian[t])
-    return total
 
 
 def add_matrix(matrix, size, out):
@@ -193,8 +203,7 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
 
 def trial(stages, plan, arrived):
     """Write the state after each step of a plan, (T, N), and return the plan's cost."""
-    for t in range(stages.steps):
-        advance(plan.states[t], plan.controls[t], stages.model, stages.model.dt, arrived[t])
+    advance_all(stages.steps, plan, stages.model, arrived)
     return cost_of_plan(stages, plan)
 
 

@@ -105,7 +105,7 @@ class CollisionSpheres:
     To compute the centres in another way, subclass this class and write `bind`.
 
     Args:
-      places: `places(x, p)`, at one of the three levels of `Dynamics`; returns the centre of each of K balls, as 3
+      places: `places(x, p)`, at one of the levels of `Dynamics`; returns the centre of each of K balls, as 3
         coordinates in the world, in metres. If the robot has a position in a plane, a centre may have 2 coordinates in
         that plane; obstacles are then seen as for the position, see `World.seen_by`. The parameters of the dynamics are
         attributes of p.
@@ -114,10 +114,10 @@ class CollisionSpheres:
       sites: names of sites or geoms in the robot's MJCF, one per ball, or None. A `Plant` checks that each of them has
         its centre where the formula puts the ball.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the nonzero derivatives to slopes
-        (K, 3 or 2, n), which are zero on entry. Without a jacobian, central differences are used.
+        (K, 3 or 2, n), which are zero on entry. Without a jacobian, central differences are used; JAX derives it.
       depends_on: names of the states that the centres depend on, for the compiled and the plain level; all by default.
         The fewer, the faster.
-      level: "symbolic", "compiled" or "plain"; by default compiled if `places` is a numba function, else symbolic.
+      level: as in `Dynamics`; by default compiled if `places` is a numba function, else symbolic.
 
     Raises:
       InputError: a radius is negative, there are no balls, names are not one per ball and different, or the level does
@@ -244,7 +244,7 @@ class CollisionSpheres:
             level=self.level, states=len(names), controls=0, parameters=tuple(own.parameters), with_control=False,
         )  # fmt: skip
         source = source_of(user_functions, BALLS=len(self), COORDINATES=size)
-        if self.jacobian is None:
+        if len(functions) == 1:
             source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
         return SphereCenters(source, own.data, axes, size == 2, functions=functions)
 

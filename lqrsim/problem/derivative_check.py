@@ -21,12 +21,12 @@ STEP = 6e-6  # step of difference quotients, relative to numbers above 1
 
 
 def functions_of(problem: Problem) -> list[UserFunction]:
-    """The numba and plain Python functions of a problem."""
+    """The functions of a problem that are no formulas."""
     return [function for part in _parts(problem) for function in part.functions]
 
 
 def check_functions(problem: Problem, x: Array, u: Array) -> None:
-    """Call each numba and plain Python function once. Raises InputError if a function returns an unsuitable result."""
+    """Call each function that is no formula once. Raises InputError if a function returns an unsuitable result."""
     for part in _parts(problem):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))

@@ -1,4 +1,4 @@
-"""The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
+"""The dynamics of a system, stated as a function: of symbols, or of arrays for numba, JAX or NumPy."""
 
 import contextlib
 import copy
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.edge_pushing import weighted_hessian
+from lqrsim.codegen.jax_steps import JaxSteps
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import (
@@ -27,7 +28,7 @@ from lqrsim.codegen.user_functions import (
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_number, excerpt
-from lqrsim.kernels import differences, discrete_map, runge_kutta, step_curvature, user_functions
+from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, step_curvature, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
@@ -53,11 +54,13 @@ class Dynamics:
             parameters={"inertia": 0.02, "gravity": 9.81, "length": 0.2}, angles=("angle",),
         )
 
-    The same function can be stated at three levels, which differ in speed and in what the function may contain:
+    The same function can be stated at four levels, which differ in speed and in what the function may contain:
 
       symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default.
       compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
                 differences, good to some eight digits, and an iteration takes longer.
+      jax       a function of arrays of jax.numpy, such as a neural network. JAX compiles it, in double precision, and
+                derives exact derivatives. Each step is a call through Python, some 20 us and more.
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
     Args:
@@ -82,14 +85,14 @@ class Dynamics:
       jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes the nonzero entries of df/dx
         and df/du to fx (n, n) and fu (n, m), which are zero on entry. A numba function if f is one, else a Python
         function.
-      level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
+      level: "symbolic", "compiled", "jax" or "plain"; by default compiled if f is a numba function, else symbolic.
       period: for a map, f is the next state, after this many seconds, and every `dt` is this period. `rate` and
         `rate_jacobian` are then f's value and derivatives. A map has no inverse and no state in between: solvers in
-        continuous time, form="primal" and free durations are refused. None for rates.
+        continuous time, form="primal" and free durations are refused. Not with JAX. None for rates.
 
     Raises:
-      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. The result
-        of f is checked when it is first needed.
+      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function, or JAX is
+        missing. The result of f is checked when it is first needed.
     """
 
     # Whether MuJoCo does the steps; see `robots/mjcf_dynamics.py`. They have no second derivatives.
@@ -149,6 +152,8 @@ class Dynamics:
             starts.append(indices[0])
         self.f, self.jacobian = f, jacobian
         self.level = level_of(f, level)
+        if self.level == "jax" and period is not None:
+            raise InputError(f'period: got {period:g} beside level="jax", want none: functions of JAX are rates')
         check_signature(f, ("x", "u", "p"))
         if jacobian is not None:
             check_derivative("jacobian", jacobian, f, self.level, "x, u, p, fx, fu")
@@ -238,22 +243,24 @@ class Dynamics:
 
     def _functions(self) -> tuple[UserFunction, ...]:
         """The functions that compiled code calls: none if the dynamics are symbolic, else f and the Jacobian, if there
-        is one.
+        is one; and of JAX, also whole steps.
         """
         if self.level == "symbolic":
             return ()
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        return with_derivatives(
-            self.f, {"values": n, "entries": self.state_coordinates.names}, self.jacobian, ((n, n), (n, m)),
-            level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
-        )  # fmt: skip
+        returned = {"values": n, "entries": self.state_coordinates.names}
+        sizes: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
+        if self.level != "jax":
+            return with_derivatives(self.f, returned, self.jacobian, ((n, n), (n, m)), **sizes)
+        first = with_derivatives(self.f, returned, None, ((n, n), (n, m)), more=1, **sizes)
+        return *first, JaxSteps(function=first[0].function, offset=first[0].offset, **returned, **sizes)
 
     @cached_property
     def source(self) -> Source:
         """Source of `rate` and `rate_jacobian` of `kernels/declarations.py`; symbolic dynamics are traced, once."""
         if self.level != "symbolic":
             given = source_of(user_functions)
-            return given if self.jacobian is not None else source_of(differences).filled(rate=given)
+            return given if len(self.functions) > 1 else source_of(differences).filled(rate=given)
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names, *self.constants.items())
         made = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
@@ -322,6 +329,8 @@ class Dynamics:
     @cached_property
     def step_source(self) -> Source:
         """Source of `advance` and `step_jacobian`, as in `kernels/runge_kutta.py`, or in `kernels/discrete_map.py`."""
+        if self.level == "jax":
+            return source_of(jax_steps).filled(rate_jacobian=self.source)
         return source_of(discrete_map if self.discrete else runge_kutta).filled(**self._rates)
 
     @property
@@ -339,6 +348,8 @@ class Dynamics:
     @cached_property
     def curvature_source(self) -> Source | None:
         """Source of `step_curvature`, as in `kernels/step_curvature.py`; None if it is zero everywhere."""
+        if self.level == "jax":
+            return self.step_source
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
         by_values = source_of(differences, AXES=axes).filled(
             **self._rates, **dict.fromkeys(("advance", "step_jacobian"), self.step_source)

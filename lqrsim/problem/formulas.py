@@ -1,4 +1,4 @@
-"""Costs and constraints that are stated as functions: formulas of symbols, and numba or plain Python functions."""
+"""Costs and constraints that are stated as functions: formulas of symbols, and numba, JAX or plain Python functions."""
 
 import copy
 import functools
@@ -229,18 +229,18 @@ class SymbolicConstraint(OfFormula, Constraint):
 
 
 class FunctionCost(OfFunction, Cost):
-    """A cost given as a numba or plain Python function, for costs that `SymbolicCost` cannot express.
+    """A cost given as a numba, JAX or plain Python function, for costs that `SymbolicCost` cannot express.
 
     Args:
-      function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.
+      function: `function(x, u, p)` of arrays x (n,) and u (m,), which must not be changed; returns the cost.
       derivatives: `derivatives(x, u, p, gradient, hessian)`, which writes to gradient (n+m,) and hessian (n+m, n+m),
         states before controls; both are zero on entry. Without derivatives, both are central differences, accurate to
-        about six digits, at two evaluations for every pair of entries in `depends_on`.
+        about six digits, at two evaluations for every pair of entries in `depends_on`; JAX derives them.
       depends_on: names of the states and controls that the cost depends on; all by default. The fewer, the faster.
       parameters: name -> value, as in `Dynamics`.
       convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
       name: the name in messages; by default that of the function.
-      level: "compiled" or "plain"; by default compiled if the function is numba's, and plain otherwise.
+      level: "compiled", "jax" or "plain"; by default compiled if the function is numba's, and plain otherwise.
     """
 
     def __init__(
@@ -260,7 +260,8 @@ class FunctionCost(OfFunction, Cost):
         self.level = level_of(function, level)
         if self.level == "symbolic":
             if level is not None:
-                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled' or 'plain'; or use SymbolicCost")
+                wanted = "'compiled', 'jax' or 'plain'; or use SymbolicCost"
+                raise InputError(f"FunctionCost: level: got 'symbolic', want {wanted}")
             self.level = "plain"
         self.depends_on = check_depends_on("FunctionCost", depends_on, "states and controls, at least one")
         if self.depends_on == ():  # a constant: nothing to minimise
@@ -282,7 +283,7 @@ class FunctionCost(OfFunction, Cost):
             level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
         )  # fmt: skip
         source = source_of(user_functions)
-        if self.derivatives is None:
+        if len(functions) == 1:
             source = source_of(differences, AXES=axes).filled(value=source)
         return CostTerm(
             source,

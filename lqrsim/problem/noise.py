@@ -79,13 +79,13 @@ class Noise:
 
     Args:
       function: `function(x, u, p)` as in `Dynamics`; returns n rows of k entries. For SymPy symbols the entries are
-        formulas, whose derivatives follow. For a numba function, or with level="plain" any Python function, of arrays
-        they are numbers, whose derivatives are central differences. A constant M may be given as a matrix (n, k).
+        formulas, whose derivatives follow. At the other levels they are numbers, whose derivatives are central
+        differences. A constant M may be given as a matrix (n, k).
       size: k; not allowed with a matrix.
       parameters: name -> value, as in `Dynamics`; they are attributes of p. Values are data.
-      depends_on: names of the states and controls that M depends on, for numba and plain functions; all by default.
-        The fewer, the faster. For formulas they are found automatically.
-      level: "symbolic", "compiled" or "plain"; by default compiled for a numba function, and symbolic otherwise.
+      depends_on: names of the states and controls that M depends on, for other functions than formulas; all by
+        default. The fewer, the faster. For formulas they are found automatically.
+      level: as in `Dynamics`; by default compiled for a numba function, and symbolic otherwise.
 
     Raises:
       InputError: an argument is not as described. The result of the function is checked when it is first needed.

@@ -105,7 +105,9 @@ def dynamics_model(dynamics: Dynamics, *, second_order: bool = False) -> Dynamic
     """The dynamics' functions and parameters for compiled code."""
     advance, step_jacobian = dynamics.compiled.addresses("advance", "step_jacobian")
     curvature = dynamics.step_curvature if second_order else 0.0
-    return DynamicsModel(advance, step_jacobian, curvature, numbers_of(dynamics))
+    many = dynamics.step_source.has("all_steps")
+    (all_steps,) = dynamics.compiled.addresses("all_steps") if many else (0.0,)
+    return DynamicsModel(advance, step_jacobian, curvature, all_steps, numbers_of(dynamics))
 
 
 def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
