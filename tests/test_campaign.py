@@ -361,9 +361,9 @@ def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pyte
         def control(self, step: int, measured: Array) -> Array:
             return np.where(step == 20, np.nan, self.sane.control(step, measured))
 
-    def mad(own: trials.Trials, policy: str) -> Controller | ls.AffinePolicy:
-        plain = own.solutions[policy].policy
-        return Mad(plain) if policy == "open_loop" else plain
+    def mad(own: trials.Trials, cell: Cell) -> Controller | ls.AffinePolicy:
+        plain = own.solutions[cell.policy].policy
+        return Mad(plain) if cell.policy == "open_loop" else plain
 
     monkeypatch.setattr(trials.Trials, "_controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)

@@ -19,7 +19,7 @@ import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.captions import Legend
-from lqrsim.view.options import ALL_OVERLAYS, Overlay
+from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay
 from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
@@ -43,6 +43,9 @@ def flight(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollou
 @pytest.fixture(params=["drive", "flight"])
 def rollout(request: pytest.FixtureRequest) -> ls.Rollout:
     return request.getfixturevalue(request.param)
+
+
+BARE: tuple[Overlay, ...] = tuple(one for one in OVERLAYS if one != "caption")  # the whole picture is one pane
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -160,7 +163,7 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
 def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
     """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
     with (
-        open_picture(rollout, PictureOptions(size=(640, 360))) as drawn,
+        open_picture(rollout, PictureOptions(size=(640, 360), overlays=BARE)) as drawn,
         mujoco.Renderer(drawn.parts[0].renderer.model, 360, 640) as segmenter,
     ):
         segmenter.enable_segmentation_rendering()
@@ -200,7 +203,7 @@ def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
     moved = dataclasses.replace(drive, states=states)
 
     def count(time: float) -> tuple[int, int]:
-        image = pixels(render_still(moved, tmp_path / "still.png", time=time, size=(640, 360)))[:320]
+        image = pixels(render_still(moved, tmp_path / "still.png", time=time, size=(640, 360), overlays=BARE))
         red, green, blue = np.moveaxis(image, 2, 0)
         plan = (red > 120) & (green < 90) & (blue > 50) & (red > 1.4 * blue)
         trace = (red > 140) & (green > 120) & (blue < 0.75 * green) & (red < 1.5 * green)
@@ -285,6 +288,39 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
 
 
 @draws
+@pytest.mark.parametrize("camera", ["overview", "top", *rarely("side", "chase")])
+def test_captions_cover_neither_the_plan_nor_one_another(camera: str, flight: ls.Rollout) -> None:
+    """Texts are strips beside the panes, and calibrated panes show the whole plan."""
+    with open_picture(flight, PictureOptions(camera=camera, size=(640, 360), insets=("top",))) as drawn:
+        (part,) = drawn.parts
+        assert part.caption is not None
+        assert drawn.legend is not None
+        for pane, view in part.views:
+            assert part.caption.height <= pane.top
+            assert part.box.top + pane.top + pane.height <= drawn.size[1] - drawn.legend.height
+            if view.camera is not None:
+                pixels = view.camera.project(flight.plan.states[:, :3], (pane.width, pane.height))
+                assert (pixels > 0).all()
+                assert (pixels < [pane.width, pane.height]).all()
+
+
+@draws
+@pytest.mark.parametrize("camera", ["overview", "top", *rarely("side")])
+def test_runs_side_by_side_have_one_zoom(camera: str, quadrotor: ls.Scenario, flight: ls.Rollout) -> None:
+    """The farther run is what both panes show, and a metre of both has as many pixels."""
+    far = dataclasses.replace(flight, states=flight.states + np.r_[[3.0, 0, 0], np.zeros(flight.states.shape[2] - 3)])
+    with open_picture([flight, far], PictureOptions(camera=camera, size=(640, 360))) as drawn:
+        drawn.draw(0.0)
+        seen = [part.renderer.scene.camera[0] for part in drawn.parts]
+        for name in ("pos", "forward", "frustum_top", "orthographic"):
+            np.testing.assert_allclose(*(getattr(one, name) for one in seen), rtol=1e-6, atol=0)
+    with open_picture(flight, PictureOptions(camera=camera, size=(320, 360))) as alone:
+        alone.draw(0.0)
+        before = alone.parts[0].renderer.scene.camera[0]
+        assert before.frustum_top != seen[0].frustum_top or not np.allclose(before.pos, seen[0].pos)
+
+
+@draws
 def test_captions_of_narrow_parts_are_not_cut_off(flight: ls.Rollout) -> None:
     """No ink in the last columns of a caption's strip: what is too long for one line goes on in the next."""
     with open_picture([flight] * 3, PictureOptions(size=(720, 360))) as drawn:
@@ -317,7 +353,7 @@ def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, 
 
 @draws
 def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: Path) -> None:
-    """Each changes the picture, and only where it is: a few percent of it."""
+    """Each changes the picture, and only where it is: a few percent of it. Captions take room from the scene."""
     tube = np.tile(np.diag([0.01, 0.02, 0.01]), (len(flight.times), 1, 1))
     noisy = dataclasses.replace(flight, measured=flight.states + 0.05 * np.sin(np.arange(12)), tube=tube)
     funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
@@ -329,7 +365,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     bare = shown()
     for overlay in ALL_OVERLAYS:
         changed = (np.abs(shown(overlay) - bare).max(axis=2) > 10).mean()
-        assert 1e-4 < changed < (0.2 if overlay == "caption" else 0.05), overlay
+        assert 1e-4 < changed < (1.0 if overlay == "caption" else 0.05), overlay
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
     options: dict = {"overlays": ("cost_tube",), "size": SMALL}
     with pytest.raises(ls.InputError, match="solution: got a plan other than"):
@@ -402,7 +438,7 @@ def test_what_legends_say_of_tubes_is_said_once(drive: ls.Rollout) -> None:
     overlays = [Overlays(one, None, ("tube",), Scale(1.0, 1.0)) for one in (narrow, wide)]
     said = [text for one in overlays for text, _ in one.legend_entries()]
     assert said[1].startswith(f"{said[0]}; drawn up to ")
-    both, second = (Legend(shown, Scale(1.0, 1.0), (640, 360), over=False) for shown in (overlays, overlays[1:]))
+    both, second = (Legend(shown, Scale(1.0, 1.0), (640, 360)) for shown in (overlays, overlays[1:]))
     assert both.tile is not None
     assert second.tile is not None
     np.testing.assert_array_equal(both.tile, second.tile)

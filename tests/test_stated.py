@@ -10,13 +10,14 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.commands.options import ControllerName, PolicyName
+from lqrsim.commands.options import CampaignPolicyName, ControllerName, PolicyName
 from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
 from lqrsim.reports.page import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
 from lqrsim.stress.campaign_files import read_manifest
 from lqrsim.stress.policies import (
+    CAMPAIGN_POLICIES,
     CONTROLLERS,
     DEFAULT_POLICIES,
     DESIGNED,
@@ -132,10 +133,46 @@ def test_the_file_of_a_stated_disturbance_of_ones_own_is_hashed_too() -> None:
     assert list(_code(replace(CAMPAIGN, design_disturbances=(Own(0.1),)))) == ["Own"]
 
 
+def test_a_design_is_made_for_what_the_summary_says(differential_drive: ls.Scenario, tmp_path: Path) -> None:
+    """Laws that are made by hand for the same disturbances run the same trials, bit for bit."""
+    campaign = replace(
+        CAMPAIGN, policies=("track", "track_per_cell"), strengths=(0.0, 4.0), trials=2, design_disturbances=None
+    )
+    results = ls.stress.run_campaign(campaign, tmp_path / "here", workers=0)
+    plant, solution = differential_drive.plant(), results.solution("track_per_cell")
+    assert solution.policy.digest != results.solution("track").policy.digest
+    designs = {"track": lambda cell: ls.disturbances.preset("moderate", plant), "track_per_cell": campaign.disturbances}
+    for cell in results.cells:
+        uncertainty = ls.uncertainty_of(plant, designs[cell.policy](cell))
+        law = ls.track(differential_drive.problem, solution, uncertainty=uncertainty)
+        met = campaign.disturbances(cell)
+        run = ls.simulate(plant, solution, controller=law, disturbances=met, trials=2, contacts=False)
+        again = ls.stress.replay(results, cell, 1, contacts=False)
+        np.testing.assert_array_equal(run.states[1], again.states[0])
+        assert run.policy_digest == again.policy_digest
+    for said in (results.summary(), results.rates().markdown(), results._repr_html_()):
+        assert "track: designed for the preset moderate, whatever the disturbances of a cell" in said
+        assert "track_per_cell: designed anew for the disturbances of each cell" in said
+    assert ls.stress.Results(tmp_path / "here").designs() == results.designs()
+    named = replace(campaign, design_disturbances=LIGHT)
+    results.manifest["campaign"] = json.loads(json.dumps(named.as_json()))
+    assert results.designs()["track"].startswith("designed for ControlNoise(std=0.02), MeasurementNoise(std=0.01), ")
+
+
+def test_a_cell_that_no_law_can_be_designed_for_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    campaign = replace(
+        CAMPAIGN, policies=("track_per_cell",), sweeps={"wind": (ls.disturbances.Gusts(),)}, design_disturbances=None
+    )
+    with pytest.raises(InputError, match="differential_drive, which wind cannot push"):
+        ls.stress.run_campaign(campaign, tmp_path / "here", workers=0)
+    assert not (tmp_path / "here").exists()
+
+
 def test_the_usual_four_are_run_unless_others_are_asked_for() -> None:
     assert ls.stress.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == DEFAULT_POLICIES == POLICIES[:4]
-    assert len({*COLOURS}) == len({*LINES}) == len({*MARKERS}) == len(POLICIES)
+    assert len({*COLOURS}) == len({*LINES}) == len({*MARKERS}) == len(CAMPAIGN_POLICIES)
     assert get_args(PolicyName) == POLICIES
+    assert get_args(CampaignPolicyName) == CAMPAIGN_POLICIES
     assert get_args(ControllerName) == CONTROLLERS
     assert {kind.controller for kind in POLICY_KINDS.values()} <= {*CONTROLLERS}
 

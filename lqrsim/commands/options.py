@@ -35,6 +35,7 @@ def _value_or_default(info: PrimitiveTypeInfo) -> Any:
 
 
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
+CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
 Strength = Annotated[float, arg(metavar="FACTOR", help="Factor by which the disturbances are scaled.")]
 DesignSet = Annotated[

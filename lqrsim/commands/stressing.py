@@ -8,13 +8,13 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from lqrsim.commands.options import (
+    CampaignPolicyName,
     DesignSet,
     Folder,
     GoalRadius,
     GoalTolerance,
     Json,
     OwnScenario,
-    PolicyName,
     SolutionFile,
     optional,
 )
@@ -38,10 +38,11 @@ class Stress:
     NAME:KIND for one kind alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
     """Factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate."""
-    policies: Annotated[tuple[PolicyName, ...], optional("POLICY ...")] = ()
+    policies: Annotated[tuple[CampaignPolicyName, ...], optional("POLICY ...")] = ()
     """smooth, ilqr: the policies of these solvers. open_loop: the plan of smooth without feedback. replan: re-plans
     during the run. track: follows the plan of smooth. offset_free: the same, and estimates the state and the
-    disturbances. By default the first four that the scenario allows: ilqr cannot keep constraints."""
+    disturbances. track_per_cell, offset_free_per_cell: these two, designed anew for the disturbances of each
+    combination. By default the first four that the scenario allows: ilqr cannot keep constraints."""
     design_disturbances: DesignSet = None
     solution: SolutionFile = None
     trials: int = 200

@@ -198,7 +198,11 @@ class OffsetFree(Controller):
             return with_filter(self.model, self.filter, laws, limits)
 
         told = self.problem, self.solution, self.uncertainty
-        return Design(self.model, self.filter, *choose_tolerances(*told, self.model, effort, at_end, moments))
+        return Design(
+            self.model,
+            self.filter,
+            *choose_tolerances(*told, self.model, effort, at_end, moments, call="OffsetFree(...)"),
+        )
 
     def _with_margin(
         self, design: Design, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float

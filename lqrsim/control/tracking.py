@@ -72,11 +72,12 @@ class Predictions(NamedTuple):
 
 def choose_tolerances(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
-    moments: Callable[[Laws, tuple[Array, Array]], LoopMoments], truth: PlanModel | None = None,
+    moments: Callable[[Laws, tuple[Array, Array]], LoopMoments], truth: PlanModel | None = None, *, call: str,
 ) -> tuple[Weights, Laws]:  # fmt: skip
     """Choose the tolerances whose law is predicted to fail least often, and that law.
 
     Args:
+      call: name of the user's call, for warnings.
       model: the model on which the laws are based.
       effort: largest change of each control, (m,).
       at_end: as in `track`.
@@ -110,8 +111,9 @@ def choose_tolerances(
     else:
         best = min(left, key=lambda i: left[i])
         _log.warning(
-            "each law that was tried loses the plan from some deviations of the predicted size; the plan's own policy"
-            " or tolerances of your own (tolerate=) may do better"
+            "%s: each law that was tried loses the plan from some deviations of the predicted size; the plan's own"
+            " policy or tolerances of your own (tolerate=) may do better",
+            call,
         )
     weights, laws = tried.pick(best), (gain[best], offset[best])
     # The same with emphasis, if it is predicted to fail less often.
@@ -319,7 +321,9 @@ def track(
         def moments(laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
             return LinearLoop(truth, laws[0][..., : model.n], laws[1], None, *limits).moments(model.n)
 
-        _, (gain, offset) = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments, truth)
+        _, (gain, offset) = choose_tolerances(
+            problem, solution, uncertainty, model, efforts, at_end, moments, truth, call="track(...)"
+        )
     return _policy_of(solution, (gain, offset))
 
 

@@ -35,9 +35,9 @@ from lqrsim.view.style import RUNS
 
 SIZE = 5.2, 3.7
 # One style for each policy; lines and markers distinguish policies in grey.
-COLOURS = (*RUNS, "#e69f00", "#882255")
-LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)))
-MARKERS = ("o", "s", "^", "D", "v", "P")
+COLOURS = (*RUNS, "#e69f00", "#882255", "#56b4e9", "#44aa99")
+LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)), (0, (3, 3)), (0, (8, 2, 1, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLike[str]) -> Path:
@@ -300,10 +300,15 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f" numbers in each combination, of seed {campaign.seed}."
         ],
     }
-    if designed := [policy for policy in policies(table) if policy in DESIGNED]:
+    designs, designed = results.designs(), [policy for policy in policies(table) if policy in DESIGNED]
+    per_cell = [f"{policy}: {designs[policy]}." for policy in policies(table) if policy in designs.keys() - designed]
+    if per_cell:
+        facts["Design disturbances"] = per_cell
+    if designed:
         disturbances = design_disturbances(scenario, campaign.design_disturbances)
         unknown = uncertainty_of(scenario.plant(), disturbances).left_out
         facts["Design disturbances"] = [
+            *per_cell,
             f"{' and '.join(designed)}: designed for {_describe(disturbances, scenario)}.",
             *([f"Left out of the design: {'; '.join(unknown)}."] if unknown else []),
         ]

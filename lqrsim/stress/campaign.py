@@ -50,8 +50,8 @@ from lqrsim.stress.campaign_files import (
     write_manifest,
 )
 from lqrsim.stress.policies import (
+    CAMPAIGN_POLICIES,
     DESIGNED,
-    POLICIES,
     POLICY_KINDS,
     check_used,
     design_uncertainty,
@@ -174,7 +174,7 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
     impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:
         if policy in impossible:
-            possible = ", ".join(one for one in POLICIES if one not in impossible)
+            possible = ", ".join(one for one in CAMPAIGN_POLICIES if one not in impossible)
             raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
     check_used(given, campaign.policies)
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
@@ -198,6 +198,12 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
             fixed[cell.sweep, cell.strength] &= known and generator.bit_generator.state == untouched
     if {*DESIGNED} & {*campaign.policies}:
         design_uncertainty(scenario, campaign.design_disturbances)
+    for cell in campaign.cells:
+        if POLICY_KINDS[cell.policy].per_cell:
+            try:
+                design_uncertainty(scenario, campaign.disturbances(cell))
+            except InputError as error:
+                raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
     return [pair for pair, drew_nothing in fixed.items() if drew_nothing]

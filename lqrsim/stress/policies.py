@@ -31,11 +31,13 @@ class PolicyKind(NamedTuple):
       solver: the solver that computes its plan; a key of `scenarios.solutions.SOLVERS`.
       controller: the controller that runs it; one of CONTROLLERS.
       designed: whether it is designed for disturbances that the user may choose.
+      per_cell: whether it is designed anew for the disturbances of each cell, at their strength.
     """
 
     solver: str = "smooth"
     controller: str = "feedback"
     designed: bool = False
+    per_cell: bool = False
 
 
 POLICY_KINDS = {
@@ -45,10 +47,13 @@ POLICY_KINDS = {
     "replan": PolicyKind(controller="replan"),
     "track": PolicyKind(designed=True),  # `solve` puts the tracking law into its solution
     "offset_free": PolicyKind(controller="offset_free", designed=True),
+    "track_per_cell": PolicyKind(controller="track", per_cell=True),
+    "offset_free_per_cell": PolicyKind(controller="offset_free", per_cell=True),
 }
-POLICIES = tuple(POLICY_KINDS)
+CAMPAIGN_POLICIES = tuple(POLICY_KINDS)
+POLICIES = tuple(name for name, kind in POLICY_KINDS.items() if not kind.per_cell)  # also outside of a campaign
 DESIGNED = tuple(name for name, kind in POLICY_KINDS.items() if kind.designed)
-DEFAULT_POLICIES = tuple(name for name, kind in POLICY_KINDS.items() if not kind.designed)
+DEFAULT_POLICIES = tuple(name for name in POLICIES if name not in DESIGNED)
 CONTROLLERS = ("feedback", "track", "offset_free", "replan")
 DEFAULT_DESIGN = "moderate"  # the set for which policies are designed by default
 
@@ -92,7 +97,7 @@ def solve(
     "smooth".
 
     Args:
-      policies: some of POLICIES.
+      policies: some of CAMPAIGN_POLICIES.
       scenario: the scenario that is solved.
       design: the disturbances for which "track" and "offset_free" are designed.
       given: a solution from `solutions.given`, in place of the result of its solver.

@@ -3,7 +3,7 @@
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
 from lqrsim.stress.data_table import DataTable, fraction_format
 from lqrsim.stress.outcome_table import Outcomes
+from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
 from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.trials import Trials
@@ -158,7 +159,7 @@ class Results:
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
-        said = [*self.manifest["remarks"], *self.plans(), *self.came_to_nothing(), *self.hints()]
+        said = [*self.manifest["remarks"], *self._designs(), *self.plans(), *self.came_to_nothing(), *self.hints()]
         return "\n".join([*lines, *said])
 
     def rates(self) -> DataTable:
@@ -184,6 +185,7 @@ class Results:
         notes = [
             f"{campaign['scenario']}, seed {campaign['seed']}; success: the fraction of trials that reached the goal",
             f"low, high: exact (Clopper-Pearson) interval of {100 * CONFIDENCE:g} %; none if all trials are one run",
+            *self._designs(),
             *self._unfinished(),
         ]
         formats: dict[str, str] = dict.fromkeys(("success", "low", "high"), fraction_format(campaign["trials"]))
@@ -207,7 +209,23 @@ class Results:
             counts = [str(ends[name]) for name in others]
             rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(ends.total()), share, interval, *counts))
         campaign = self.manifest["campaign"]
-        return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", self._unfinished(), rows)
+        notes = [*self._designs(), *self._unfinished()]
+        return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", notes, rows)
+
+    def designs(self) -> dict[str, str]:
+        """For which disturbances each policy was designed that is designed for any, by policy."""
+        stated, found = self.manifest["campaign"]["design_disturbances"], dict[str, str]()
+        told = f"the preset {DEFAULT_DESIGN}" if stated is None else ", ".join(map(_described, stated))
+        for policy in self.manifest["policies"]:
+            kind = POLICY_KINDS[policy]
+            if kind.designed:
+                found[policy] = f"designed for {told}, whatever the disturbances of a cell"
+            elif kind.per_cell:
+                found[policy] = "designed anew for the disturbances of each cell, at their strength"
+        return found
+
+    def _designs(self) -> list[str]:
+        return [f"{policy}: {text}" for policy, text in self.designs().items()]
 
     def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or a diverged filter."""
@@ -385,6 +403,11 @@ class Results:
         reference = self.manifest["campaign"]["scenario"]
         own = ["--scenario", reference] if names_code(reference) else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
+
+
+def _described(disturbance: Mapping[str, Any]) -> str:
+    """A disturbance of a manifest, as it is written in Python."""
+    return f"{disturbance['kind']}({', '.join(f'{name}={value}' for name, value in disturbance['settings'].items())})"
 
 
 def replay(

@@ -25,7 +25,7 @@ from lqrsim.errors import (
 )
 from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.stress.policies import DEFAULT_POLICIES, POLICIES, check_designed
+from lqrsim.stress.policies import CAMPAIGN_POLICIES, DEFAULT_POLICIES, check_designed
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
 
@@ -104,9 +104,10 @@ class Campaign:
       scenario: as in `lqrsim solve`.
       sweeps: name -> disturbances at strength 1.
       strengths: factors by which the disturbances are scaled.
-      policies: some of POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is the plan
-        of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan of
-        smooth, with lqrsim.track and lqrsim.OffsetFree. By default the first four.
+      policies: some of CAMPAIGN_POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is
+        the plan of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan
+        of smooth, with lqrsim.track and lqrsim.OffsetFree; "track_per_cell", "offset_free_per_cell" are designed anew
+        for the disturbances of each cell, which no single policy knows. By default the first four.
       design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of the
         disturbances in a trial. By default the preset "moderate": one policy serves all strengths, and this preset is
         in the middle.
@@ -149,8 +150,10 @@ class Campaign:
         keep(self, sweeps={name: check_items(f"sweeps: {name}", some, Disturbance, wanted) for name, some in sweeps})
         strengths = check_items("strengths", self.strengths, object, "a tuple of numbers", at_most=1000)
         keep(self, strengths=tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths))
-        policies = check_items("policies", self.policies, object, f"a tuple of {', '.join(POLICIES)}", at_most=100)
-        keep(self, policies=tuple(check_name("policies", policy, POLICIES) for policy in policies))
+        policies = check_items(
+            "policies", self.policies, object, f"a tuple of {', '.join(CAMPAIGN_POLICIES)}", at_most=100
+        )
+        keep(self, policies=tuple(check_name("policies", policy, CAMPAIGN_POLICIES) for policy in policies))
         for field in ("strengths", "policies"):
             values = getattr(self, field)
             if not values or len(set(values)) < len(values):

@@ -28,14 +28,14 @@ class Trials:
         self.campaign, self.solutions = campaign, solutions
         self.scenario = scenario.settled(next(iter(solutions.values())))  # all plans have the same duration
         self.plant = self.scenario.plant()
-        self._controllers: dict[str, Controller | AffinePolicy] = {}
+        self._controllers: dict[str | tuple[str, str, float], Controller | AffinePolicy] = {}
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
         """Run `count` trials of a cell, starting with number `first`."""
         return simulate(
             self.plant,
             self.solutions[cell.policy],
-            controller=self._controller(cell.policy),
+            controller=self._controller(cell),
             disturbances=self.campaign.disturbances(cell),
             **self.scenario.near_enough(self.campaign.goal_radius, self.campaign.goal_tolerance),
             seed=self.campaign.seed,
@@ -50,8 +50,9 @@ class Trials:
         """Compile everything, by running undisturbed trials."""
         options: dict[str, Any] = {"frames": False, "contacts": False, "threads": 1}
         self.outcomes(simulate(self.plant, next(iter(self.solutions.values())), **options))
-        if (solution := self.solutions.get("offset_free")) is not None:  # its filter is also compiled
-            simulate(self.plant, solution, controller=self._controller("offset_free"), **options)
+        filters = [cell for cell in self.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
+        for cell in filters[:1]:  # its filter is also compiled
+            simulate(self.plant, self.solutions[cell.policy], controller=self._controller(cell), **options)
 
     def outcomes(self, rollout: Rollout) -> Outcomes:
         """The outcomes of a rollout's trials, with the cost of the scenario's problem."""
@@ -84,17 +85,19 @@ class Trials:
         except Exception as error:
             return _failed_rows(trial, 1, format_error(error))
 
-    def _controller(self, policy: str) -> Controller | AffinePolicy:
-        """The controller of a policy, made once because its gains take time."""
-        if policy not in self._controllers:
-            self._controllers[policy] = make_controller(
-                POLICY_KINDS[policy].controller,
+    def _controller(self, cell: Cell) -> Controller | AffinePolicy:
+        """The controller of a cell, made once for its policy or for the cell, because its gains take time."""
+        kind, design = POLICY_KINDS[cell.policy], self.campaign.design_disturbances
+        key = (cell.policy, cell.sweep, cell.strength) if kind.per_cell else cell.policy
+        if key not in self._controllers:
+            self._controllers[key] = make_controller(
+                kind.controller,
                 self.scenario,
-                self.solutions[policy],
-                design=self.campaign.design_disturbances,
+                self.solutions[cell.policy],
+                design=self.campaign.disturbances(cell) if kind.per_cell else design,
                 replan_every=self.campaign.replan_every,
             )
-        return self._controllers[policy]
+        return self._controllers[key]
 
 
 @dataclass(frozen=True, eq=False)

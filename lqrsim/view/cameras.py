@@ -5,7 +5,7 @@ metre has the same number of pixels everywhere. The centre of a ball's pixels is
 ball, at any distance and anywhere in the picture. The position of a camera along its line of sight does not matter.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -158,31 +158,30 @@ class CameraView:
     camera: Camera | None = None
 
 
-def camera_view(name: str, recorded: RecordedTrial, aspect: float) -> CameraView:
+def camera_view(
+    name: str, recorded: RecordedTrial, aspect: float, *, beside: Sequence[RecordedTrial] = ()
+) -> CameraView:
     """The view of that name in a pane of this aspect ratio: one of VIEWS, or another camera of the model.
+
+    Args:
+      beside: trials in the same picture. Those of the same model are seen from the same place, at the same zoom.
 
     Raises:
       InputError: there is no view of that name.
     """
     model, of_model = recorded.model, _model_cameras(recorded)
     check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
+    alike = [one for one in beside if one.rollout.model == recorded.rollout.model] or [recorded]
     if name in CALIBRATED:
-        camera = (top if name == "top" else side)(recorded.rollout, aspect)
+        camera = (top if name == "top" else side)(recorded.rollout, aspect, around=around(alike))
         return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
     if name == "chase":
         return _chase(recorded)
     if name == "overview" and (aspect < OVERVIEW_ASPECT or name not in of_model):
-        return _overview(recorded, model.camera(name).id if name in of_model else None, aspect)
+        return _overview(recorded, model.camera(name).id if name in of_model else None, aspect, alike)
     view = mujoco.MjvCamera()
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(name).id
     return CameraView(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
-
-
-def leaves_room_for_captions(name: str, recorded: RecordedTrial, aspect: float) -> bool:
-    """Whether a view is wide, and not fitted to its content, so that captions may cover a part."""
-    return (
-        aspect >= OVERVIEW_ASPECT and name not in CALIBRATED and (name == "chase" or name in _model_cameras(recorded))
-    )
 
 
 def _model_cameras(recorded: RecordedTrial) -> list[str]:
@@ -191,8 +190,14 @@ def _model_cameras(recorded: RecordedTrial) -> list[str]:
     return [name for name in names if name]
 
 
-def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> CameraView:
-    """A view that contains the run and its surroundings, in the direction of a camera of the model."""
+def around(alike: Sequence[RecordedTrial]) -> Array:
+    """Corners (k, 3) that a calibrated camera shows of these trials."""
+    runs = {id(one.rollout): one.rollout for one in alike}
+    return np.vstack([corner for run in runs.values() for corner in _bounds(run)])
+
+
+def _overview(recorded: RecordedTrial, like: int | None, aspect: float, alike: Sequence[RecordedTrial]) -> CameraView:
+    """A view that contains these runs and their surroundings, in the direction of a camera of the model."""
     model, data = recorded.model, mujoco.MjData(recorded.model)
     recorded.pose(data, 0.0)
     forward, field_of_view = OBLIQUE / np.linalg.norm(OBLIQUE), FIELD_OF_VIEW
@@ -201,7 +206,7 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
         axes, field_of_view = data.cam_xmat[like].reshape(3, 3), float(model.cam_fovy[like])
         right, forward = axes[:, 0], -axes[:, 2]
     right = right / np.linalg.norm(right)
-    up, points = np.cross(right, forward), _extent_points(recorded, data)
+    up, points = np.cross(right, forward), np.vstack([_extent_points(one) for one in alike])
     # Far enough back to have every point within both angles of view.
     rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)
@@ -217,8 +222,10 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
     return CameraView(lambda scene, data, time: _set_perspective(scene, model, eye, forward, up, field_of_view))
 
 
-def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
+def _extent_points(recorded: RecordedTrial) -> Array:
     """Points (k, 3) of the run, and corners of fixed geoms that are near it."""
+    data = mujoco.MjData(recorded.model)
+    recorded.pose(data, 0.0)
     model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     body = recorded.rollout.radius

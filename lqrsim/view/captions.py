@@ -21,32 +21,29 @@ from lqrsim.view.recorded_trial import RecordedTrial
 Pixels = npt.NDArray[np.uint8]
 
 INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
-HEADER_SHARES = 0.4, 0.75  # largest fraction of a picture's height for the header: above the picture, and over it
+HEADER_SHARE = 0.4  # largest fraction of a picture's height for the header
 LETTER_HEIGHTS = 44, 54  # numbers of lines of text in the height of a picture, and in the width of a narrow one
 
 
 class Caption:
-    """The caption of one run, in the upper left corner of its part of the picture.
+    """The caption of one run, a strip above its part of the picture, where it covers nothing.
 
     Attributes:
       height: in pixels, the same at all times.
     """
 
-    def __init__(
-        self, recorded: RecordedTrial, overlays: Overlays, box: Box, title: str | None, speed: float, *, over: bool
-    ) -> None:
-        """With `over` it is narrow and covers a part of the picture; otherwise it is a strip above it."""
+    def __init__(self, recorded: RecordedTrial, overlays: Overlays, box: Box, title: str | None, speed: float) -> None:
         run = recorded.rollout
-        self.recorded, self.overlays, self.speed, self.over = recorded, overlays, speed, over
+        self.recorded, self.overlays, self.speed = recorded, overlays, speed
         self.letter_height = _letter_height(box.width, box.height)
         which = f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else ""
         title = title or f"{recorded.name}{which}"
-        self.width = box.width // 4 if over else box.width
+        self.width = box.width
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
         # Readings keep their place: next to the title in a strip that is wide enough, otherwise in separate lines.
         longest = self._readings_width(1)
         bare_title = text_tile((title,), self.letter_height, width=0)
-        beside = not over and bare_title.shape[1] + longest < self.width
+        beside = bare_title.shape[1] + longest < self.width
         most = len(self._readings(recorded.end))
         self.lines = next((count for count in range(1, most) if self._readings_width(count) <= self.width), most)
         self.place = (self.width - longest, 0) if beside else (0, self.header.shape[0])
@@ -58,28 +55,22 @@ class Caption:
         for count in range(len(what), -1, -1):
             left = len(what) - count
             words = what[:count] + ([f"{left} more disturbances" if count else f"{left} disturbances"] if left else [])
-            lines = [title]
-            for line in words if self.over else ["; ".join(words)]:
-                lines += wrap(line, self.letter_height, self.width - round(1.4 * self.letter_height))
-            width = box.width // 5 if self.over else self.width
-            tile = text_tile(tuple(lines), self.letter_height, width=width)
-            if tile.shape[0] <= HEADER_SHARES[self.over] * box.height:
+            lines = [title, *wrap("; ".join(words), self.letter_height, self.width - round(1.4 * self.letter_height))]
+            tile = text_tile(tuple(lines), self.letter_height, width=self.width)
+            if tile.shape[0] <= HEADER_SHARE * box.height:
                 break
         return tile
 
     def draw(self, area: Pixels, time: float) -> None:
         """Draw the caption into the run's part of the picture, in place."""
-        margin = self.letter_height if self.over else 0
-        blend(area, self.header, left=margin, top=margin)
+        blend(area, self.header, left=0, top=0)
         readings = self._readings_tile(time)
         if self.place[0]:
             readings = readings[: round(1.85 * self.letter_height)]  # up to the next line
-        blend(area, readings, left=margin + self.place[0], top=margin + self.place[1])
+        blend(area, readings, left=self.place[0], top=self.place[1])
 
     def _readings_tile(self, time: float) -> Pixels:
-        lines = tuple(self._readings(time)) if self.over else self._in_lines(time, self.lines)
-        width = self.header.shape[1] if self.over else 0
-        return text_tile(lines, self.letter_height, width=width, bold=False)
+        return text_tile(self._in_lines(time, self.lines), self.letter_height, width=0, bold=False)
 
     def _readings_width(self, lines: int) -> int:
         """The width in pixels of the readings in this number of lines, with room for longer numbers."""
@@ -135,26 +126,23 @@ def legend_entries(overlays: Sequence[Overlays], scale: Scale) -> dict[str, Colo
 
 
 class Legend:
-    """The legend of all runs, in the lower left corner.
+    """The legend of all runs, a strip below them.
 
     Attributes:
       height: in pixels; 0 for an empty legend.
     """
 
-    def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
+    def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int]) -> None:
         entries = legend_entries(overlays, scale)
         letter_height = max(round(0.8 * _letter_height(*size)), 8)
-        self.margin = letter_height if over else 0
-        width = size[0] - 2 * self.margin
-        self.tile = legend_tile(tuple(entries.items()), letter_height, width) if entries else None
+        self.tile = legend_tile(tuple(entries.items()), letter_height, size[0]) if entries else None
         self.height = 0 if self.tile is None else self.tile.shape[0] + self.tile.shape[0] % 2
 
     def draw(self, image: Pixels) -> None:
         """Draw the legend into the picture, in place."""
         if self.tile is not None:
-            if not self.margin:
-                image[-self.height :] = 255
-            blend(image, self.tile, left=self.margin, bottom=self.margin)
+            image[-self.height :] = 255
+            blend(image, self.tile, left=0, bottom=0)
 
 
 def _letter_height(width: int, height: int) -> int:

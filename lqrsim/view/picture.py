@@ -15,7 +15,7 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import gl
-from lqrsim.view.cameras import CameraView, camera_view, leaves_room_for_captions
+from lqrsim.view.cameras import CameraView, camera_view
 from lqrsim.view.captions import Caption, Legend, Pixels
 from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Box, Overlay, Quality, side_by_side, split_into_panes
 from lqrsim.view.overlays import Overlays, common_scale, draw_mark, mark_radius
@@ -157,7 +157,6 @@ class SceneRenderer:
 LARGEST = 8192  # pixels, a side length that every OpenGL can draw
 MOST_RUNS = 6  # largest number of runs side by side; more are too small
 MOST_INSETS = 3
-READABLE = 300  # pixels; captions may cover a part of a picture that is at least this high
 LEAST_HEIGHT = 16  # pixels of height that a caption must leave
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # colours between panes, and behind captions
 
@@ -260,15 +259,13 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
     ]
     titles = _one_each("titles", list(options.titles), recordings) if options.titles else [None] * len(recordings)
     gl.bind()
-    over = len(recordings) == 1 and not insets and size[1] >= READABLE
-    over = over and leaves_room_for_captions(camera, recordings[0], size[0] / size[1])
-    legend = Legend(overlays, common, size, over=over) if "caption" in options.overlays else None
-    boxes = side_by_side(len(recordings), (size[0], size[1] - (0 if legend is None or over else legend.height)))
+    legend = Legend(overlays, common, size) if "caption" in options.overlays else None
+    boxes = side_by_side(len(recordings), (size[0], size[1] - (0 if legend is None else legend.height)))
     captions = [None] * len(recordings)
     if legend is not None:
         each_run = zip(recordings, overlays, boxes, titles, strict=True)
-        captions = [Caption(*each, options.speed, over=over) for each in each_run]
-    strip = max(0 if one is None or over else one.height for one in captions)
+        captions = [Caption(*each, options.speed) for each in each_run]
+    strip = max(0 if one is None else one.height for one in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
         raise InputError(
             f"size: got {size[0]} x {size[1]}, which captions would fill, want it larger, or overlays without caption"
@@ -279,7 +276,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
             _set_quality(recorded, options.settings)
             panes = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
             named = zip((camera, *insets), panes, strict=True)
-            views = [(pane, camera_view(name, recorded, pane.aspect)) for name, pane in named]
+            views = [(pane, camera_view(name, recorded, pane.aspect, beside=recordings)) for name, pane in named]
             renderer = stack.enter_context(open_renderer(recorded, overlay, views, (box.width, box.height)))
             parts.append(RunPart(recorded, box, views, renderer, caption))
         panes = tuple(

@@ -1,18 +1,19 @@
 """The figures of runs, of a policy, and of a funnel."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d import Axes3D
 
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text
@@ -21,25 +22,43 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
-from lqrsim.view import figure_parts, style
+from lqrsim.view import figure_parts
+from lqrsim.view import style as styles
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
-from lqrsim.view.style import LIMIT, PLAN, RUNS
+from lqrsim.view.moved_objects import moved_objects
+from lqrsim.view.style import AROUND, LIMIT, LOOKS, PLAN, RUNS, Panel, Style, arrange, legend_below
 
 MOMENTS = 7  # number of times at which the balls of a robot are drawn
 AREA = "area: "  # prefix of the label of a tube
+LONG = 0.45  # height over width, below which a view is as wide as the figure
+Plane = tuple[int, int]  # the axes of a view, of those of a position
+
+
+CURVE, STRIP, NARROW = 1.2, 0.65, 1.65  # inches: the heights of curves and of strips, and the least width of a strip
+LINES_OF_STRIP = 2.5  # lines of text above and below a strip
+STRIPS = 3  # below one another; more are drawn in columns
+ROUNDING = 1e-6  # of the largest error: smaller ones of an undisturbed run are rounding errors
+LEAST_ERROR = 1e-3  # mm, or of the plan's range; an axis of smaller errors would show rounding errors
 
 
 def plot_run(
-    solution: Solution, rollouts: Mapping[str, Rollout], path: str | os.PathLike[str], *, world: World, trial: int = 0
+    solution: Solution,
+    rollouts: Mapping[str, Rollout],
+    path: str | os.PathLike[str],
+    *,
+    world: World,
+    trial: int = 0,
+    style: Style = "screen",
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
 
-    For a robot without a position it shows the balls at several times.
+    A robot in space is seen from above and from the side; for a robot without a position the figure shows the balls at
+    several times. Objects that the first run moved are drawn where it began and where it ended. In a view that is more
+    than four times as long as wide the short side is stretched, as its label says.
 
-    A predicted tube is drawn about the plan, 2 standard deviations wide, up to where it is too wide to be shown. The
-    chance of collision at each step is drawn below.
+    A predicted tube is drawn about the plan, 2 standard deviations wide, up to where it is too wide to be shown, with
+    the chance of collision at each step.
 
     Args:
       solution: the solution with the plan that the rollouts follow.
@@ -47,46 +66,91 @@ def plot_run(
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
       trial: row of each rollout.
+      style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
 
     Raises:
-      InputError: the rollouts are of other systems, or the file cannot be written.
+      InputError: the rollouts are of other systems, there is no such style, or the file cannot be written.
     """
     _check(solution, rollouts, trial, world)
-    with style.figure(path, size=(11, 7.5)) as figure:
-        strips = len(solution.policy.control_coordinates)
-        in_space = len(solution.policy.state_coordinates.position) == 3
-        of_balls = not solution.policy.state_coordinates.position
+    with styles.figure(path, style=style) as figure:
+        space, first = solution.policy.state_coordinates, next(iter(rollouts.values()))
+        moved = moved_objects(first, trial)
         chances = [
             (run.times, run.collision_chance, color)
             for run, color in zip(rollouts.values(), RUNS, strict=False)
             if run.collision_chance is not None and run.collision_chance.any()
         ]
-        low = 0.13 if len(list(_tubes(rollouts))) <= 2 else 0.155  # above the legend, which has two tubes in a row
-        under = low + 0.205 if chances else low
-        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=under, top=0.95)[0]
-        right = figure.add_gridspec(
-            3, 1, left=0.57, right=0.92, bottom=low, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
-        )
-        if in_space:
-            path_axes = figure.add_subplot(left, projection="3d")
-            assert isinstance(path_axes, Axes3D)
-            _path_in_space(path_axes, solution, rollouts, world, trial)
+        if space.position:
+            shown = [one.places[:, _axes_of(space)] for one in moved]
+            places = np.vstack([*(points for *_, points in _paths(solution, rollouts, trial)), *shown])
+            span = figure_parts.extent(space, world, places, first.radius)[1]
+            planes = _planes(space, places)
         else:
-            path_axes = figure.add_subplot(left)
-            (_path_of_balls if of_balls else _path_in_plane)(path_axes, solution, rollouts, world, trial)
+            places = np.zeros(0)
+            low, high, plane = _seen_of_balls(first, world, trial)
+            span, planes = high - low, [plane]
+        views = _views(planes, span, style)
+        across, strips = _strips(len(first.control_coordinates), style)
+        curves = [Panel(CURVE)] * (1 + bool(chances))
+        of_time = [*curves, Panel(CURVE), strips] if strips.wide else [*curves, strips, Panel(CURVE)]
+        parts = arrange(figure, [*views, *of_time], style)
+        drawn = [figure.add_subplot(part) for part in parts[: len(planes)]]
+        for axes, plane in zip(drawn, planes, strict=True):
+            if space.position:
+                _paths_in_view(axes, solution, rollouts, world, trial, places, plane)
+                in_world = [_axes_of(space)[i] for i in plane]
+            else:
+                _path_of_balls(axes, solution, rollouts, world, trial)
+                in_world = list(plane)
+            figure_parts.draw_moved(axes, moved, in_world)
+        *rest, commands, costs = parts[len(planes) :]
+        if strips.wide:
+            commands, costs = costs, commands
+        _tracking_error(figure.add_subplot(rest[0]), rollouts, trial)
         if chances:
-            below = figure.add_gridspec(1, 1, left=0.085, right=0.455, bottom=low, top=low + 0.1)[0]
-            figure_parts.draw_chances(figure.add_subplot(below), chances)
-        _tracking_error(figure.add_subplot(right[0]), rollouts, trial)
-        rows = right[1].subgridspec(strips, 1, hspace=0.18)
-        _controls([figure.add_subplot(row) for row in rows], solution.trajectory, rollouts, trial)
-        _convergence(figure.add_subplot(right[2]), solution)
-        handles = dict(zip(*reversed(path_axes.get_legend_handles_labels()), strict=True))
-        tubes = {label: handles.pop(label) for label in list(handles) if label.startswith(AREA)}
-        figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=len(RUNS) + 3)
-        if tubes:
-            figure.legend(tubes.values(), tubes.keys(), loc="lower center", bbox_to_anchor=(0.5, 0.028), ncols=2)
+            figure_parts.draw_chances(figure.add_subplot(rest[1]), chances)
+        controls = _controls(_grid(figure, commands, len(first.control_coordinates), across), solution, rollouts, trial)
+        _convergence(figure.add_subplot(costs), solution)
+        legend_below(figure, _entries(drawn[0]) | controls)
     return Path(path)
+
+
+def _axes_of(space: Coordinates) -> list[int]:
+    """The world's axes of the position."""
+    return ["xyz".index(letter) for letter in (space.plane if len(space.position) == 2 else "xyz")]
+
+
+def _views(planes: Sequence[Plane], span: Array, style: Style) -> list[Panel]:
+    """The panels of views in these planes, of an extent (2 or 3,) in metres: wide ones if they are long."""
+    shapes = [figure_parts.slenderness(span[list(plane)]) for plane in planes]
+    wide = max(shapes) < LONG
+    look = LOOKS[style]
+    width = look.width / (1 if wide else look.columns) - AROUND[1] * look.text / 72
+    return [Panel(width * min(shape, 1.0), wide) for shape in shapes]
+
+
+def _strips(count: int, style: Style) -> tuple[int, Panel]:
+    """In how many columns so many strips are drawn, and their panel."""
+    wide = count > STRIPS
+    rows = -(-count // int(LOOKS[style].width / NARROW)) if wide else count
+    return -(-count // rows), _strip_panel(rows, style, wide=wide)
+
+
+def _strip_panel(rows: int, style: Style, *, wide: bool = False) -> Panel:
+    """The panel of strips below one another: the layout counts their titles and numbers with its height."""
+    return Panel(rows * (STRIP + LINES_OF_STRIP * LOOKS[style].text / 72), wide)
+
+
+def _grid(figure: Figure, place: SubplotSpec, count: int, across: int) -> list[Axes]:
+    """Axes of strips, in this many columns."""
+    rows = -(-count // across)
+    grid = place.subgridspec(rows, across)
+    return [figure.add_subplot(grid[number]) for number in range(count)]
+
+
+def _entries(*drawn: Axes) -> dict[str, Artist]:
+    """What is drawn in these axes, by label."""
+    return {label: one for axes in drawn for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
 
 
 def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, world: World) -> None:
@@ -126,16 +190,33 @@ def _tubes(rollouts: Mapping[str, Rollout]) -> Iterator[tuple[Ellipsoids, dict[s
             yield ellipsoids, {"label": f"{AREA}{name}, {ellipsoids.label}", "face": paler, "edge": color}
 
 
-def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
-    paths, radius = _paths(solution, rollouts, trial), next(iter(rollouts.values())).radius
-    places = np.vstack([points for *_, points in paths])
-    figure_parts.draw_obstacles(axes, solution.policy.state_coordinates, world, places, radius, (0, 1))
+def _paths_in_view(
+    axes: Axes,
+    solution: Solution,
+    rollouts: Mapping[str, Rollout],
+    world: World,
+    trial: int,
+    places: Array,
+    plane: Plane,
+) -> None:
+    radius = next(iter(rollouts.values())).radius
+    onto = _begin_projection(axes, solution.policy.state_coordinates, world, places, radius, plane, "path")
     for ellipsoids, looks in _tubes(rollouts):
-        figure_parts.draw_tube(axes, ellipsoids, **looks)
-    for name, color, line, points in paths:
-        axes.plot(*points.T, line, color=color, label=name)
-    figure_parts.mark_ends(axes, paths[-1][-1])
-    axes.set_title("path (pale: closer than the robot's radius)")
+        figure_parts.draw_tube(axes, ellipsoids.seen_in(onto), **looks)
+    for name, color, line, points in (paths := _paths(solution, rollouts, trial)):
+        axes.plot(*points[:, list(plane)].T, line, color=color, label=name)
+    figure_parts.mark_ends(axes, paths[-1][-1][:, list(plane)])
+
+
+def _seen_of_balls(run: Rollout, world: World, trial: int) -> tuple[Array, Array, Plane]:
+    """The corners (3,) of what is seen of a robot of balls, and the plane: along the axis of least motion."""
+    assert run.balls is not None
+    driven, radii = run.balls.driven[trial], run.balls.radii
+    low, high = np.nanmin(driven, axis=(0, 1)), np.nanmax(driven, axis=(0, 1))
+    across, up = sorted(np.argsort(high - low, kind="stable")[1:].tolist())
+    margin = float(radii.max()) + 0.1 * float((high - low).max())
+    low, high = figure_parts.bounds(driven[np.isfinite(driven).all(axis=(1, 2))].reshape(-1, 3), world, margin)
+    return low, high, (across, up)
 
 
 def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
@@ -143,11 +224,8 @@ def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     first = next(iter(rollouts.values()))
     assert first.balls is not None
     driven, radii = first.balls.driven[trial], first.balls.radii
-    low, high = np.nanmin(driven, axis=(0, 1)), np.nanmax(driven, axis=(0, 1))
-    across, up = sorted(np.argsort(high - low, kind="stable")[1:].tolist())
-    margin = float(radii.max()) + 0.1 * float((high - low).max())
-    corners = figure_parts.bounds(driven[np.isfinite(driven).all(axis=(1, 2))].reshape(-1, 3), world, margin)
-    figure_parts.draw_projected(axes, world, *corners, across, up)
+    low, high, (across, up) = _seen_of_balls(first, world, trial)
+    figure_parts.draw_projected(axes, world, low, high, across, up)
     alive = np.flatnonzero(np.isfinite(driven).all(axis=(1, 2)))
     for number, knot in enumerate(np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))):
         paler, (red, green, blue) = 0.75 * (1 - number / (MOMENTS - 1)), to_rgb(RUNS[0])
@@ -161,37 +239,29 @@ def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     axes.set_title("balls, paler the earlier, and the path of the last")
 
 
-def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
-    paths = _paths(solution, rollouts, trial)
-    figure_parts.draw_in_space(axes, world, *figure_parts.bounds(np.vstack([points for *_, points in paths]), world))
-    for ellipsoids, looks in _tubes(rollouts):
-        figure_parts.draw_tube_in_space(axes, ellipsoids, **looks)
-    for name, color, line, points in paths:
-        axes.plot(*points.T, line, color=color, label=name)
-    figure_parts.mark_ends(axes, paths[-1][-1])
-    axes.set_title("path")
-
-
 def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> None:
     errors = {name: run.tracking_error[trial] for name, run in rollouts.items()}
     worst = np.array([np.nanmax(error) for error in errors.values()])
-    # Runs that differ by decades need a logarithmic axis, from which the zero at the start is left out.
+    # Runs that differ by decades need a logarithmic axis, from which zeros and rounding errors are left out.
     decades = bool(worst.max() > 30 * worst.min())
     of = next(iter(rollouts.values())).tracking_unit
     factor, unit = (1e3, "mm") if of == "m" and worst.max() < 1 and not decades else (1.0, of)
     for (name, error), color in zip(errors.items(), RUNS, strict=False):
-        shown = np.where(error > 0, error, np.nan) if decades else error
+        shown = np.where(error > ROUNDING * worst.max(), error, np.nan) if decades else error
         axes.plot(rollouts[name].times, factor * shown, color=color)
     if decades:
         axes.set_yscale("log")
     else:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, max(1.05 * factor * worst.max(), LEAST_ERROR))
+    unit = unit.replace("the plan's", "its")
     axes.set(xlabel="time (s)", ylabel=f"distance from\nthe plan ({unit})", title="tracking error")
     axes.margins(x=0.01)
 
 
-def _controls(strips: list[Axes], plan: Trajectory, rollouts: Mapping[str, Rollout], trial: int) -> None:
-    space = next(iter(rollouts.values())).control_coordinates
+def _controls(strips: list[Axes], solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> dict[str, Artist]:
+    """The commanded controls over time; returns what the legend says of them."""
+    space, plan = next(iter(rollouts.values())).control_coordinates, solution.trajectory
+    found: dict[str, Artist] = {}
     for number, axes in enumerate(strips):
         # Disturbed runs come first, so that the undisturbed one is not hidden.
         for (_, run), color in reversed(list(zip(rollouts.items(), RUNS, strict=False))):
@@ -199,12 +269,26 @@ def _controls(strips: list[Axes], plan: Trajectory, rollouts: Mapping[str, Rollo
         axes.stairs(plan.controls[:, number], plan.times, color=PLAN, baseline=None, linestyle="--", linewidth=0.9)
         for limit in (space.low[number], space.high[number]):
             if np.isfinite(limit):
-                axes.axhline(limit, color=LIMIT, linewidth=0.9, linestyle=":", gid="limit")
-        axes.set_ylabel(space.labels[number].replace("_", " ").replace(" (", "\n("))
+                found["limit of a control"] = axes.axhline(
+                    limit, color=LIMIT, linewidth=0.9, linestyle=":", gid="limit"
+                )
+        axes.set_title(space.names[number].replace("_", " "))
+        axes.set_ylabel("command" + f"\n({space.units[number]})" * bool(space.units[number]))
         axes.margins(x=0.01, y=0.12)
-        axes.tick_params(labelbottom=number == len(strips) - 1)
-    strips[0].set_title("commanded controls (dotted: limits)")
-    strips[-1].set_xlabel("time (s)")
+        if len(set(space.units)) == 1:
+            axes.label_outer(remove_inner_ticks=False)
+    _share_time(strips)
+    return found
+
+
+def _share_time(strips: list[Axes]) -> None:
+    """Numbers and label of the time only below the last strip of each column."""
+    for axes in strips:
+        place = axes.get_subplotspec()
+        assert place is not None
+        below = place.num1 + place.get_gridspec().ncols >= len(strips)
+        axes.tick_params(labelbottom=below)
+        axes.set_xlabel("time (s)" if below else "")
 
 
 def _convergence(axes: Axes, solution: Solution) -> None:
@@ -220,14 +304,14 @@ def _convergence(axes: Axes, solution: Solution) -> None:
     if shown.any():
         other = axes.twinx()
         other.semilogy(number[shown], change[shown], "s:", color=LIMIT, markersize=3.5, linewidth=1.0)
-        other.set_ylabel("relative change (squares)")
+        other.set_ylabel("relative change\n(squares)")
         other.spines["right"].set_visible(True)
 
 
 # Colours of faces and edges, as in videos.
 TUBE = {"face": "#8ad7d5", "edge": "#008f91"}
 COST_TUBE = {"face": "#d5c8ec", "edge": "#7a4dc7"}
-LINES = ("-", "--", "-.", ":")
+LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)))
 FLAT = 0.05  # a curve whose range is a smaller part of the largest one's in its unit has another strip
 
 
@@ -238,6 +322,7 @@ def plot_policy(
     world: World | None = None,
     radius: float = 0.0,
     tube: Tube | None = None,
+    style: Style = "screen",
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
 
@@ -254,10 +339,11 @@ def plot_policy(
       radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle
         are grey. 0 leaves the grey out, which would be wrong for a robot of several balls.
       tube: tube of the solution, from `predict_tube`.
+      style: as in `plot_run`.
 
     Raises:
-      InputError: the solution has no policy, the tube is of another plan or has no position, or the file cannot be
-        written.
+      InputError: the solution has no policy, the tube is of another plan or has no position, there is no such style, or
+        the file cannot be written.
     """
     check_kind("solution", solution, Solution, "a Solution")
     world = World() if world is None else world
@@ -270,49 +356,48 @@ def plot_policy(
         raise InputError("tube: got a tube of another plan, want one of the solution's plan")
     if tube is not None and not solution.policy.state_coordinates.position:
         raise InputError("tube: got a tube of a robot without a position, want None")
-    with style.figure(path, size=(11, 7.5)) as figure:
-        draw_policy(figure, solution, world, radius, tube)
+    with styles.figure(path, style=style) as figure:
+        draw_policy(figure, solution, world, radius, tube, style)
     return Path(path)
 
 
-def draw_policy(figure: Figure, solution: Solution, world: World, radius: float, tube: Tube | None = None) -> None:
+def draw_policy(
+    figure: Figure, solution: Solution, world: World, radius: float, tube: Tube | None = None, style: Style = "screen"
+) -> None:
     """Draw the figure of a policy."""
     policy = solution.policy
-    grid = figure.add_gridspec(1, 2, left=0.07, right=0.97, bottom=0.12, top=0.95, wspace=0.2, width_ratios=(1, 1.1))
-    if policy.state_coordinates.position:
-        planes = _planes(policy.state_coordinates)
-        places = grid[0].subgridspec(len(planes), 1, hspace=0.25)
-        paths = [figure.add_subplot(place) for place in places]
-        for axes, plane in zip(paths, planes, strict=True):
+    space, chances = policy.state_coordinates, tube is not None and bool(tube.step_chance.any())
+    gains = list(product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(space.units)))
+    curves = [Panel(CURVE)] * (1 + chances) + [_strip_panel(len(gains), style)]
+    if space.position:
+        plan = solution.trajectory.states[:, list(space.position)]
+        planes = _planes(space, plan)
+        views = _views(planes, figure_parts.extent(space, world, plan, radius)[1], style)
+        parts = arrange(figure, [*views, *curves], style)
+        of_time = parts[len(views) :]
+        drawn = [figure.add_subplot(part) for part in parts[: len(views)]]
+        for axes, plane in zip(drawn, planes, strict=True):
             _tube(axes, solution, world, radius, plane, tube)
-        figure.legend(*paths[0].get_legend_handles_labels(), loc="lower center", ncols=4)
     else:
         together = _drawn_together(solution)
-        places = grid[0].subgridspec(len(together), 1, hspace=0.18)
-        _states([figure.add_subplot(place) for place in places], together, solution)
-    strips = list(
-        product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(policy.state_coordinates.units))
-    )
-    chances = [] if tube is None or not tube.step_chance.any() else [0.6]
-    ratios = (1, *chances, 0.3 + 0.55 * len(strips))
-    rows = grid[1].subgridspec(len(ratios), 1, hspace=0.42 if chances else 0.3, height_ratios=ratios)
-    _cost_to_go(figure.add_subplot(rows[0]), solution)
+        states, *of_time = arrange(figure, [_strip_panel(len(together), style), *curves], style)
+        drawn = []
+        _states(_grid(figure, states, len(together), 1), together, solution)
+    _cost_to_go(figure.add_subplot(of_time[0]), solution)
     if tube is not None and chances:
-        axes = figure.add_subplot(rows[1])
+        axes = figure.add_subplot(of_time[1])
         figure_parts.draw_chances(axes, [(tube.plan.times, tube.step_chance, TUBE["edge"])])
         axes.set_title(f"predicted chance of collision ({tube.collision_chance:.2g} in all)")
-    of_gains = rows[len(ratios) - 1].subgridspec(len(strips), 1, hspace=0.18)
-    _gains([figure.add_subplot(row) for row in of_gains], strips, policy, solution.trajectory.times)
+    strips = _grid(figure, of_time[-1], len(gains), 1)
+    _gains(strips, gains, policy, solution.trajectory.times)
+    legend_below(figure, _entries(*drawn[:1], *strips))
 
 
-def _tube(
-    axes: Axes, solution: Solution, world: World, radius: float, plane: tuple[int, int], tube: Tube | None
-) -> None:
+def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: Plane, tube: Tube | None) -> None:
     """The tube, the plan and the obstacles, seen along the axis that is not in `plane`."""
     space = solution.policy.state_coordinates
     plan = solution.trajectory.states[:, list(space.position)]
-    legend = "grey: closer than the robot's radius" if radius > 0 else ""
-    onto = _begin_projection(axes, space, world, plan, radius, plane, "tube", legend)
+    onto = _begin_projection(axes, space, world, plan, radius, plane, "plan" if tube is None else "predicted tube")
     if tube is not None:
         ellipsoids = Ellipsoids.predicted(plan, tube.position_covariance)
         figure_parts.draw_tube(axes, ellipsoids.seen_in(onto), ellipsoids.label, **TUBE)
@@ -322,23 +407,21 @@ def _tube(
     figure_parts.draw_plan(axes, plan[:, list(plane)], linewidth=1.4 if tube is None else 0.9)
 
 
-def _planes(space: Coordinates) -> list[tuple[int, int]]:
-    """The planes in which a path is shown: from above and, in space, from the side."""
-    return [(0, 1)] if len(space.position) == 2 else [(0, 1), (0, 2)]
+def _planes(space: Coordinates, places: Array) -> list[Plane]:
+    """The planes in which places (k, 2 or 3) are seen: from above and, in space, from their longer side."""
+    if len(space.position) == 2:
+        return [(0, 1)]
+    x, y, _ = np.ptp(places, axis=0)
+    return [(0, 1), (0, 2) if x >= y else (1, 2)]
 
 
 def _begin_projection(
-    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: tuple[int, int], title: str,
-    legend: str,
-) -> Array:  # fmt: skip
-    """Draw the obstacles around places (k, d), and the title of a projection; returns its axes (2, d).
-
-    The legend explains flat obstacles.
-    """
+    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: Plane, title: str
+) -> Array:
+    """Draw the obstacles around places (k, d), and the title of a view; returns its axes (2, d)."""
     figure_parts.draw_obstacles(axes, space, world, places, radius, plane)
-    side = f"{title}, from {'above' if plane == (0, 1) else 'the side'}"
-    in_plane = f"{title} ({legend})" if legend else title
-    axes.set_title(in_plane if len(space.position) == 2 else side)
+    in_space = f"{title}, from {'above' if plane == (0, 1) else 'the side'}"
+    axes.set_title(in_space if len(space.position) == 3 else title)
     return np.eye(len(space.position))[list(plane)]
 
 
@@ -368,7 +451,7 @@ def _states(strips: list[Axes], together: list[list[int]], solution: Solution) -
         axes.margins(x=0.01)
         axes.legend(loc="best")
     strips[0].set_title("planned states")
-    strips[-1].set_xlabel("time (s)")
+    _share_time(strips)
 
 
 def _cost_to_go(axes: Axes, solution: Solution) -> None:
@@ -393,20 +476,15 @@ def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolic
         for number, (name, unit) in enumerate(zip(controls.names, controls.units, strict=True)):
             if unit == answer:
                 norm = strength(policy, number, deviation)
-                line, colour = LINES[number % len(LINES)], RUNS[number % len(RUNS)]
+                # Twenty pairs of a colour and a line; the first four differ in both.
+                line, colour = LINES[(number + 2 * (number // len(RUNS))) % len(LINES)], RUNS[number % len(RUNS)]
                 looks = {"baseline": None, "color": colour, "linestyle": line, "linewidth": 1.2}
                 axes.stairs(norm, times, label=name.replace("_", " "), **looks)
         axes.set_ylabel(f"{answer or '1'}\nper {deviation or '1'}")
         axes.set_ylim(bottom=0)
         axes.margins(x=0.01)
-        axes.tick_params(labelbottom=axes is strips[-1])
     strips[0].set_title("feedback gains")
-    handles = {label: one for axes in strips for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    strips[0].legend(
-        handles.values(), handles.keys(), loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.2,
-        columnspacing=1.0, handlelength=1.8, handletextpad=0.5,
-    )  # fmt: skip
-    strips[-1].set_xlabel("time (s)")
+    _share_time(strips)
 
 
 def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
@@ -418,7 +496,9 @@ def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
 FACE, EDGE, CERTIFIED = "#cfe3f5", "#5f97c9", RUNS[0]
 
 
-def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, radius: float) -> Path:
+def plot_funnel(
+    funnel: Funnel, path: str | os.PathLike[str], *, world: World, radius: float, style: Style = "screen"
+) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a funnel; returns its path.
 
     Outlines are dark at certified knots and pale between them, where the level is interpolated. The ellipsoids of all
@@ -430,37 +510,42 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
+      style: as in `plot_run`.
 
     Raises:
-      InputError: the position is not among the funnel's states, or the file cannot be written.
+      InputError: the position is not among the funnel's states, there is no such style, or the file cannot be written.
     """
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     check_kind("world", world, World, "a World, such as scene.world")
     radius = check_number("radius", radius, at_least=0.0)
-    covariances = funnel.position_covariance
-    planes = _planes(funnel.state_coordinates)
-    columns = len(planes) + 1
-    with style.figure(path, size=(4 * columns, 5.2 if columns == 2 else 4.6)) as figure:
-        left = 0.09 if columns == 2 else 0.07
-        grid = figure.add_gridspec(1, columns, left=left, right=0.98, bottom=0.2, top=0.92, wspace=0.24)
-        drawn = [figure.add_subplot(grid[i]) for i in range(len(planes))]
+    covariances, space = funnel.position_covariance, funnel.state_coordinates
+    places = _certified_places(funnel, covariances)
+    planes = _planes(space, places)
+    with styles.figure(path, style=style) as figure:
+        views = _views(planes, figure_parts.extent(space, world, places, radius)[1], style)
+        *parts, levels = arrange(figure, [*views, Panel(1.4 * CURVE)], style)
+        drawn = [figure.add_subplot(part) for part in parts]
         for axes, plane in zip(drawn, planes, strict=True):
             _shadow(axes, funnel, covariances, world, radius, plane)
-        figure.legend(*drawn[0].get_legend_handles_labels(), loc="lower center", ncols=5)
-        _levels(figure.add_subplot(grid[len(planes)]), funnel)
+        _levels(figure.add_subplot(levels), funnel)
+        legend_below(figure, _entries(drawn[0]))
     return Path(path)
 
 
-def _shadow(
-    axes: Axes, funnel: Funnel, covariances: np.ndarray, world: World, radius: float, plane: tuple[int, int]
-) -> None:
+def _certified_places(funnel: Funnel, covariances: np.ndarray) -> Array:
+    """Places (k, 2 or 3) of which the certified outlines are seen as a whole."""
+    plan = funnel.plan.states[:, list(funnel.state_coordinates.position)]
+    held = funnel.knots[funnel.levels > 0]
+    reach = np.sqrt(np.diagonal(covariances[held], axis1=1, axis2=2))
+    return np.vstack([plan, plan[held] - reach, plan[held] + reach])
+
+
+def _shadow(axes: Axes, funnel: Funnel, covariances: np.ndarray, world: World, radius: float, plane: Plane) -> None:
     """The projection, the plan and the obstacles, seen along the axis that is not in `plane`."""
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
     held, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
-    reach = np.sqrt(np.diagonal(covariances[held], axis1=1, axis2=2))
-    shown = np.vstack([plan, plan[held] - reach, plan[held] + reach])  # the certified outlines are seen as a whole
-    onto = _begin_projection(axes, space, world, shown, radius, plane, "funnel", "pale grey: within a radius")
+    onto = _begin_projection(axes, space, world, _certified_places(funnel, covariances), radius, plane, "funnel")
     every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # gives the outlines at the level
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
     figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)

@@ -2,15 +2,31 @@
 
 import contextlib
 import os
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import matplotlib.style
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.gridspec import SubplotSpec
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
+from matplotlib.ticker import (
+    LogFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+    ScalarFormatter,
+    StrMethodFormatter,
+)
 
-from lqrsim.errors import InputError, check_path, excerpt
+from lqrsim.errors import InputError, check_name, check_path, excerpt
 from lqrsim.results.archive import replacing
 
 PLAN = "#222222"
@@ -35,33 +51,163 @@ STYLE = {
 }
 
 
-@contextlib.contextmanager
-def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[Figure]:
-    """A figure, `size` inches wide and high, that is written to each path when the block ends: png, pdf or svg.
+Style = Literal["screen", "page", "column"]
 
-    A block that fails writes nothing. For the layout use `Figure.set_layout_engine("tight", ...)`, which runs when the
-    file is written: `tight_layout` would run before the tick labels of logarithmic axes are replaced.
+
+class Look(NamedTuple):
+    """The width of a figure in inches, the size of its text in points, and the panels side by side in it."""
+
+    width: float
+    text: float
+    columns: int
+
+
+# Journals' text is 3.4 inches wide in a column and 7.1 in two, and text in figures at least 7 points high.
+LOOKS: dict[Style, Look] = {"screen": Look(11.0, 9.0, 2), "page": Look(7.1, 7.0, 2), "column": Look(3.4, 7.0, 1)}
+ROUNDING = 1e-6  # an axis whose range is a smaller part of its values shows that they are equal
+ASIDE = 0.025  # of the middle of such an axis: what is shown on both sides of it
+AROUND = 7.0, 7.0  # lines of text in height and in width that a panel's title, numbers and labels take
+PAD = 0.07  # inches around panels
+GAP = 2.0  # pixels between the numbers of ticks at least
+
+
+@contextlib.contextmanager
+def figure(
+    *paths: str | os.PathLike[str], size: tuple[float, float] | None = None, style: Style = "screen"
+) -> Iterator[Figure]:
+    """A figure that is written to each path when the block ends: png, pdf or svg.
+
+    A block that fails writes nothing. Numbers of ticks that would overlap, and titles wider than their axes, are mended
+    when the block ends: layout engines do not do that.
+
+    Args:
+      size: inches wide and high. By default `style` gives the width, `arrange` the height, and the layout keeps titles,
+        ticks and labels apart.
 
     Raises:
-      InputError: a path has another suffix, or a file cannot be written.
+      InputError: a path has another suffix, there is no such style, or a file cannot be written.
     """
     places = [check_path("path", path) for path in paths]
     for place in places:
         if place.suffix.lower() not in METADATA:
             raise InputError(f"path: got {excerpt(place.name)}, want a name that ends in one of: {', '.join(METADATA)}")
+    check_name("style", style, LOOKS)
+    look = LOOKS[style]
+    text = {"font.size": look.text, "axes.titlesize": look.text * STYLE["axes.titlesize"] / STYLE["font.size"]}
     with contextlib.ExitStack() as stack:
         unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
-        stack.enter_context(matplotlib.style.context(["default", STYLE]))
-        drawn = Figure(figsize=size)
+        stack.enter_context(matplotlib.style.context(["default", STYLE | text]))
+        drawn = Figure(
+            figsize=size or (look.width, look.width),
+            layout=None if size else ConstrainedLayoutEngine(h_pad=PAD, w_pad=PAD),
+        )
         FigureCanvasAgg(drawn)
         yield drawn
         for axes in drawn.axes:
-            for axis in (axes.xaxis, axes.yaxis):
-                if isinstance(axis.get_major_formatter(), LogFormatter):  # this formatter writes powers as mathematics
-                    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-                    axis.set_minor_formatter(NullFormatter())
+            _set_ticks(axes)
+        drawn.draw_without_rendering()
+        for axes in drawn.axes:
+            _keep_apart(axes)
         for suffix, file in unfinished:
             drawn.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
+
+
+class Panel(NamedTuple):
+    """A part of a figure: the height of its axes in inches, and whether it is as wide as the figure."""
+
+    height: float
+    wide: bool = False
+
+
+def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") -> list[SubplotSpec]:
+    """Places for panels, in columns from the top, and the height of the figure."""
+    look = LOOKS[style]
+    columns = look.columns
+    sections: list[list[list[int]]] = []  # of each section its columns, of each column its panels
+    for number, panel in enumerate(panels):
+        if panel.wide or columns == 1:
+            sections.append([[number]])
+        else:
+            if not sections or len(sections[-1]) == 1:
+                sections.append([[] for _ in range(columns)])
+            min(sections[-1], key=lambda column: sum(panels[i].height for i in column)).append(number)
+    sections = [[column for column in section if column] for section in sections]
+    heights = [max(sum(panels[i].height for i in column) for column in section) for section in sections]
+    most = sum(max(len(column) for column in section) for section in sections)
+    figure.set_figheight(sum(heights) + most * AROUND[0] * look.text / 72)
+    places: dict[int, SubplotSpec] = {}
+    rows = figure.add_gridspec(len(sections), 1, height_ratios=heights)
+    for row, section in enumerate(sections):
+        across = rows[row].subgridspec(1, len(section))
+        for number, column in enumerate(section):
+            below = across[number].subgridspec(len(column), 1, height_ratios=[panels[i].height for i in column])
+            places |= {i: below[place] for place, i in enumerate(column)}
+    return [places[number] for number in range(len(panels))]
+
+
+def legend_below(figure: Figure, entries: Mapping[str, Artist]) -> None:
+    """A legend below everything, in as many columns as fit; long labels are wrapped."""
+    size = float(matplotlib.rcParams["font.size"])
+    letters = max(int(figure.get_figwidth() * 72 / (0.6 * size)) - 8, 20)
+    labels = ["\n".join(textwrap.wrap(label, letters)) for label in entries]
+    for columns in range(len(entries), 0, -1):
+        legend = figure.legend(list(entries.values()), labels, loc="outside lower center", ncols=columns)
+        box = legend.get_window_extent()
+        if columns == 1 or box.width <= figure.bbox.width:
+            figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
+            return
+        legend.remove()
+
+
+def _set_ticks(axes: Axes) -> None:
+    """Plain numbers on logarithmic axes, and no axis on which rounding errors look like changes."""
+    for axis, scale in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
+        if isinstance(axis.get_major_formatter(), LogFormatter):  # this formatter writes powers as mathematics
+            low, high = axis.get_view_interval()
+            if high < 100 * low:  # less than two decades have one power of ten in them, or none
+                plain_decades(axis)
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
+        elif isinstance(axis.get_major_formatter(), ScalarFormatter):
+            low, high = sorted(axis.get_view_interval())
+            beyond = max(abs(low), abs(high))
+            if axes.get_aspect() == "auto" and high - low < ROUNDING * beyond:
+                scale(0.5 * (low + high) - ASIDE * beyond, 0.5 * (low + high) + ASIDE * beyond)
+
+
+def _keep_apart(axes: Axes) -> None:
+    """Fewer ticks where their numbers would overlap, titles in lines, and what ticks leave out in the axis' label."""
+    for along, axis in enumerate((axes.xaxis, axes.yaxis)):
+        locator, formatter = axis.get_major_locator(), axis.get_major_formatter()
+        if isinstance(locator, MaxNLocator | LogLocator):
+            name = "nbins" if isinstance(locator, MaxNLocator) else "numticks"
+            for most in range(len(axis.get_major_ticks()), 0, -1):
+                axis.get_tightbbox(None)  # places the ticks
+                if not _overlap(axis, along):
+                    break
+                options: dict[str, Any] = {name: most}
+                locator.set_params(**options)
+        if isinstance(formatter, ScalarFormatter) and (left_out := formatter.get_offset()):
+            axis.offsetText.set_visible(False)
+            plus = left_out.startswith(("+", "-", "\N{MINUS SIGN}"))
+            axis.set_label_text(f"{axis.get_label_text()}{' ' if plus else ', times '}{left_out}")
+    if axes.figure.get_layout_engine() is None:  # nothing would make room for more lines
+        return
+    for text in axes.get_children():
+        if isinstance(text, Text) and (title := text.get_text()) and title == axes.get_title(loc="left"):
+            share = axes.bbox.width / text.get_window_extent().width
+            text.set_text("\n".join(textwrap.wrap(title, max(int(len(title) * share), 8))) if share < 1 else title)
+
+
+def _overlap(axis: Axis, along: int) -> bool:
+    """Whether numbers of neighbouring ticks overlap, or are not apart by GAP, along x (0) or y (1)."""
+    low, high = sorted(axis.get_view_interval())
+    texts = [
+        text for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high for text in (tick.label1, tick.label2)
+    ]
+    boxes = [text.get_window_extent() for text in texts if text.get_visible() and text.get_text()]
+    spans = sorted((box.min[along], box.max[along]) for box in boxes)
+    return any(after[0] - before[1] < GAP for before, after in pairwise(spans))
 
 
 def plain_decades(*axes: Axis) -> None:

@@ -296,10 +296,14 @@ def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
                 "path": place.folder / "run.png",
                 "world": world,
                 "trial": 0,
+                "style": "page",
             },
             0.1,
         ),
-        "plot_policy": ({"solution": solution, "path": place.folder / "p.png", "world": world, "radius": 0.2}, 0.1),
+        "plot_policy": (
+            {"solution": solution, "path": place.folder / "p.png", "world": world, "radius": 0.2, "style": "page"},
+            0.1,
+        ),
     }
     ls.render(rollout, video, camera="top", size=(128, 96), fps=6, overlays=())
     shown = ls.verify_run(rollout)
