@@ -16,7 +16,15 @@ from lqrsim.results.export_c import ExportedC
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Replan
-from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertificate, Curvature, Iteration, Multipliers
+from lqrsim.results.solution_parts import (
+    BetweenKnots,
+    Candidate,
+    Certificate,
+    ContactCertificate,
+    Curvature,
+    Iteration,
+    Multipliers,
+)
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.gradients import Gradients
@@ -25,6 +33,7 @@ from lqrsim.stress.data_table import DataTable
 from lqrsim.verify.verdict import Verification
 
 __all__ = [
+    "BetweenKnots",
     "Candidate",
     "Capsule",
     "Certificate",

@@ -226,12 +226,15 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
     clock = SimpleNamespace(perf_counter=lambda: now[0])
     monkeypatch.setattr(budget, "time", clock)
 
-    def solve(fixed: ls.Problem, settings: SmootherSettings, stop: budget.Stop) -> ls.Solution:
+    stop = budget.Stop()
+    stop.begin(1e6)
+
+    def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
         now[0] += 100.0
         return strategy.solve(fixed, settings, stop=stop)
 
     solution = free_duration.solve_for_duration(
-        problem(), SmootherSettings(time_limit=1e6), solve, attentive=False, callback=None
+        problem(), SmootherSettings(), solve, attentive=False, callback=None, stop=stop
     )
     assert solution.status is Status.CONVERGED
     assert now[0] >= 300.0  # the stated duration, a shorter one, and the end

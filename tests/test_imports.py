@@ -81,7 +81,7 @@ FLOORS_WITHIN = {
         ("engine", "interior_point", "parallel"),
         ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
         ("control_rates", "interior_run", "restoration", "risk"),
-        ("constrained", "free_duration", "reach"),
+        ("between_knots", "constrained", "free_duration", "reach"),
         ("strategy",),
     ),
     "simulation": (("plant_validation", "plant", "simulator"), ("physics", "mujoco_physics"), ("disturbances",)),

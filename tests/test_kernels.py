@@ -64,6 +64,7 @@ from lqrsim.kernels import (
     secants,
     signed_distance,
     sphere_centers,
+    within_periods,
 )
 from lqrsim.kernels import stages as stage_kernels
 from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
@@ -94,6 +95,7 @@ from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.control_rate import RateCost, RateLimits
 from lqrsim.problem.last_command import LastCommand
 from lqrsim.problem.limit_cost import LimitCost
+from lqrsim.problem.within_periods import WithinPeriods
 from lqrsim.results.archive import sha256
 from lqrsim.robots.force_limits import ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
@@ -1029,6 +1031,33 @@ class TestParts:
         replay(wide.step_source, sizes, "step_jacobian", x, U, numbers, 0.1, np.zeros(5), np.zeros((5, w)))
         arrays = np.linspace(-1.0, 2.0, 5), np.zeros(5), np.zeros((5, w)), np.zeros((w, w))
         replay(wide.step_source, sizes, "step_curvature", x, U, numbers, 0.1, *arrays)
+
+    def test_substeps(self) -> None:
+        self.steps(CART.with_substeps(3), X, U, 0.1)
+
+    def test_motion_within_periods(self) -> None:
+        plan = Motion(np.tile(X, (3, 1)), np.tile(U, (2, 1)))
+        for again in (True, False):
+            found = np.zeros((2 * 3, 3))
+            replay(
+                source_of(within_periods),
+                SIZES,
+                "states_within",
+                2,
+                3,
+                again,
+                plan,
+                compiled.arguments(problem()),
+                found,
+            )
+
+    @pytest.mark.parametrize("by_knot", [False, True])
+    def test_constraints_within_periods(self, by_knot: bool) -> None:
+        margin = np.full(4, 0.01) if by_knot else 0.01
+        for shape in ({"radius": 0.1}, {"balls": BALLS["formula"]}):
+            clear = ls.Clearance(WORLD, **shape, margin=margin)
+            rows = clear.bind(CART).rows
+            of_constraint(WithinPeriods(clear, np.ones((3, rows)), np.full(rows, 1e-3)).bind(CART))
 
     @staticmethod
     def steps(dynamics: ls.Dynamics, x: Array, u: Array, dt: float) -> None:

@@ -155,6 +155,13 @@ def rate_curvature(x, u, p, w, curve) -> None:
     """
 
 
+def part_curvature(x, u, p, h, weights, out, jacobian, hessian) -> None:
+    """Write a Runge-Kutta step (N,) and its Jacobian (N, W); add the Hessian (W, W) of the step times weights (N,).
+
+    `step_curvature.py`, and what `differences.py` has in its place.
+    """
+
+
 def value(x, u, t, data) -> float:
     """A cost: the files of costs, and what `differences.py` takes differences of."""
     return 0.0

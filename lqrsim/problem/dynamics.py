@@ -5,7 +5,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ from lqrsim.codegen.user_functions import (
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_number, excerpt
-from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, step_curvature, user_functions
+from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, step_curvature, substeps, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
@@ -101,6 +101,8 @@ class Dynamics:
     rounding: ClassVar[float] = 1e-13
     # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
+    # Runge-Kutta steps in a control period; see `with_substeps`.
+    substeps: int = 1
 
     def __init__(
         self,
@@ -220,10 +222,30 @@ class Dynamics:
         """The same dynamics with the disturbances as parameters, too. At their planned values nothing changes."""
         if self.disturbances.keys() <= self.parameters.keys():
             return self
-        other = copy.copy(self)
-        for name in ("source", "step_source", "compiled", "curvature_source", "step_curvature"):
+        return self._traced_anew(parameters=self.parameters | self.disturbances)
+
+    def with_substeps(self, count: int) -> "Dynamics":
+        """The same dynamics with several Runge-Kutta steps of equal length in each control period, for accuracy.
+
+        `Problem(accuracy=)` chooses their number. The control is still held over the period.
+
+        Args:
+          count: number of steps; 1 for the usual one.
+
+        Raises:
+          InputError: no such number, or dynamics that are not stated as a rate, such as those of an MJCF.
+        """
+        count = check_count("substeps", count)
+        if self.discrete or self.level == "jax":
+            raise InputError(f"substeps: got {count} for {self.name}, want a rate that is no function of JAX")
+        return self if count == self.substeps else self._traced_anew(substeps=count)
+
+    def _traced_anew(self, **changed: Any) -> Self:
+        """A copy with other attributes, without what was compiled for the present ones."""
+        other = copy.copy(self)  # without `compiled` and `step_curvature`
+        for name in ("source", "step_source", "curvature_source"):
             vars(other).pop(name, None)
-        other.parameters = self.parameters | self.disturbances
+        vars(other).update(changed)
         return other
 
     @property
@@ -331,6 +353,12 @@ class Dynamics:
         """Source of `advance` and `step_jacobian`, as in `kernels/runge_kutta.py`, or in `kernels/discrete_map.py`."""
         if self.level == "jax":
             return source_of(jax_steps).filled(rate_jacobian=self.source)
+        step = self._part_source if self.substeps == 1 else source_of(substeps, PARTS=self.substeps)
+        return step.filled(**self._rates)
+
+    @property
+    def _part_source(self) -> Source:
+        """The same of one Runge-Kutta step."""
         return source_of(discrete_map if self.discrete else runge_kutta).filled(**self._rates)
 
     @property
@@ -350,9 +378,17 @@ class Dynamics:
         """Source of `step_curvature`, as in `kernels/step_curvature.py`; None if it is zero everywhere."""
         if self.level == "jax":
             return self.step_source
+        part = self._curvature_of_part()
+        if part is None or self.substeps == 1:
+            return part
+        step = source_of(substeps, PARTS=self.substeps)
+        return step.filled(part_curvature=(part, "step_curvature"), **self._rates)
+
+    def _curvature_of_part(self) -> Source | None:
+        """The same of one Runge-Kutta step."""
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
         by_values = source_of(differences, AXES=axes).filled(
-            **self._rates, **dict.fromkeys(("advance", "step_jacobian"), self.step_source)
+            **self._rates, **dict.fromkeys(("advance", "step_jacobian"), self._part_source)
         )
         by_jacobians = source_of(step_curvature).filled(step_curvature=(by_values, "curvature_from_jacobians"))
         if self.level != "symbolic" and self.jacobian is None:
@@ -448,6 +484,10 @@ class Dynamics:
         dt = check_number("dt", dt)
         return dt if self.period is None else round(dt / self.period) * self.period
 
+    def _parts_of(self, dt: float, most: int) -> int:
+        """The number of equal parts, up to `most`, of a period of `dt` seconds at whose ends states are known."""
+        return 1 if self.discrete else most
+
     def check_period(self, dt: float) -> None:
         """Check that a step can last `dt` seconds: of a map, its period; see `MjcfDynamics` for MuJoCo's steps.
 
@@ -479,11 +519,11 @@ class Dynamics:
         self.compiled.state_jacobians(len(states), *of, slopes)
         if error := interrupt_of(self.functions):  # as by Ctrl-C
             raise error
-        return dt, slopes
+        return dt / self.substeps, slopes
 
     def _with_finer_steps(self, dt: float, most: float) -> str:
         """How Runge-Kutta's steps in a control period of `dt` seconds become as short as `most` seconds, as text."""
-        return f"use dt of at most {most:g} s, with {math.ceil(dt / most)} times as many steps"
+        return f"use dt of at most {most * self.substeps:g} s, with {math.ceil(dt / most)} times as many steps"
 
     def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
         """A context in which a solver works.
@@ -527,7 +567,7 @@ class Dynamics:
         return fx, fu
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python.
+        """The state (n,) after `dt` seconds (negative: before), control held: the Runge-Kutta step, in plain Python.
         A map has no step backwards.
 
         Args:

@@ -15,6 +15,7 @@ from lqrsim.errors import (
     brief,
     check_array,
     check_count,
+    check_flag,
     check_items,
     check_kind,
     check_memory,
@@ -44,6 +45,8 @@ from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
+
+ACCURATE = 1e-11  # smallest accuracy of steps; errors below are rounding
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -126,6 +129,10 @@ class Problem(OneVersion):
         the same number of steps, and its own dt. The stage cost still counts once per step, whatever dt is. None for
         the fixed duration steps * dt.
       time_weight: cost per second of a free duration. The cost of a solution does not include it.
+      accuracy: largest error of a plan's steps, as `BetweenKnots.step_error`: `smooth` then takes as many Runge-Kutta
+        steps in a period as that needs. By default it takes one.
+      between_knots: whether inequalities are to hold between the knots, too; by default they hold at the knots. The
+        dynamics must be a formula, and obstacles stand still. Re-plans keep them at the knots.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
@@ -147,6 +154,8 @@ class Problem(OneVersion):
     duration: tuple[float, float] | None = None
     time_weight: float = 0.0
     control_rate: ControlRate | None = None
+    accuracy: float | None = None
+    between_knots: bool = False
     _terms: dict[str, tuple[CostTerm, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
     _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
@@ -184,6 +193,7 @@ class Problem(OneVersion):
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         self._check_duration()
         self._check_rate()
+        self._check_between_knots()
         controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
@@ -492,6 +502,8 @@ class Problem(OneVersion):
             parts.append(repr((self.duration, self.time_weight)))
         if (rate := self.control_rate) is not None:
             parts.append(repr([None if one is None else np.asarray(one).tolist() for one in vars(rate).values()]))
+        if self.accuracy is not None or self.between_knots:
+            parts.append(repr((self.accuracy, self.between_knots)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_duration(self) -> None:
@@ -524,10 +536,24 @@ class Problem(OneVersion):
         check_kind("control_rate", self.control_rate, (ControlRate, type(None)), "a ControlRate, or None")
         if self.control_rate is None:
             return
-        for what, stated in (("noise", self.noise), ("a free duration", self.duration)):
+        others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
+        for what, stated in (*others.items(), ("between_knots", self.between_knots or None)):
             if stated is not None:
                 raise InputError(f"control_rate: got {self.control_rate!r} with {what}, want one of the two")
         keep(self, control_rate=self.control_rate._in(self.dynamics))
+
+    def _check_between_knots(self) -> None:
+        """Raises InputError if the accuracy is no number, or this kind of problem is right at its knots alone."""
+        formula = not self.dynamics.discrete and self.dynamics.level == "symbolic"
+        keep(self, between_knots=check_flag("between_knots", self.between_knots))
+        if self.accuracy is not None:
+            keep(self, accuracy=check_number("accuracy", self.accuracy, at_least=ACCURATE))
+            if self.dynamics.discrete or self.dynamics.level == "jax":
+                raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
+        if self.between_knots and not formula:
+            raise InputError("between_knots: got True with dynamics that are not a formula, want False")
+        if self.between_knots and any(one.world.moving for one in self.kept_clear):
+            raise InputError("between_knots: got True with obstacles that move, want False")
 
     def _check_start_clear(self) -> None:
         """Raises InputError if the robot starts inside an obstacle."""

@@ -12,7 +12,7 @@ from lqrsim.results import notebook
 from lqrsim.results.fields import LINE, Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Iteration
+from lqrsim.results.solution_parts import BetweenKnots, Candidate, Certificate, Curvature, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
@@ -113,6 +113,19 @@ class Solution(Plan):
         """Violation of the worst constraint at the steps; see `Certificate`."""
         return self.certificate.violation
 
+    def between_knots(self) -> BetweenKnots:
+        """What the plan does between its knots. It is worked out when it is first needed, and not stored in files.
+
+        Raises:
+          InputError: the solution is not as `smooth` or `smooth_many` returned it, but from a file or changed, or its
+            plan is not finite.
+        """
+        look = vars(self).get("_look")
+        if look is None or not self.trajectory.finite:
+            got = "a solution from a file, or one that was changed" if look is None else "a plan that is not finite"
+            raise InputError(f"between_knots: got {got}, want one as smooth returns it, as smooth(problem, start=this)")
+        return look()
+
     @property
     def dynamics_residual(self) -> float:
         """Dynamics residual of the last iteration; see `Iteration.dynamics_residual`."""
@@ -147,7 +160,7 @@ class Solution(Plan):
         return "\n".join([Iteration.HEADER, *rows])
 
     def summary(self) -> str:
-        """The status with its remedy, cost, clearance, goal, limits and starts, in at most 15 lines."""
+        """The status with its remedy, cost, clearance, goal, limits, motion between knots, starts: at most 16 lines."""
         lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
         if self.detail:
             lines.append(f"  detail:    {self.detail}")
@@ -173,6 +186,7 @@ class Solution(Plan):
             lines.append(f"  clearance: {self.clearance[knot]:.3f} m at {knot * self.trajectory.dt:.2f} s ({verdict})")
         lines += [f"  goal:      {line}" for line in self._at_goal()]
         lines += [f"  limits:    {line}" for line in _first(self._beyond_limits(), 1)]
+        lines += [f"  between:   {line}" for line in self._between_knots()]
         lines += [f"  starts:    {line}" for line in _first(self._search(), 2)]
         return "\n".join(lines)
 
@@ -191,6 +205,15 @@ class Solution(Plan):
             for label, used, low, high in zip(space.labels, controls.T, space.low, space.high, strict=True)
             if used.min() < low or used.max() > high
         ]
+
+    def _between_knots(self) -> list[str]:
+        """What is wrong between the knots, with the remedy; nothing for a plan that failed, or from a file."""
+        if not self.success or "_look" not in vars(self):
+            return []
+        found = self.between_knots()._told(1e-6)  # the default tolerance
+        remedies = {"accuracy": "accuracy=1e-6", "between_knots": "between_knots=True"}
+        use = ", ".join(remedies[name] for name in found)
+        return [f"{'; '.join(found.values())}; use Problem({use})"] if found else []
 
     def _search(self) -> list[str]:
         """The start of the plan, and the results of other starts, if there were several."""

@@ -1,6 +1,7 @@
 """Parts of a `Solution`: trajectory, status, log, certificate, multipliers, candidates. NumPy only."""
 
 import enum
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
 
 # The end of a "moving" horizon moves along with the robot; the end of a "shrinking" horizon stays.
 HORIZONS = ("moving", "shrinking")
+COARSE = 1e-4  # error of a step that a solution mentions: over a hundred steps it may add up to a hundredth
 
 
 def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
@@ -337,3 +339,34 @@ class Candidate:
         check_fields(self)
         if np.isnan(self.cost):
             raise InputError("Candidate: cost: got nan, want a number, infinite where there is none")
+
+
+@dataclass(frozen=True, eq=False)
+class BetweenKnots:
+    """What a plan does between its knots, in continuous time, with the controls held.
+
+    Attributes:
+      step_error: largest difference between a knot and the exact motion from the knot before, each state relative to
+        its largest size along the plan, at least 1 unit. 0 for steps that MuJoCo does, whose physics steps are the
+        motion.
+      end_error: the same for the last knot and the exact motion from the first knot under the plan's controls.
+      violations: name of an inequality, as in `Problem.violations` -> its largest violation between the knots, in its
+        unit, and its time in s; for all that are violated by more than rounding. Obstacles that move are left out.
+    """
+
+    step_error: float
+    end_error: float
+    violations: Mapping[str, tuple[float, float]]
+
+    __repr__ = repr_of
+
+    def _told(self, tolerance: float, accuracy: float = COARSE) -> dict[str, str]:
+        """What exceeds a tolerance of constraints or an accuracy of steps, in words, by the argument that helps."""
+        found = {}
+        if self.step_error > accuracy:
+            found["accuracy"] = f"steps are off by up to {self.step_error:.1e}, the end by {self.end_error:.1e}"
+        worst = max(self.violations, key=lambda name: self.violations[name][0], default="")
+        if worst and self.violations[worst][0] > tolerance:
+            by, time = self.violations[worst]
+            found["between_knots"] = f"{worst} is violated by {by:.2g} between knots, at {time:.3g} s"
+        return found

@@ -233,6 +233,9 @@ class MjcfDynamics(Dynamics):
         """The physics step in seconds."""
         return float(self.mjcf.model.opt.timestep)
 
+    def _parts_of(self, dt: float, most: int) -> int:
+        return round(dt / self.period)
+
     def check_period(self, dt: float) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""
         timestep, dt = float(self.physics.model.opt.timestep), check_number("dt", dt, above=0.0)

@@ -35,28 +35,27 @@ FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a sea
 
 
 def solve_for_duration(
-    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings, Stop], Solution], *,
-    attentive: bool, callback: Callback | None,
+    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], *,
+    attentive: bool, callback: Callback | None, stop: Stop, begin: Solution | None = None,
 ) -> Solution:  # fmt: skip
     """Solve for the stated duration, then find the best duration near it, and finish the plan with that duration.
 
-    With a weight on time, and no start from the caller, shorter durations are also tried, because they may lead to
-    another route. A search for the best duration that ends elsewhere goes on from a plan of the duration at which it
-    ended, as long as such plans become cheaper. `solve` is for problems with a fixed duration, within the time of this
-    solve; for `attentive` see `Budget`.
+    A plan `begin` takes the place of the first solve. With a weight on time, and no start from the caller, shorter
+    durations are also tried, because they may lead to another route. A search for the best duration that ends elsewhere
+    goes on from a plan of the duration at which it ended, as long as such plans become cheaper. `solve` is for problems
+    with a fixed duration, within the time of `stop`; for `attentive` see `Budget`.
     """
-    budget, total = Budget(settings.max_iterations, callback=callback), 0
-    stop, log = budget.stop, budget.log
+    budget, total = Budget(settings.max_iterations, stop, callback=callback), 0
+    log = budget.log
 
     def solved(fixed: Problem, options: SmootherSettings) -> Solution:
         nonlocal total
-        solution = solve(fixed, options, stop)
+        solution = solve(fixed, options)
         total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
         return solution
 
-    stop.begin(settings.time_limit)
     assert problem.duration is not None
-    first = begin = solved(settled(problem, problem.steps * problem.dt), settings)
+    first = begin = begin or solved(settled(problem, problem.steps * problem.dt), settings)
     shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
     best, fixed = None, [first]
     while not budget.over:
@@ -232,4 +231,4 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
         angles=tuple(names[i] for i in space.angles),
         rotation_vectors=tuple(names[i : i + 3] for i in space.rotation_vectors),
         control_limits=(controls.low, controls.high),
-    )  # fmt: skip
+    ).with_substeps(dynamics.substeps)  # fmt: skip

@@ -100,6 +100,8 @@ def gradients(
     plan = check_flag("plan", plan)
     _check_solution(solution, plan)
     problem = _made(make, point)
+    if problem.accuracy is not None or problem.between_knots:
+        raise InputError("make: got a problem with accuracy= or between_knots=True, want one with neither")
     if problem.digest != solution.problem_digest:
         how = other_lqrsim(solution.versions) or "limits of forces refined"
         raise InputError(f"solution: got one of another problem, or with {how}, want that of make(at)")

@@ -123,6 +123,8 @@ def _check(problem: Problem, settings: Settings) -> None:
         raise InputError(_NO_PRIOR)
     if problem.duration is not None:
         raise InputError("duration: got a free duration, want None for ilqr; use `smooth`, which solves for it")
+    if problem.accuracy is not None or problem.between_knots:
+        raise InputError("accuracy, between_knots: got one of them, want neither for ilqr; use smooth")
     if problem.constraints or (problem.control_rate is not None and problem.control_rate.limits is not None):
         raise InputError(
             "constraints: got a problem with constraints, want none for ilqr, which keeps only limits; use smooth"

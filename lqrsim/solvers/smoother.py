@@ -1,5 +1,6 @@
 """`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. `strategy.py` describes what they try."""
 
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -8,6 +9,7 @@ from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
+from lqrsim.solvers.between_knots import between_knots
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import StartLike
 from lqrsim.solvers.multistart import STARTS, check_starts
@@ -121,7 +123,7 @@ def smooth(
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     warn_of_goal(problem)
-    return solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
+    return _solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
 
 
 def smooth_many(
@@ -155,7 +157,14 @@ def smooth_many(
         is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
     settings = settings_from(SmootherSettings, "smooth_many", options)
-    return solve_all(all_driven_by(problems, noise, risk), settings, _check, solve, threads=threads, progress=progress)
+    return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
+
+
+def _solve(problem: Problem, settings: SmootherSettings, **options: Any) -> Solution:
+    """Solve; the solution can look at its plan between the knots."""
+    solution = solve(problem, settings, **options)
+    vars(solution)["_look"] = functools.cache(functools.partial(between_knots, problem, solution.trajectory))
+    return solution
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
@@ -165,6 +174,9 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
             if got != want:
                 raise InputError(f"{option}: got {got!r} with control_rate, want {want!r}: no step leads back from it")
         problem = with_last_command(problem)  # its constraints have the limits of rates
+    if problem.between_knots and not (settings.second_order(problem) and settings.elastic is None):
+        want = 'finish="newton" and stop="optimal", without elastic= and noise'
+        raise InputError(f"between_knots: got True without an interior point that keeps all constraints, want {want}")
     if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
         if problem.constraints:
             why = 'None without finish="newton" and stop="optimal"'

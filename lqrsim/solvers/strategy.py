@@ -34,6 +34,7 @@ from lqrsim.results.solution_parts import Candidate, Curvature, Iteration, Statu
 from lqrsim.solvers import compiled, reach
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
+from lqrsim.solvers.between_knots import solve_between_knots
 from lqrsim.solvers.budget import Budget, Callback, Stop
 from lqrsim.solvers.constrained import Known, Ladder
 from lqrsim.solvers.control_rates import solve_with_rates
@@ -95,27 +96,30 @@ def solve(
     callback: Callback | None = None,
     stop: Stop | None = None,
     refinements: int = REFINEMENTS,
+    begin: Solution | None = None,
 ) -> Solution:
     """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts.
 
     `stop` is that of a solve of which this one is a part; its time limit is then for both. `refinements` is how often
-    constraints that the plan misses within its periods may be refined.
+    constraints that the plan misses within its periods may be refined. A search for a free duration goes on from a plan
+    `begin`.
     """
-    if problem.duration is not None:
-
-        def fixed(settled: Problem, options: SmootherSettings, whole: Stop) -> Solution:
-            return solve(settled, options, attentive=attentive, threads=threads, callback=callback, stop=whole)
-
-        return solve_for_duration(problem, settings, fixed, attentive=attentive, callback=callback)
-    if problem.control_rate is not None:
-
-        def wide(other: Problem, options: SmootherSettings) -> Solution:
-            return solve(other, options, attentive=attentive, threads=threads, callback=callback, stop=stop)
-
-        return solve_with_rates(problem, settings, wide)
     if stop is None:
         stop = Stop()
         stop.begin(settings.time_limit)
+
+    def part(stated: Problem, options: SmootherSettings, last: Solution | None = None) -> Solution:
+        how = {"attentive": attentive, "threads": threads, "callback": callback, "stop": stop}
+        return solve(stated, options, begin=last, **how)
+
+    if problem.control_rate is not None:
+        return solve_with_rates(problem, settings, part)
+    if problem.accuracy is not None or problem.between_knots:
+        return solve_between_knots(problem, settings, part, stop)
+    if problem.duration is not None:
+        return solve_for_duration(
+            problem, settings, part, attentive=attentive, callback=callback, stop=stop, begin=begin
+        )
     before, asked = tuple[Iteration, ...](), settings
     if refinements == REFINEMENTS and any(one._rough for one in problem.constraints):
         problem, settings, before = outlined(problem, settings, attentive, threads, callback, stop)

@@ -73,6 +73,7 @@ def scenario(goal_x: float = 1.2, goal_y: float = 0.3) -> ls.Scenario:
         stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(scene.world, radius=robot.radius),
         final_cost=ls.QuadraticCost((5000.0,) * 4, about=(goal_x, goal_y, 0.0, 0.0)),  # larger ends nearer to the goal
         constraints=[ls.Clearance(scene.world, radius=robot.radius, margin=0.02)],
+        between_knots=True,  # not only at its knots does the plan keep clear
     )
     return ls.Scenario(
         name="my_robot",

@@ -156,6 +156,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Dynamics.step": ({"self": cart, **at, "dt": 0.1},),
         "Dynamics.linearize": ({"self": cart, **at, "dt": 0.1},),
         "Coordinates": ({field.name: getattr(limits, field.name) for field in dataclasses.fields(limits)},),
+        "Dynamics.with_substeps": ({"self": place.problem.dynamics, "count": 2},),
         "Dynamics.with_parameters": ({"self": place.problem.dynamics, "axle_length": 0.3},),
         "Coordinates.in_world": ({"self": place.space, "places": np.zeros((4, 2)), "height": 0.1},),
         "Coordinates.of_world": ({"self": place.space, "points": np.zeros((4, 3))},),
@@ -251,6 +252,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "FixedState of a state": ({"call": lambda state: ls.FixedState(state), "state": [0.0, 1.0]},),
         "Problem": (stated | {
             "control_limits": (-0.4, 0.4), "constraints": [], "noise": ls.Noise(np.eye(3)), "risk": 0.1,
+            "accuracy": 1e-6, "between_knots": True,
         },),
         "ControlRate": ({"weight": 1.0, "limits": (-2.0, 3.0), "previous": [0.0, 0.0]},),
         "ControlRate of a Problem": ({
@@ -408,7 +410,7 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
         "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
         "Gradients": ls.types.Gradients(np.ones(1), np.zeros(1), (), np.zeros((5, 3, 1)), np.zeros((4, 2, 1))),
         "Multipliers": ls.types.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
-        "Certificate": solution.certificate,
+        "Certificate": solution.certificate, "BetweenKnots": place.solution.between_knots(),
         "ContactCertificate": ls.types.ContactCertificate(
             pressed=1, across=-0.1, sampled=-0.2, radius=1e-3, samples=50
         ),

@@ -1,0 +1,270 @@
+"""What a plan does between its knots, and plans that are right there, too.
+
+`Problem(accuracy=, between_knots=True)` is solved in rounds. Each looks at the last plan in continuous time, takes more
+Runge-Kutta steps in a period where these are not accurate enough, and adds rows within the periods in which an
+inequality is violated. If it is still violated between these, they spare that much. The next plan begins from the last.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.errors import Array
+from lqrsim.kernels import within_periods
+from lqrsim.kernels.declarations import FIRST
+from lqrsim.kernels.records import Motion
+from lqrsim.problem.constraints import names_of
+from lqrsim.problem.problem import ACCURATE, Problem
+from lqrsim.problem.within_periods import WithinPeriods
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import BetweenKnots, Status, Trajectory
+from lqrsim.solvers import compiled
+from lqrsim.solvers.budget import Stop
+from lqrsim.solvers.settings import MISSED, SmootherSettings
+
+GRID = 16  # parts of a period at whose ends inequalities are evaluated; a parabola leads to the worst time between
+MOST = 1024  # Runge-Kutta steps in a period, for exact motion and for plans
+ORDER = 4  # of Runge-Kutta steps: twice as many have a sixteenth of the error
+KNOWN = 1e-3  # share of an error to which it is to be known
+ROUNDS = 12  # plans after the first; most need two or three
+FAILED = 3  # failures after the first plan, one after the other or not, until the last of which it goes on
+SPARED = 1.2  # of what is violated between the times of a period, is spared at them: the next plan is another
+ROUNDING = 1e-9  # violation that is not mentioned
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a plan does between its knots.
+
+    Attributes:
+      step_error, end_error: see `BetweenKnots`.
+      worst, shares: for each constraint, the largest violation in each period, and the part of the period after which
+        it is, (T, rows). Not above 0 for what is not violated, or does not act between the knots.
+    """
+
+    step_error: float
+    end_error: float
+    worst: list[Array]
+    shares: list[Array]
+
+    @property
+    def missed(self) -> float:
+        """The largest violation, 0 if there is none."""
+        return max((float(one.max(initial=0.0)) for one in self.worst), default=0.0)
+
+    def record(self, problem: Problem) -> BetweenKnots:
+        """The record of it, with the names of the problem's constraints."""
+        violations: dict[str, tuple[float, float]] = {}
+        for constraint, term, worst, shares in zip(
+            problem.constraints, problem.constraint_terms, self.worst, self.shares, strict=True
+        ):
+            for row, name in enumerate(names_of(constraint, term)):
+                t = int(np.argmax(worst[:, row]))
+                found = float(worst[t, row]), problem.begin + problem.dt * (t + float(shares[t, row]))
+                if found[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
+                    violations[name] = found
+        return BetweenKnots(self.step_error, self.end_error, violations)
+
+
+def look(problem: Problem, plan: Trajectory) -> Look:
+    """Look at a plan between its knots, at a problem's inequalities; the problem's dt is the plan's."""
+    motion = Motion(in_c_order(plan.states), in_c_order(plan.controls))
+    step_error, end_error = _errors(problem, motion)
+    worst, shares = _violations(problem, motion)
+    return Look(step_error, end_error, worst, shares)
+
+
+def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
+    """What a plan for a problem does between its knots; its duration is the plan's."""
+    stated = replace(problem, dt=plan.dt, duration=None, time_weight=0.0, accuracy=None, between_knots=False)
+    return look(stated, plan).record(stated)
+
+
+def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
+    """The states (T, parts, n) at the ends of equal parts of each period; see `kernels/within_periods.py`."""
+    steps, n = len(plan.controls), plan.states.shape[1]
+    sizes = {"N": n, "M": plan.controls.shape[1]}
+    found = np.empty((steps * parts, n))
+    module = module_of(source_of(within_periods), f"motion of {n} states and {sizes['M']} controls", **sizes)
+    with problem.dynamics.quiet():
+        module.states_within(steps, parts, again, plan, compiled.arguments(problem), found)
+    return found.reshape(steps, parts, n)
+
+
+def _errors(problem: Problem, plan: Motion) -> tuple[float, float]:
+    """The largest error of a step, and that of the end: parts are halved until it is known to a thousandth."""
+    if problem.dynamics.discrete:
+        return 0.0, 0.0
+    sizes = np.maximum(np.abs(plan.states).max(axis=0), 1.0)
+    parts, exact, changed, error = 1, plan.states[1:], np.inf, 0.0
+    while parts < MOST and not changed <= max(ACCURATE, KNOWN * error):
+        parts, last = 2 * parts, exact
+        exact = _within(problem, plan, parts)[:, -1]
+        changed, error = ((np.abs(exact - one) / sizes).max() for one in (last, plan.states[1:]))
+    end = _within(problem, plan, parts, again=False)[-1, -1]
+    return float(error), float((np.abs(end - plan.states[-1]) / sizes).max())
+
+
+def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array]]:
+    """The largest violation of each constraint's rows in each period, and where it is; see `Look`.
+
+    A start that violates a row, and so cannot be helped, leaves out the first period.
+    """
+    terms = problem.constraint_terms
+    within = [
+        not (term.equality or term.final_only) and not (one.moving and not one.by_knot)
+        for one, term in zip(problem.constraints, terms, strict=True)
+    ]
+    if not any(within):
+        none: list[Array] = [np.zeros((problem.steps, term.rows)) for term in terms]
+        return none, none
+    states = _within(problem, plan, problem.dynamics._parts_of(problem.dt, GRID))
+    states = np.concatenate([plan.states[:-1, None], states], axis=1)
+    values = _values(problem, states, plan.controls)
+    worst, shares = [], []
+    for kept, one in zip(within, values, strict=True):
+        missed, share = _deepest(-one)
+        missed[0, one[0, 0] < -MISSED] = 0.0
+        worst.append(missed if kept else np.zeros_like(missed))
+        shares.append(share)
+    return worst, shares
+
+
+def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
+    """Each constraint's rows (T, parts+1, rows) at states (T, parts+1, n), under the controls of their periods.
+
+    Numbers that a constraint has for each knot are those at the end of the period at which it asks for less.
+    """
+    steps, terms = problem.steps, problem.constraint_terms
+    acting = [compiled.ConstraintMultipliers(problem, term) for term in terms]
+    for one in acting:
+        one.array[FIRST] = 0.0  # a fixed start cannot change, but what follows can
+    constraints = compiled.arguments(problem, multipliers=acting).stage.constraints
+    found: list[Array] = [np.empty((steps, states.shape[1], term.rows)) for term in terms]
+    for j in range(states.shape[1]):
+        here, there = (np.concatenate(pair) for pair in ((states[:, j], states[-1:, j]), (states[:1, j], states[:, j])))
+        for at, first in ((here, 0), (there, 1)):
+            values = tuple(np.empty_like(one.values) for one in acting)
+            compiled.costs_module(problem).evaluate_constraints(steps, at, controls, constraints, values)
+            for own, one, constraint, term in zip(found, values, problem.constraints, terms, strict=True):
+                rows = one.reshape(steps + 1, -1)[first : first + steps]
+                if not first:
+                    own[:, j] = rows
+                elif constraint.by_knot and not term.uses_control:
+                    own[:, j] = np.maximum(own[:, j], rows)
+    return found
+
+
+def _deepest(missed: Array) -> tuple[Array, Array]:
+    """The largest of violations (T, parts+1, rows) in each period, and where it is, (T, rows), by parabolas."""
+    parts = missed.shape[1] - 1
+    before, here, after = missed[:, :-2], missed[:, 1:-1], missed[:, 2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bend, tilt = before - 2 * here + after, (after - before) / 2
+        shift = -tilt / bend
+        peaks = np.where((bend < 0) & (np.abs(shift) <= 1), here + tilt * shift / 2, -np.inf)
+    ends = np.broadcast_to(np.arange(1, parts + 1)[None, :, None], missed[:, 1:].shape)
+    times = np.concatenate([ends, ends[:, :-1] + shift], axis=1)
+    found = np.concatenate([missed[:, 1:], peaks], axis=1)
+    at = found.argmax(axis=1)[:, None]
+    return np.take_along_axis(found, at, axis=1)[:, 0], np.take_along_axis(times, at, axis=1)[:, 0] / parts
+
+
+def solve_between_knots(
+    problem: Problem, settings: SmootherSettings,
+    solve: Callable[[Problem, SmootherSettings, Solution | None], Solution], stop: Stop,
+) -> Solution:  # fmt: skip
+    """Solve a problem in rounds until its plan is as it is to be between the knots.
+
+    `solve` solves a problem that is to be right at its knots, within the time of `stop`. From the second round on it
+    gets the last plan, too, from which a search for a free duration goes on.
+    """
+    at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.violation_tolerance(problem)
+    rows = [Rows(np.zeros((problem.steps, one.rows)), np.zeros(one.rows)) for one in problem.constraint_terms]
+
+    def again(last: Solution) -> Solution:
+        stated = _with_rows(problem, replace(at_knots, dt=last.trajectory.dt), rows)
+        return solve(stated, replace(settings, start=last, starts=None), last)
+
+    solution, rounds, failed = solve(at_knots, settings, None), 0, 0
+    iterations, ended = solution.iterations, {}
+    while solution.success or (rounds and failed < FAILED and not stop.due):
+        if not solution.success:
+            failed += 1
+            if solution.violation <= tolerance and failed % 2:  # it is only not at its best
+                solution = again(solution)
+            else:  # another way than the last plan's
+                rows = [one.everywhere() for one in rows]
+                solution = solve(_with_rows(problem, replace(at_knots, dt=problem.dt), rows), settings, None)
+            rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
+            continue
+        at_knots = replace(at_knots, dt=solution.trajectory.dt)
+        found = look(at_knots, solution.trajectory)
+        coarse = problem.accuracy is not None and found.step_error > problem.accuracy
+        missed = problem.between_knots and found.missed > tolerance
+        if not (coarse or missed):
+            break
+        if rounds >= ROUNDS or stop.due:
+            status, remedy = Status.STALLED, "use more steps"
+            if stop.due:
+                status, remedy = Status.TIME_LIMIT, "raise time_limit"
+            wrong = found.record(at_knots)._told(tolerance, problem.accuracy or np.inf)
+            said = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
+            ended = {"status": status, "remedy": remedy, "detail": said}
+            break
+        if coarse:
+            assert problem.accuracy is not None
+            finer = at_knots.dynamics.with_substeps(_substeps(at_knots, found.step_error / problem.accuracy))
+            at_knots = replace(at_knots, dynamics=finer)
+        if missed:
+            rows = [one.against(worst, tolerance) for one, worst in zip(rows, found.worst, strict=True)]
+        solution = again(solution)
+        rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
+    settled = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)
+    substeps = at_knots.dynamics.substeps
+    return replace(
+        solution, iterations=iterations, multipliers=solution.multipliers[: len(problem.constraints)],
+        options=dict(solution.options) | ({"substeps": substeps} if substeps > problem.dynamics.substeps else {}),
+        problem_digest=settled.digest, **ended,
+    )  # fmt: skip
+
+
+def _with_rows(asked: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
+    """The problem with rows within its periods beside the constraints that are asked."""
+    pairs = zip(asked.constraints, rows, strict=True)
+    within = [WithinPeriods(constraint, *own) for constraint, own in pairs if own.acts.any()]
+    return at_knots.with_constraints([*asked.constraints, *within])
+
+
+class Rows(NamedTuple):
+    """The rows of a constraint within periods: `acts` and `spares` of `WithinPeriods`."""
+
+    acts: Array
+    spares: Array
+
+    def everywhere(self) -> "Rows":
+        """With the rows that act in some period acting in all."""
+        return self._replace(acts=np.where(self.acts.any(axis=0), 1.0, self.acts))
+
+    def against(self, worst: Array, tolerance: float) -> "Rows":
+        """With rows in the periods where violations (T, rows) are, and beside them, since a plan may turn up there.
+
+        Where such rows act already, they spare what is violated between them.
+        """
+        missed = worst > tolerance
+        near = missed.copy()
+        near[1:] |= missed[:-1]
+        near[:-1] |= missed[1:]
+        again = np.where(missed & (self.acts > 0), worst, 0.0).max(axis=0)
+        more = np.where(again > 0, SPARED * again, 0.0)
+        return Rows(np.maximum(self.acts, near), np.maximum(self.spares, 0.5 * tolerance) + more)
+
+
+def _substeps(problem: Problem, times: float) -> int:
+    """The number of Runge-Kutta steps in a period with which errors, now so many times too large, are half as large."""
+    return min(problem.dynamics.substeps * 2 ** max(math.ceil(math.log2(2 * times) / ORDER), 1), MOST)
