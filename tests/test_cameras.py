@@ -229,9 +229,8 @@ def test_what_stands_for_a_robot_is_as_wide_as_its_base_and_not_as_its_arms_reac
 def test_marks_and_planned_places_of_packaged_robots_have_their_radius(rollout: ls.Rollout) -> None:
     recorded = RecordedTrial(rollout, 0)
     assert mark_radius(recorded) == 0.25 * rollout.radius
-    assert recorded.planned_balls(0.0)[1].tolist() == [rollout.radius]
+    assert recorded.ghost_radius == rollout.radius
     # Of a robot whose radius were a reach, both would be as small as its body.
     armed = RecordedTrial(dataclasses.replace(rollout, radius=1.5), 0)
-    ((radius,), mark) = armed.planned_balls(0.0)[1], mark_radius(armed)
-    assert mark == 0.25 * radius
-    assert radius == pytest.approx(rollout.radius, rel=0.2)
+    assert mark_radius(armed) == 0.25 * armed.ghost_radius
+    assert armed.ghost_radius == pytest.approx(rollout.radius, rel=0.2)

@@ -193,13 +193,13 @@ def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
         points = arrays.rounded(overlays.plan + 2 * lift)
         page["plan"] = {"points": points, "colour": _bytes([PLAN_RGB])[0], "width": 2 * overlays.plan_width}
     if "ghost" in show:
-        centres = np.array([recorded.planned_balls(float(time))[0] for time in run.times])
+        centres = recorded.planned(run.times)
         if recorded.planar:
-            centres[..., 2] = recorded.floor + 3 * LIFT
+            centres[:, 2] = recorded.floor + 3 * LIFT
         page["ghost"] = {
             "kind": "cylinder" if recorded.planar else "sphere",
             "colour": [*PLAN_RGB, GHOST_OPACITY[recorded.planar]],
-            "sizes": [[float(radius), LIFT, 0.0] for radius in recorded.planned_balls(0.0)[1]],
+            "size": [recorded.ghost_radius, LIFT, 0.0],
             "places": arrays.rounded(centres),
         }
     if "forces" in show:

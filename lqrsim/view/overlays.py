@@ -299,13 +299,13 @@ class Overlays:
                 height = 0.2 * LIFT if recorded.planar else self.width
                 pen.add(Geom.mjGEOM_BOX, place + 3 * lift, [self.width, self.width, height], (*MEASURED, 1.0))
         if "ghost" in self.show:
-            opacity = GHOST_OPACITY[recorded.planar]
-            for wanted, radius in zip(*recorded.planned_balls(time), strict=True):
-                if recorded.planar:
-                    wanted[2] = recorded.floor
-                    pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, opacity))
-                else:
-                    pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, opacity))
+            wanted, radius = recorded.planned(time), recorded.ghost_radius
+            colour = (*PLAN_RGB, GHOST_OPACITY[recorded.planar])
+            if recorded.planar:
+                wanted[2] = recorded.floor
+                pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], colour)
+            else:
+                pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, colour)
 
     @property
     def arrow(self) -> tuple[float, float, float]:

@@ -112,14 +112,10 @@ class RecordedTrial:
         places = self.measured[:, list(self.rollout.state_coordinates.position)]
         return self._between(places, self.times, self.times) if places.size else np.zeros((0, 3))
 
-    def planned_balls(self, time: float) -> tuple[Array, Array]:
-        """Planned places (B, 3) and radii (B,) of the robot's balls; without balls, of the robot as a single ball."""
-        run = self.rollout
-        if run.balls is None:
-            return self.planned(time)[None], np.array([self.size])
-        planned = run.balls.planned
-        flat = self._interpolated(planned.reshape(len(planned), -1), run.times, time)
-        return flat.reshape(-1, 3), run.balls.radii
+    @property
+    def ghost_radius(self) -> float:
+        """The radius in metres of the ball at the planned place: that of the robot, or of an arm's last ball."""
+        return self.size if self.rollout.balls is None else float(self.rollout.balls.radii[-1])
 
     def _between(self, places: Array, times: Array, at: Array | float) -> Array:
         """Points (..., 3) in the world at the times `at`, between places (k, 2 or 3) at `times`."""
