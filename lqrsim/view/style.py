@@ -132,9 +132,9 @@ def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") ->
                 sections.append([[] for _ in range(columns)])
             min(sections[-1], key=lambda column: sum(panels[i].height for i in column)).append(number)
     sections = [[column for column in section if column] for section in sections]
-    heights = [max(sum(panels[i].height for i in column) for column in section) for section in sections]
-    most = sum(max(len(column) for column in section) for section in sections)
-    figure.set_figheight(sum(heights) + most * AROUND[0] * look.text / 72)
+    texts = AROUND[0] * look.text / 72  # the layout counts these with the heights of sections, which are grids
+    heights = [max(sum(panels[i].height + texts for i in column) for column in section) for section in sections]
+    figure.set_figheight(sum(heights))
     places: dict[int, SubplotSpec] = {}
     rows = figure.add_gridspec(len(sections), 1, height_ratios=heights)
     for row, section in enumerate(sections):
@@ -190,7 +190,8 @@ def _keep_apart(axes: Axes) -> None:
         if isinstance(formatter, ScalarFormatter) and (left_out := formatter.get_offset()):
             axis.offsetText.set_visible(False)
             plus = left_out.startswith(("+", "-", "\N{MINUS SIGN}"))
-            axis.set_label_text(f"{axis.get_label_text()}{' ' if plus else ', times '}{left_out}")
+            said = left_out if plus else f"times {left_out}"
+            axis.set_label_text(" \n"[along].join([axis.get_label_text(), said]))
     if axes.figure.get_layout_engine() is None:  # nothing would make room for more lines
         return
     for text in axes.get_children():
