@@ -120,17 +120,26 @@ class Panel(NamedTuple):
 
 
 def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") -> list[SubplotSpec]:
-    """Places for panels, in columns from the top, and the height of the figure."""
+    """Places for panels, in columns from the top, and the height of the figure.
+
+    Where the columns are equally high, as below two views side by side, other columns begin.
+    """
     look = LOOKS[style]
     columns = look.columns
+
+    def heights_of(section: list[list[int]]) -> list[float]:
+        return [sum(panels[i].height for i in column) for column in section]
+
     sections: list[list[list[int]]] = []  # of each section its columns, of each column its panels
     for number, panel in enumerate(panels):
         if panel.wide or columns == 1:
             sections.append([[number]])
         else:
-            if not sections or len(sections[-1]) == 1:
+            tops = heights_of(sections[-1]) if sections else []
+            if len(tops) < 2 or 0 < max(tops) < 1.02 * min(tops):
                 sections.append([[] for _ in range(columns)])
-            min(sections[-1], key=lambda column: sum(panels[i].height for i in column)).append(number)
+                tops = [0.0] * columns
+            sections[-1][tops.index(min(tops))].append(number)
     sections = [[column for column in section if column] for section in sections]
     texts = AROUND[0] * look.text / 72  # the layout counts these with the heights of sections, which are grids
     heights = [max(sum(panels[i].height + texts for i in column) for column in section) for section in sections]
