@@ -207,7 +207,9 @@ def test_a_file_keeps_multipliers_and_candidates(tmp_path: Path) -> None:
             other.start, other.cost, other.iterations, other.status,
         )  # fmt: skip
         np.testing.assert_array_equal(one.trajectory.states, other.trajectory.states)
-    assert loaded.summary() == solution.summary()
+    # A loaded solution has no problem that can be looked at between the knots.
+    between = [line for line in solution.summary().splitlines() if not line.startswith("  between:")]
+    assert loaded.summary().splitlines() == between
     again = ls.smooth(case, start=loaded)  # with the multipliers it begins where it had ended
     assert len(again.iterations) <= 3
     assert again.cost == pytest.approx(solution.cost, rel=1e-4)

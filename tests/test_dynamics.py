@@ -306,7 +306,7 @@ FIELDS = {
         (_pendulum, {"parameters": {1: 1.0}}, "parameters: got the name 1, want a Python name"),
         (_pendulum, {"states": ["angle", "speed"]}, "states: got .*, want a dictionary of name: unit"),
         (_pendulum, {"control_limits": ("a", "b")}, r"control_limits: got .*, want \(lowest, highest\), each a number"),
-        (_pendulum, {"level": 3}, "level: got 3, want one of: symbolic, compiled, plain"),
+        (_pendulum, {"level": 3}, "level: got 3, want one of: symbolic, compiled, jax, plain"),
         (
             _pendulum,
             {"control_limits": (1.0, -1.0)},

@@ -748,8 +748,8 @@ def test_what_runs_violate_is_named_though_they_reach_the_goal(
     missed = [low - x[:, 1:, 0], x[:, 1:, 0] - high, u[:, :, 1] - most, np.abs(x[:, -1:, 1] - end)]
     knots = [slice(1, None), slice(1, None), slice(0, -1), slice(-1, None)]
     found, x0 = problem.violations(run), problem.dynamics.state_coordinates.names[0]
-    most = "SymbolicConstraint: <lambda>"  # named after the function; the second of the name is numbered
-    assert list(found) == [f"StateBounds: {x0} low", f"StateBounds: {x0} high", most, f"{most} (2)"]
+    formulas = ["SymbolicConstraint: p.most - right", "SymbolicConstraint: -p.end + y"]  # lambdas have no other name
+    assert list(found) == [f"StateBounds: {x0} low", f"StateBounds: {x0} high", *formulas]
     for own, by, acts in zip(found.values(), missed, knots, strict=True):
         values = np.where((by > 1e-6) & run.counts[:, acts], by, 0.0)
         worst, when = values.max(axis=1), t[acts][values.argmax(axis=1)]
@@ -817,8 +817,8 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     # Estimates of drag that are negative make its predictions explode.
     wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("drag", 3000.0)], measurement=0.02, start=0.01)
 
-    def controller(own: trials.Trials, policy: str) -> Controller | ls.AffinePolicy:
-        return ls.OffsetFree(scenario.problem, own.solutions[policy], wrong, tolerate=tolerate)
+    def controller(own: trials.Trials, cell: Any) -> Controller | ls.AffinePolicy:
+        return ls.OffsetFree(scenario.problem, own.solutions[cell.policy], wrong, tolerate=tolerate)
 
     monkeypatch.setattr(trials.Trials, "_controller", controller)
     noise = (MeasurementNoise(0.02), ForceNoise(1.0))
@@ -930,7 +930,7 @@ def test_in_a_campaign_only_those_trials_fail_that_fail_alone(
     alone = rough.trials.run(rough.cells[1], 0, 12, frames=False, contacts=False)
     beyond = alone.measured[:, 7, 0] > np.median(alone.measured[:, 7, 0])
     monkeypatch.setitem(globals(), "FAR", float(np.median(alone.measured[:, 7, 0])))
-    monkeypatch.setattr(trials.Trials, "_controller", lambda own, policy: Failing(own.solutions[policy], some))
+    monkeypatch.setattr(trials.Trials, "_controller", lambda own, cell: Failing(own.solutions[cell.policy], some))
     files = []
     for batch in (12, 5):
         results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)

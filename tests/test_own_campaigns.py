@@ -110,7 +110,7 @@ def test_of_a_file_that_lacks_the_function_those_are_offered_that_can_be_it(
 
 def test_asked_by_name_it_is_refused(elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = "policies: got ilqr, which cannot keep the scenario's constraints, want some of smooth, open_loop, replan,"
-    wanted += " track, offset_free"
+    wanted += " track, offset_free, track_per_cell, offset_free_per_cell"
     assert main(["stress", "own file.py:walled", "--policies", "ilqr", "smooth", *FEW]) == 2
     assert capsys.readouterr().err == f"lqrsim: error: {wanted}\n"
     assert not (elsewhere / "runs").exists()
