@@ -45,6 +45,7 @@ def test_demo_leaves_everything_it_promises(tmp_path: Path, capsys: pytest.Captu
         assert len([row for row in rows if f"{solution.cost:.4f}" in row]) == 2
 
 
+@pytest.mark.long
 def test_demo_fails_when_an_undisturbed_run_leaves_its_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plan of query 3 cuts through a beam: a local optimum that the physics does not allow."""
     assert main(["demo", "--robots", "quadrotor,query=3", "--no-video", "--out", str(tmp_path)]) == 1

@@ -286,12 +286,14 @@ def test_options_are_refused_before_anything_is_solved(options: dict[str, Any], 
     assert "score" not in vars(problem)
 
 
-def test_where_there_is_no_failure_it_says_so(own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("rare", "break"):
-        small = ["--particles", "20", *(["--repetitions", "2"] if command == "rare" else ["--rounds", "3"])]
-        words = [command, f"{own}:shifted,most=0.2", *OPEN, *small, "--out", str(tmp_path / "out")]
-        assert main(words) == 1
-        assert "no failure was found" in capsys.readouterr().out
+@pytest.mark.parametrize("command", ["rare", *rarely("break")])
+def test_where_there_is_no_failure_it_says_so(
+    command: str, own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--particles", "20", *(["--repetitions", "2"] if command == "rare" else ["--rounds", "3"])]
+    words = [command, f"{own}:shifted,most=0.2", *OPEN, *small, "--out", str(tmp_path / "out")]
+    assert main(words) == 1
+    assert "no failure was found" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
 
 

@@ -98,7 +98,7 @@ LENGTHS = st.sampled_from([0.05, 1.0, 7.0, 60.0])
 
 
 @given(st.data())
-@settings(max_examples=examples(20))
+@settings(max_examples=examples(8))
 def test_no_texts_overlap(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     extent = np.array(data.draw(st.lists(LENGTHS, min_size=2, max_size=3), label="extent"))
     about = np.full(len(extent), data.draw(st.sampled_from([0.0, -0.3, 1e4]), label="about"))

@@ -169,6 +169,7 @@ def test_double_precision_is_local() -> None:
     assert not jax.config.jax_enable_x64
 
 
+@pytest.mark.long
 def test_a_problem_with_a_network_is_copied_and_sent_to_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, x, u = networked(), [0.3, 0.5], [0.2]
     for other in (pickle.loads(pickle.dumps(problem)), copy.deepcopy(problem)):

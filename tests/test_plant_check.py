@@ -151,6 +151,7 @@ def test_samples_are_about_the_line_from_start_to_goal() -> None:
     assert np.ptp(controls) > 0.9 * (high - low)
 
 
+@pytest.mark.long
 def test_samples_are_about_a_plan() -> None:
     """Each is near one of its knots: 300 normal numbers in three coordinates stay within 4.5."""
     swing = 0.1 * np.sin(np.arange(40) / 5)[:, None]

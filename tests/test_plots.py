@@ -59,7 +59,7 @@ def test_errors_that_differ_by_decades_get_a_logarithmic_axis(
     assert "the plan (mm)" in texts(path)
 
 
-@pytest.mark.parametrize("robot", ["drive", "flight"])
+@pytest.mark.parametrize("robot", ["drive", *rarely("flight")])
 def test_a_predicted_tube_is_drawn_with_its_chance_of_collision(
     robot: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:

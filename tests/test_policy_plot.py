@@ -205,7 +205,7 @@ def test_axes_have_units(
     assert {"x (m)", "y (m)", "z (m)", "N", "per m", "per m/s", "per rad", "per rad/s", "rotor 4"} <= set(flight)
 
 
-@pytest.mark.parametrize("suffix", [".pdf", *rarely(".png")])
+@pytest.mark.parametrize("suffix", rarely(".pdf", ".png"))
 def test_same_policy_gives_the_same_bytes(
     suffix: str, drive_solution: ls.Solution, differential_drive: ls.Scenario, tmp_path: Path
 ) -> None:

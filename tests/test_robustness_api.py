@@ -63,7 +63,7 @@ def refusal(call: Callable[[], object]) -> str:
 
 
 def test_a_sample_of_hostile_calls() -> None:
-    count = examples(120)
+    count = examples(60)
     verdicts = list(api.calls(count, seed=1))
     assert len(verdicts) == count
     assert not [verdict for verdict in verdicts if verdict.failed]

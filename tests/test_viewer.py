@@ -288,12 +288,12 @@ def test_only_its_own_pages_are_let_in(served: int) -> None:
 
 
 def test_a_page_that_sends_junk_takes_no_place(served: int) -> None:
-    """Text and bytes that are no message, two hundred of each kind of connection: the next pages get the run."""
+    """Text and bytes that are no message, sixty of each kind of connection: the next pages get the run."""
     rng, ours = np.random.default_rng(36), Origin(f"http://127.0.0.1:{served}")
     for path in ("ui", "state"):
         junk = connect(f"ws://127.0.0.1:{served}/{path}", origin=ours, max_size=None)
         with contextlib.suppress(ConnectionClosed), junk as connection:  # the server may hang up
-            for size in rng.integers(1, 300, 100).tolist():
+            for size in rng.integers(1, 300, 30).tolist():
                 connection.send(rng.bytes(size))
                 connection.send("junk" * size)
     for _ in range(4):

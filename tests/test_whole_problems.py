@@ -63,8 +63,10 @@ def test_what_is_known_beforehand_is_found(kind: str) -> None:
         assert solution.success == drawn.possible, f"{kind} {number}"
 
 
-# Contacts take seconds each.
-@pytest.mark.parametrize("kind", [*(one for one in families.KINDS if one != "contact"), *rarely("contact")])
+SLOW = "contact", "overflow", "scales", "saturating"  # seconds each
+
+
+@pytest.mark.parametrize("kind", [*(one for one in families.KINDS if one not in SLOW), *rarely(*SLOW)])
 def test_no_family_misleads(kind: str) -> None:
     """No plan is worse than its start, a saddle, improved by a step of iLQR though STALLED, or NaN without a word."""
 
