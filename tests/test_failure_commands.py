@@ -358,8 +358,8 @@ def test_commands_check_their_options_before_they_solve(
 @pytest.mark.parametrize(
     ("command", "at", "says"),
     [
-        ("rare --particles 20 --repetitions 500", "2 of 500", r"stopped after \d+ of 500 repetitions"),
         *rarely(
+            ("rare --particles 20 --repetitions 500", "2 of 500", r"stopped after \d+ of 500 repetitions"),
             (
                 "funnel,steps=3 --rate 0.6 --knots 0 1 2 --disturbances light",
                 "1 of 3",

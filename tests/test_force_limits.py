@@ -192,6 +192,7 @@ def test_constraints_with_a_linear_file_are_those_of_a_quadratic_program(
     np.testing.assert_allclose(solution.trajectory.states[:, 1].clip(*bounds[1]), solution.trajectory.states[:, 1])
 
 
+@pytest.mark.long
 def test_a_plan_with_dry_friction_ends_where_the_cost_no_longer_changes(tmp_path: Path) -> None:
     """No gradient vanishes at a kink. Of plans beside it that clip nothing, none is cheaper by more than 2 %."""
     arm = robot(tmp_path, SERVOS.format(kp=900, kv=40, most=40, other=15), joint='frictionloss="0.3"')

@@ -307,12 +307,17 @@ def test_in_a_process_of_its_own_stdout_has_nothing_else(tmp_path: Path) -> None
     assert "CONVERGED" in done.stderr
 
 
-def test_list_and_cache(printed: Any) -> None:
+def test_list_and_cache(printed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = {one["name"]: one for one in printed("list")["scenarios"]}
     assert sorted(found) == sorted(ls.scenarios.names())
     assert found["differential_drive"]["states"][2] == {"name": "heading", "unit": "rad"}
     assert found["quadrotor"]["dt"] == ls.scenarios.quadrotor().problem.dt
+    monkeypatch.setenv(
+        "LQRSIM_CACHE_DIR", str(tmp_path)
+    )  # with little in it: of all that the tests compile, it takes long
+    assert ls.Dynamics(lambda x, u, p: [-x[0] + u[0]], states={"x": "m"}, controls={"u": "m/s"}).compiled
     found = printed("cache")
+    assert found["items"]
     assert found["folder"] == str(disk_cache.folder())
     assert {item["what"] for item in found["items"]} <= {item.what for item in disk_cache.items()}
 

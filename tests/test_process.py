@@ -276,7 +276,7 @@ def test_ctrl_c_in_a_stress_test_is_one_line(ready: str, tmp_path: Path) -> None
     assert not list((tmp_path / "run").rglob(".unfinished-*"))
 
 
-HELP = ["--help", "solve --help", "list", "--version", "cache"]
+HELP = ["--help", "solve --help", "list", "--version", *rarely("cache")]
 
 
 @pytest.mark.parametrize("command", HELP)
