@@ -123,7 +123,7 @@ def test_what_is_kept_between_knots_is_kept_in_continuous_time(number: int) -> N
     if seen > 1e-5:
         assert "between_knots=True)" in str(loose)
     assert between_knots.violation(case, kept.trajectory) <= TOLERANCE
-    assert "between:" not in str(kept)
+    assert "between_knots=True)" not in str(kept)  # the steps may be off: no accuracy is asked for
 
 
 def test_a_plan_that_is_right_between_its_knots_stays_as_it_is() -> None:
