@@ -27,7 +27,6 @@ def test_a_constant_factor(factor: float) -> None:
     found = rates.rate(costs(0.5, factor))
     assert found.order == pytest.approx(1, abs=1e-4)
     assert found.factor == pytest.approx(factor, rel=1e-4)
-    assert found.spread == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize("order", [1.2, 1.5])
@@ -63,7 +62,7 @@ def test_second_order_would_be_noticed() -> None:
             case: {who: script.rates(queries, case, who) for who in logs} for case, logs in cases.items()
         }
         left = np.array([1e-2, 1e-4, 1e-8]) if seen else np.array([1e-2, 1e-3, 1e-4])
-        result["settling"] = {"one": {"status": "CONVERGED", "errors": [], "order": settling.order(left)}}
+        result["settling"] = {"one": settling.order(left)}
         said = {one.paper: one.holds for one in script.statements(result)}
         assert said["a second-order convergence rate was not observed, for neither iLQR nor smoothing"] != seen
         assert (
