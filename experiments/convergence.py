@@ -235,7 +235,7 @@ def statements(result: Result) -> list[Statement]:
     return [
         Statement(
             where="Sec. VI-B",
-            paper="the relative improvement typically declined by about a constant factor with each iteration",
+            paper="the improvement declines by about a constant factor an iteration",
             test=f"the median order of smoothing is from {CONSTANT[0]} to {CONSTANT[1]}",
             ours=f"order {said(constant['order'])}, factor {said(constant['factor'])}",
             holds=bool(constant["order"]) and CONSTANT[0] <= constant["order"][0] <= CONSTANT[1],
@@ -243,23 +243,23 @@ def statements(result: Result) -> list[Statement]:
         ),
         Statement(
             where="Sec. VI-B",
-            paper="a second-order convergence rate was not observed, for neither iLQR nor smoothing",
-            test=f"an order over {SECOND}, or too fast for one, in at most {100 * FEW:g} % of the queries of either",
+            paper="second order was not observed, for neither iLQR nor smoothing",
+            test=f"an order over {SECOND} in at most {100 * FEW:g} % of the queries",
             ours=", ".join(f"{who} {some} of {of}" for who, (some, of) in fast[WITH].items()),
             holds=all(some <= FEW * of for some, of in fast[WITH].values()),
             figure="convergence_order",
         ),
         Statement(
             where="Sec. VI-B",
-            paper="a second-order convergence rate was not observed; Newton's method at the end has one",
-            test=f"an order over {SECOND}, or too fast for one, in {100 - 100 * FEW:g} % of the queries",
+            paper="second order was not observed; Newton's method at the end has it",
+            test=f"an order over {SECOND} in {100 - 100 * FEW:g} % of the queries",
             ours=", ".join(f"{case} {some} of {of}" for case, (some, of) in newton.items()),
             holds=all(some >= (1 - FEW) * of for some, of in newton.values()),
             figure="convergence_order",
         ),
         Statement(
             where="Sec. VI-B",
-            paper="a second-order convergence rate was not observed; the interior point has one where constraints act",
+            paper="second order was not observed; the interior point has it where constraints act",
             test=f"the median order of its last steps is over {SECOND}",
             ours=f"order {said(order)} of {known} of {len(result['settling'])} problems",
             holds=bool(order) and order[0] > SECOND,
@@ -267,27 +267,24 @@ def statements(result: Result) -> list[Statement]:
         ),
         Statement(
             where="Sec. VI-B",
-            paper="that is likely due to how the obstacle term is quadratized: negative curvature is thrown away;"
-            " it makes the constant factor",
-            test=f"what is thrown away predicts iLQR's factor by itself: {EXPLAINED[0]} to {EXPLAINED[1]} steps of"
-            " Gauss-Newton an iteration, in the median",
+            paper="that is due to the negative curvature of obstacles, which is thrown away: it makes the factor",
+            test=f"it predicts iLQR's factor: {EXPLAINED[0]} to {EXPLAINED[1]} steps of Gauss-Newton an iteration",
             ours=f"{said(worth, '.2f')} steps; predicted {said(alone)}, measured {said(medians[WITH][ILQR]['factor'])}",
             holds=bool(worth) and EXPLAINED[0] <= worth[0] <= EXPLAINED[1],
             figure="convergence_order",
         ),
         Statement(
             where="Sec. VI-B",
-            paper="that is likely due to how the obstacle term is quadratized: negative curvature is thrown away;"
-            " nothing else stands in the way of second order",
+            paper="nothing else stands in the way of second order",
             test=f"without obstacles, the order of both is over {SECOND} in half of the queries",
             ours=", ".join(f"{who} {said(orders[WITHOUT][who])}" for who in (SMOOTHING, ILQR))
-            + "; the second derivatives of the dynamics are left out, too, as in all Gauss-Newton methods",
+            + "; the second derivatives of the dynamics are left out, too",
             holds=all(mostly[WITHOUT].values()),
             figure="convergence_order",
         ),
         Statement(
             where="Sec. V-C",
-            paper="the iterations are Gauss-Newton updates and should exhibit a rate approaching second order",
+            paper="the rate of the iterations, Gauss-Newton updates, approaches second order",
             test=f"the order of smoothing is over {SECOND} in half of the queries, with obstacles or without",
             ours=", ".join(f"{case} {said(orders[case][SMOOTHING])}" for case in orders),
             holds=any(both[SMOOTHING] for both in mostly.values()),
@@ -297,7 +294,7 @@ def statements(result: Result) -> list[Statement]:
             Statement(
                 where="Sec. V-C, Eq. (22)",
                 paper=f"upon convergence {claim}",
-                test=f"to {EXACT:g} in SI units, in every query of both robots and forms, run on until rounding",
+                test=f"to {EXACT:g} in SI units, run on until rounding",
                 ours=f"{them[RUN_ON]:.1e} at most; {them[STOPPED]:.1e} at the paper's stop",
                 holds=them[RUN_ON] <= EXACT,
                 figure="convergence",

@@ -204,9 +204,8 @@ def statements(result: Result) -> list[Statement]:
         said.append(
             Statement(
                 where="Sec. VI-A",
-                paper="the control policy can account for disturbances"
-                + ("" if name == "differential_drive" else f", said of the drive; here the {NAMES[name]}"),
-                test="the goal reached more often than without feedback, the 95 % intervals apart",
+                paper=f"the policy can account for disturbances; {NAMES[name]}",
+                test="the goal reached more often than without feedback, intervals apart",
                 ours=f"{100 * value:.1f} % ({100 * low:.1f} to {100 * high:.1f}) with feedback,"
                 f" {100 * bare:.1f} % ({100 * bare_low:.1f} to {100 * bare_high:.1f}) without",
                 holds=low > bare_high,

@@ -191,8 +191,11 @@ def _progress(items: Sequence[Any], name: str) -> Any:
 
 def report(result: Result) -> str:
     problems, notes, absent = result["problems"], [], dict[str, list[str]]()
+    unsolved = []
     for name, family in problems.items():
         for solver, one in family["solvers"].items():
+            if not all(one["solved"]):
+                unsolved.append(f"{name} by {solver} ({sum(one['solved'])} of {family['instances']})")
             notes += [
                 f"{name}, {solver}, instance {i}: claimed, but {'; '.join(faults)}."
                 for i, (faults, refuted) in enumerate(zip(one["faults"], one["refuted"], strict=True))
@@ -215,6 +218,7 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             *parts,
+            f"Not solved: {'; '.join(unsolved) or 'none'}.",
             *notes,
             *(f"{what}: {', '.join(names)}." for what, names in absent.items()),
             *_beside_fatrop(problems),
@@ -277,14 +281,13 @@ def _beside_fatrop(problems: dict[str, Any]) -> list[str]:
 
 
 MEASURES: dict[str, Callable[[Result], str]] = {
-    "instances solved": lambda one: str(sum(one["solved"])),
     "iterations to 1e-8": lambda one: _median(one["exact"]["iterations"], "g"),
     "ms to 1e-8": lambda one: _median(one["exact"]["milliseconds"], ".1f"),
     "optimality reached": lambda one: _median(one["optimality"], ".0e"),
     "final cost": lambda one: _median(one["cost"], ".4g"),
     "iterations to the target": lambda one: _median(one["target"]["iterations"], "g"),
 }
-BY_SOLVER = ("instances solved", "iterations to 1e-8", "ms to 1e-8", "final cost", "iterations to the target")
+BY_SOLVER = ("iterations to 1e-8", "ms to 1e-8", "final cost", "iterations to the target")
 
 
 def _median(values: Sequence[float | None], spec: str) -> str:

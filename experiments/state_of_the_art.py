@@ -178,8 +178,7 @@ def statements(result: Result) -> list[Statement]:
         said = [f'{between(found[name]["fewer"])} times those of "{name}"' for name in there]
         return Statement(
             where="abstract",
-            paper="smoothing takes about a third of the iterations of existing approaches such as iterative LQR;"
-            f" {where}",
+            paper=f"a third of the iterations of existing approaches; {where}",
             test=f"mean iterations at most {MOST} times those of each",
             ours="; ".join([*said, *(f'no "{name}" here' for name in missing), *more]),
             holds=None if missing else max(found[name]["fewer"][0] for name in names) <= MOST,

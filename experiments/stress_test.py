@@ -119,20 +119,16 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
             half = half_fail(success(found[name]))
             low, high = half["above"] or 0.0, half["below"] or np.inf
             asked[name] = {strength for strength in grid if low < strength < high} - set(found[name])
-    rows = [told(name, one, plant, found[name]) for name, one in kinds.items()]
+    rows = [told(name, success(outcomes)) for name, outcomes in found.items()]
     # What never fails half of the time comes last, what fails more often before what fails less.
     rows.sort(key=lambda row: (row["half"]["value"] or np.inf, row["at_last"]))
     return {"alone": rows, "trials_alone": trials}
 
 
-def told(name: str, one: Disturbance, plant: ls.Plant, found: dict[float, ls.stress.Outcomes]) -> dict[str, Any]:
-    """The result of one kind of disturbance, in words."""
-    points = success(found)
-    strengths, half = [strength for strength, _ in points], half_fail(points)
-    return {
-        "kind": name, "range": [strengths[0], strengths[-1]], "at_last": points[-1][1][0], "half": half,
-        "there": one.scaled(float(f"{half['value']:.2g}") if half["value"] else strengths[-1]).describe(plant),
-    }  # fmt: skip
+def told(name: str, points: Sequence[tuple[float, list[float]]]) -> dict[str, Any]:
+    """The result of one kind of disturbance."""
+    (first, _), (last, (at_last, *_)) = points[0], points[-1]
+    return {"kind": name, "range": [first, last], "at_last": at_last, "half": half_fail(points)}
 
 
 def success(found: dict[float, ls.stress.Outcomes]) -> list[tuple[float, list[float]]]:
@@ -210,8 +206,7 @@ def report(result: Result) -> str:
         ),
         "Smoothing's policy under one kind at a time, made stronger in steps; success falls through one half between"
         " two of them, which is interpolated. In brackets are the last strength at which success is surely above one"
-        " half and the first at which it is surely below. Multiples of the preset are not the same effort for all"
-        " kinds: the last column says what they come to.",
+        " half and the first at which it is surely below.",
     ]
     for name, robot in robots.items():
         title = f"{NAMES[name].capitalize()}, {robot['trials_alone']} trials a strength."
@@ -241,8 +236,8 @@ def of_kinds(kinds: Sequence[dict[str, Any]]) -> str:
             span = f"{f'under {first:.3g}' if low is None else f'{low:.3g}'} to"
             span += f" over {last:.3g}" if high is None else f" {high:.3g}"
             where = f"{span}" if half is None else f"{half:.2g} ({span})"
-        rows.append([kind["kind"], where, brief(kind["there"])])
-    return table(("kind", "half fail at", "which is"), rows)
+        rows.append([kind["kind"], where])
+    return table(("kind", "half fail at"), rows)
 
 
 def brief(text: str) -> str:

@@ -37,7 +37,7 @@ def test_a_quick_run_counts_what_keeps_the_constraints_at_altros_cost() -> None:
     said = json.loads(done.stdout)
     found = said["result"]["problems"]
     assert list(found) == ["double_integrator", "pendulum"]
-    for name, family in found.items():
+    for family in found.values():
         one = family["solvers"]["lqrsim"]
         assert one["solved"] == [True]
         assert one["faults"] == [[]]
@@ -46,7 +46,7 @@ def test_a_quick_run_counts_what_keeps_the_constraints_at_altros_cost() -> None:
         else:
             assert family["targets"][0] == pytest.approx(1.001 * one["cost"][0])
         assert one["target"]["iterations"][0] > 0
-        assert f"| {name} | 1 |" in said["report"]
+    assert "Not solved: none." in said["report"]
 
 
 def test_an_untouched_plan_is_verified(solved: tuple[ls.Problem, ls.Solution]) -> None:

@@ -76,7 +76,6 @@ def of_preset(rows: dict[str, list[Reached]], costs: list[list[float]]) -> dict[
     together = {name: np.concatenate(parts) for name, parts in rows.items()}
     result: dict[str, Any] = {
         "reached": {name: share(ended) for name, ended in together.items()},
-        "worst": {name: min(100 * float(part.mean()) for part in parts) for name, parts in rows.items()},
         "dearer": float(np.median([safe / plan for plan, safe in costs])) - 1,
     }
     if ROTORPY in together:
@@ -90,14 +89,10 @@ def of_preset(rows: dict[str, list[Reached]], costs: list[list[float]]) -> dict[
 def report(found: dict[str, Any]) -> list[str]:
     presets = found["presets"]
     names = list(dict.fromkeys(name for one in presets.values() for name in one["reached"]))
-    rows = []
-    for name in names:
-        cells = []
-        for one in presets.values():
-            told = one["reached"].get(name)
-            cells += ["-", "-"] if told is None else [f"{told[0]:.1f}", f"{one['worst'][name]:.0f}"]
-        rows.append([name, *cells])
-    head = ["reached (%)", *(cell for preset in presets for cell in (preset, "worst query"))]
+    rows = [
+        [name, *(f"{one['reached'][name][0]:.1f}" if name in one["reached"] else "-" for one in presets.values())]
+        for name in names
+    ]
     dearer = ", ".join(f"{100 * one['dearer']:+.0f} % ({preset})" for preset, one in presets.items())
     against = [
         f"{one['against']['only_ours']} against {one['against']['only_theirs']} ({preset}, p ="
@@ -113,5 +108,5 @@ def report(found: dict[str, Any]) -> list[str]:
         + f", and costs more than the default plan by {dearer} in the median. RotorPy's law has the gains that a"
         " search found best (`experiments/rotorpy_gains.py`). Trials that only ours reaches against those that only"
         f" theirs does, McNemar's exact test: {peers}.",
-        table(head, rows),
+        table(("reached (%)", *presets), rows),
     ]
