@@ -66,9 +66,6 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
 
     Returns:
       1 if a script failed, else 0, whether or not the paper's statements hold.
-
-    Raises:
-      InputError: an unknown script, a folder that cannot be written, or results that cannot be kept.
     """
     named = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
     chosen = [name for name in SCRIPTS if name in named]
