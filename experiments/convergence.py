@@ -61,11 +61,8 @@ def main(config: Config) -> Result:
     measured = {robot: [measure(one) for one in progress(them, robot)] for robot, them in robots.items()}
     result = opening(config)
     result["rates"] = {
-        robot: {
-            case: {solver: rates(found, case, solver) for solver in (SMOOTHING, ILQR, FINISHED)}
-            for case in (WITH, WITHOUT)
-        }
-        for robot, found in measured.items()
+        case: {solver: rates(measured["quadrotor"], case, solver) for solver in (SMOOTHING, ILQR, FINISHED)}
+        for case in (WITH, WITHOUT)
     }
     both = (SMOOTHING, ILQR)
     predicted = {solver: [one.discarded[solver] for one in measured["quadrotor"]] for solver in both}
@@ -167,11 +164,10 @@ def worst(result: Result, stop: str, what: str) -> float:
 def report(result: Result) -> str:
     rows = [
         [
-            f"{robot}, {case}, {solver}", f"{found['iterations']:g}", f"{found['determined']}/{found['queries']}",
+            f"{case}, {solver}", f"{found['iterations']:g}", f"{found['determined']}/{found['queries']}",
             said(found["medians"]["order"]), said(found["medians"]["factor"]),
         ]
-        for robot, cases in result["rates"].items()
-        for case, solvers in cases.items()
+        for case, solvers in result["rates"].items()
         for solver, found in solvers.items()
     ]  # fmt: skip
     kept = [
@@ -192,7 +188,7 @@ def report(result: Result) -> str:
             f" over relative errors in cost from {CLOSE:g} down to {ROUNDING:g}; the factor is what an iteration"
             " multiplies the error by at the end. Medians over the queries in which they are determined, by"
             f" {FEWEST} errors or more. A run with fewer is too fast to have an order: it counts as one over {SECOND}.",
-            table(("", "iterations", "determined", "order", "factor"), rows),
+            table(("quadrotor", "iterations", "determined", "order", "factor"), rows),
             picture(
                 result,
                 "convergence_order",
@@ -216,7 +212,7 @@ def report(result: Result) -> str:
 
 
 def statements(result: Result) -> list[Statement]:
-    found = result["rates"]["quadrotor"]
+    found = result["rates"]
     medians = {case: {solver: one["medians"] for solver, one in found[case].items()} for case in found}
     constant, orders = (
         medians[WITH][SMOOTHING],

@@ -182,7 +182,7 @@ def report(result: Result) -> str:
         rows = [
             [
                 f"{strength}, {policy}", f"{cell[policy]['rms']:.3g}", f"{cell[policy]['worst']:.3g}",
-                between([100 * value for value in cell[policy]["success"]], ".1f"), cell[policy]["collided"],
+                reached(cell[policy]), cell[policy]["collided"],
                 f"{cell['p_value']:.1g}" if policy == FEEDBACK and float(strength) else "",
             ]
             for strength, cell in robot["strengths"].items()
@@ -194,6 +194,12 @@ def report(result: Result) -> str:
             table(("strength, policy", "error, rms (m)", "largest (m)", "reached (%)", "collided", "p"), rows),
         ]
     return "\n\n".join(parts)
+
+
+def reached(one: dict[str, Any]) -> str:
+    """The share in %; of a single trial, as undisturbed, without an interval."""
+    percent = [100 * value for value in one["success"]]
+    return between(percent, ".1f") if one["trials"] > 1 else f"{percent[0]:.0f}"
 
 
 def statements(result: Result) -> list[Statement]:

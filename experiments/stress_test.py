@@ -80,9 +80,7 @@ def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, A
             "band": interval(found.band),
         })  # fmt: skip
     plans = {policy: plan_of(results.solution(policy)) for policy in ("smooth", "ilqr")}
-    words = [one.describe(scenario.plant()) for one in light]
-    told = {"disturbances": words, "plans": plans, "replan_every": asked.replan_every, "trials": asked.trials}
-    return told | {"together": cells}
+    return {"plans": plans, "replan_every": asked.replan_every, "trials": asked.trials, "together": cells}
 
 
 def plan_of(solution: ls.Solution) -> dict[str, float]:
@@ -192,8 +190,7 @@ def report(result: Result) -> str:
     for name, robot in robots.items():
         plans = ", ".join(f"{WORDS[policy]}'s {plan['clearance']:.3f} m" for policy, plan in robot["plans"].items())
         parts += [
-            f"{NAMES[name].capitalize()}, reached (%), {robot['trials']} trials each; clearance of the plans: {plans}."
-            f" At strength 1: {brief('; '.join(robot['disturbances']))}.",
+            f"{NAMES[name].capitalize()}, reached (%), {robot['trials']} trials each; clearance of the plans: {plans}.",
             of_policies(robot["together"]),
         ]
     parts += [
@@ -238,11 +235,6 @@ def of_kinds(kinds: Sequence[dict[str, Any]]) -> str:
             where = f"{span}" if half is None else f"{half:.2g} ({span})"
         rows.append([kind["kind"], where])
     return table(("kind", "half fail at"), rows)
-
-
-def brief(text: str) -> str:
-    """The text with numbers rounded to three digits."""
-    return re.sub(r"\d+\.\d{2,}", lambda number: f"{float(number[0]):.3g}", text)
 
 
 if __name__ == "__main__":

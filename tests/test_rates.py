@@ -58,7 +58,7 @@ def test_second_order_would_be_noticed() -> None:
         solvers = script.SMOOTHING, script.ILQR, script.FINISHED
         cases = {case: dict.fromkeys(solvers, log) for case in (script.WITH, script.WITHOUT)}
         queries = 3 * [SimpleNamespace(logs=cases)]
-        result["rates"]["quadrotor"] = {
+        result["rates"] = {
             case: {who: script.rates(queries, case, who) for who in logs} for case, logs in cases.items()
         }
         left = np.array([1e-2, 1e-4, 1e-8]) if seen else np.array([1e-2, 1e-3, 1e-4])
