@@ -145,7 +145,7 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
 
 
 def load_with_scenario(path: Path, named: str | None) -> "tuple[Solution, Scenario]":
-    """The solution in a file, and the scenario in which it runs: the named one, else its own if `lqrsim list` has it."""
+    """The solution in a file, and its scenario: the named one, else its own if `lqrsim list` has it."""
     from lqrsim.results import save_load
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.references import resolve
