@@ -35,7 +35,7 @@ COMMANDS = {
     "demo": "solve, simulate and render both robots (arguments go to `lqrsim demo`)",
     "test": "run the tests; --long includes whole experiments (other arguments go to pytest: test -k solver)",
     "check": "check lint, formatting and types",
-    "numbers": "print the numbers of the pages again, which takes hours (arguments: numbers --help)",
+    "numbers": "print the numbers of the pages again; with --long those of long runs, too (numbers --help)",
     "release": "try the sdist and the wheel in empty environments of each Python on the path (release --help)",
     "docs": "build the documentation site into build/site; warnings are errors",
     "setup": "only set up what the other commands need",

@@ -27,7 +27,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from peers.rotorpy import DEFAULT
 from peers.rotorpy import RotorPy as Se3
-from runner import FolderSettings, Result, at_most, between, interval, opening, progress, run, table
+from runner import FolderSettings, Result, at_most, opening, progress, run, table
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
@@ -39,7 +39,6 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.wind import first_order
 from lqrsim.simulators import RotorPy
-from lqrsim.stress.statistics import rate
 
 Kind = Literal["none", "wind", "force", "torque", "model", "rotors", "payload"]
 Part = Literal["ranges", "when2fail", "delay"]
@@ -260,15 +259,11 @@ def errors(law: str, disturbances: Sequence[Disturbance], trial: int, seed: int)
 
 
 def cell(law: str, disturbance: Disturbance | None, trials: int, seed: int) -> dict[str, Any]:
-    """Successes; the error of each trial in m, None where it was lost; mean and standard deviation of the successes."""
+    """The share of successes, and the mean error of these in m; None without any."""
     given = [] if disturbance is None else [disturbance]
     rms = np.array([np.sqrt(np.mean(errors(law, given, trial, seed) ** 2)) for trial in range(trials)])
     good = rms < FAILED  # NaN is none
-    mean, spread = (float(rms[good].mean()), float(rms[good].std())) if good.any() else (None, None)
-    return {
-        "law": law, "share": interval(rate(int(good.sum()), trials)), "mean": mean, "spread": spread,
-        "rms": [float(one) if np.isfinite(one) else None for one in rms],
-    }  # fmt: skip
+    return {"law": law, "share": float(good.mean()), "mean": float(rms[good].mean()) if good.any() else None}
 
 
 def ranges(config: Config) -> list[dict[str, Any]]:
@@ -289,7 +284,7 @@ def when2fail(config: Config) -> list[dict[str, Any]]:
             for law in list(flying):
                 one = cell(law, Bench(kind, strength, strength), config.failing, config.seed)
                 found.append(one | {"kind": kind, "strength": strength})
-                if one["share"][0] == 0:
+                if one["share"] == 0:
                     flying.remove(law)
     return found
 
@@ -330,44 +325,52 @@ def report(result: Result) -> str:
         return "\n\n".join([*lines, f"skipped: {result['skipped']}"])
     config = result["config"]
     if "ranges" in result:
+        rows = [
+            [name, *("-" if cells[law]["mean"] is None else f"{cells[law]['mean']:.3f}" for law in LAWS)]
+            for name, cells in by_law(result["ranges"]).items()
+        ]
+        few = [f"{one['kind']}, {one['law']}, {percent(one)}" for one in result["ranges"] if one["share"] < 1]
         lines += [
             "### Within the published ranges",
-            f"{config['trials']} trials each, the same for all laws. Successes in %, with exact intervals of 95 %; and"
-            " the root mean square of the position's error of those that succeed, mean and standard deviation, in m.",
+            f"{config['trials']} trials each, the same for all laws: the root mean square of the position's error in m,"
+            f" mean of those that succeed. Successes below 100 %: {'; '.join(few) or 'none'}.",
+            table(("disturbance", *LAWS), rows),
         ]
-        rows = [[f"{one['kind']}: {one['law']}", percent(one), told(one)] for one in result["ranges"]]
-        lines.append(table(("disturbance and law", "success", "error"), rows))
     if "when2fail" in result:
+        rows = [
+            [name, *(percent(cells[law]) if law in cells else "-" for law in LAWS)]
+            for name, cells in by_law(result["when2fail"]).items()
+        ]
         lines += [
             "### Until it fails",
-            f"{config['failing']} trials of each strength: successes in % and errors in m, as above. A law is not run"
-            " beyond the strength at which none succeed. Strengths are in m/s, N, N m, and shares of the numbers, the"
-            " efficiency and the mass; theirs end at 0.6 for rotors and at 2 for the payload, too.",
+            f"{config['failing']} trials of each strength: successes in %. A law is not run beyond the strength at"
+            " which none succeed. Strengths are in m/s, N, N m, and shares of the numbers, the efficiency and the mass;"
+            " theirs end at 0.6 for rotors and at 2 for the payload, too.",
+            table(("strength", *LAWS), rows),
         ]
-        cells = {(one["kind"], one["strength"], one["law"]): one for one in result["when2fail"]}
-        rows = []
-        for kind, strength in dict.fromkeys((one["kind"], one["strength"]) for one in result["when2fail"]):
-            row = [f"{kind} {strength:g}"]
-            for law in LAWS:
-                one = cells.get((kind, strength, law))
-                row.append("-" if one is None else f"{percent(one)}, {told(one)}")
-            rows.append(row)
-        lines.append(table(("strength", *LAWS), rows))
     if "delay" in result:
-        lines += ["### Delay margin", f"{config['delayed']} references. In ms, in steps of {1000 * DT:g}."]
         rows = [
             [one["law"], *(f"{1e3 * of(one['margins']):.0f}" for of in (np.mean, min, max))] for one in result["delay"]
         ]
-        lines.append(table(("law", "mean", "least", "most"), rows))
+        lines += [
+            "### Delay margin",
+            f"{config['delayed']} references. In ms, in steps of {1000 * DT:g}.",
+            table(("law", "mean", "least", "most"), rows),
+        ]
     return "\n\n".join(lines)
 
 
+def by_law(cells: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
+    """The cells of each kind, with its strength if it has one, by law."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for one in cells:
+        name = f"{one['kind']} {one['strength']:g}" if "strength" in one else one["kind"]
+        found.setdefault(name, {})[one["law"]] = one
+    return found
+
+
 def percent(one: dict[str, Any]) -> str:
-    return between([100 * part for part in one["share"]], ".0f")
-
-
-def told(one: dict[str, Any]) -> str:
-    return "-" if one["mean"] is None else f"{one['mean']:.3f} ± {one['spread']:.3f}"
+    return f"{100 * one['share']:.0f}"
 
 
 if __name__ == "__main__":

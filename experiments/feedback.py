@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
 from paper.common import figure, numbers, picture
-from runner import FolderSettings, Result, Statement, interval, opening, progress, run, table
+from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare, rate
@@ -64,47 +64,42 @@ def main(config: Config) -> Result:
         }
         if strength == FULL:
             one = rollouts[FEEDBACK]
-            robot |= {"disturbances": one.disturbances, "goal_radius": one.goal_radius, "seconds": numbers(one.times)}
-            robot["bands"] = {name: bands(rollout) for name, rollout in rollouts.items()}
+            robot |= {"disturbances": one.disturbances, "goal_radius": one.goal_radius}
             drawn[scenario.name] = rollouts
-    draw(config, result)
+    draw(config, result, drawn)
     draw_paths(config, result, scenarios, drawn)
     return result
 
 
 def measured(rollout: ls.Rollout) -> dict[str, Any]:
-    """Trial by trial: how far from the plan in metres, until it ended, and how it ended."""
+    """How far from the plan in metres, until each trial ended, and how many reached the goal."""
     error = np.where(rollout.counts, rollout.tracking_error, np.nan)
+    rms, worst = np.sqrt(np.nanmean(error**2, axis=1)).mean(), np.nanmax(error)
     return {
-        "rms": numbers(np.sqrt(np.nanmean(error**2, axis=1))),
-        "worst": numbers(np.nanmax(error, axis=1)),
-        "final": numbers(error[:, -1]),
-        "outcome": rollout.outcome,
+        "trials": rollout.trials,
+        "rms": numbers([rms])[0],
+        "worst": numbers([worst])[0],
+        "collided": rollout.outcome.count("collided"),
         "success": interval(rate(int(rollout.reached.sum()), rollout.trials)),
     }
 
 
-def bands(rollout: ls.Rollout) -> list[list[float | None]]:
-    """5 %, median and 95 % of the tracking errors over time."""
-    return [numbers(line) for line in np.nanpercentile(rollout.tracking_error, (5, 50, 95), axis=0)]
-
-
-def draw(config: Config, result: Result) -> None:
+def draw(config: Config, result: Result, rollouts: dict[str, dict[str, ls.Rollout]]) -> None:
     with figure(config, result, "feedback", (10, 6)) as drawn:
         for row, (name, robot) in zip(drawn.subplots(2, 2, width_ratios=(3, 2)), result["robots"].items(), strict=True):
             over_time, success = row
-            draw_errors(over_time, robot)
+            draw_errors(over_time, rollouts[name])
             over_time.set_title(f"{NAMES[name]} at strength {FULL:g}: median, 5 to 95 %")
             draw_success(success, robot)
             success.set_title(f"{NAMES[name]}: goal reached")
         drawn.set_layout_engine("tight", w_pad=3)
 
 
-def draw_errors(axes: Axes, robot: dict[str, Any]) -> None:
-    times, radius = np.array(robot["seconds"])[1:], robot["goal_radius"]
+def draw_errors(axes: Axes, rollouts: dict[str, ls.Rollout]) -> None:
+    times, radius = rollouts[FEEDBACK].times[1:], rollouts[FEEDBACK].goal_radius
     for policy, (colour, line, _) in LOOK.items():
         # All begin on the plan, at an error that a logarithmic axis has no place for.
-        low, middle, high = np.array(robot["bands"][policy], dtype=float)[:, 1:]
+        low, middle, high = np.nanpercentile(rollouts[policy].tracking_error, (5, 50, 95), axis=0)[:, 1:]
         axes.fill_between(times, low, high, color=colour, alpha=0.2, linewidth=0)
         axes.plot(times, middle, line, color=colour)
         axes.annotate(policy, (times[-1], middle[-1]), (4, 0), textcoords="offset points", color=colour, va="center")
@@ -118,7 +113,7 @@ def draw_success(axes: Axes, robot: dict[str, Any]) -> None:
     for policy, (colour, line, marker) in LOOK.items():
         cells = [cell[policy] for cell in robot["strengths"].values()]
         value, low, high = np.array([cell["success"] for cell in cells]).T
-        sampled = np.array([len(cell["outcome"]) > 1 for cell in cells])
+        sampled = np.array([cell["trials"] > 1 for cell in cells])
         reach = np.where(sampled, [value - low, high - value], 0)
         axes.errorbar(strengths, value, reach, linestyle=line, color=colour, marker=marker, markersize=4, capsize=3)
         last = strengths[-1], value[-1]
@@ -173,60 +168,38 @@ def draw_runs(axes: Axes, rollout: ls.Rollout, count: int, name: str) -> None:
 
 
 def report(result: Result) -> str:
+    count = min(result["config"]["paths"], result["trials"])
     parts = [
         "## Feedback against open loop",
         picture(
             result, "feedback", "Distance from the plan over time, and success against the strength of the disturbances"
         ),
-        picture(
-            result,
-            "feedback_paths",
-            f"The first {min(result['config']['paths'], result['trials'])} trials with feedback and without, each up to"
-            " its first collision; disturbances as in the demo",
-        ),
+        picture(result, "feedback_paths", f"The first {count} trials of each, up to their first collision"),
+        f"{result['trials']} trials of each strength and policy, one undisturbed; p is McNemar's exact test of feedback"
+        " against open loop. Errors are distances from the plan, until a trial collides or is lost.",
     ]
     for name, robot in result["robots"].items():
+        rows = [
+            [
+                f"{strength}, {policy}", f"{cell[policy]['rms']:.3g}", f"{cell[policy]['worst']:.3g}",
+                reached(cell[policy]), cell[policy]["collided"],
+                f"{cell['p_value']:.1g}" if policy == FEEDBACK and float(strength) else "",
+            ]
+            for strength, cell in robot["strengths"].items()
+            for policy in LOOK
+        ]  # fmt: skip
         parts += [
-            f"{NAMES[name].capitalize()}, {result['trials']} trials of each; at strength 1:"
-            f" {'; '.join(robot['disturbances'])}. A trial has reached its goal if it ends within"
-            f" {robot['goal_radius']:g} m of the goal and never collided.",
-            cells(robot),
+            f"{NAMES[name].capitalize()}; at strength 1: {'; '.join(robot['disturbances'])}. The goal is reached within"
+            f" {robot['goal_radius']:g} m, without a collision.",
+            table(("strength, policy", "error, rms (m)", "largest (m)", "reached (%)", "collided", "p"), rows),
         ]
-    return "\n\n".join(
-        [
-            *parts,
-            "Errors are distances from the plan in metres: root mean square over time, the largest, and the last one;"
-            " they count until a trial collides or is lost."
-            " Intervals are exact, of 95 %; p is McNemar's exact test of the same trials with feedback and without."
-            " Undisturbed, all trials are the same, so there is one.",
-        ]
-    )
+    return "\n\n".join(parts)
 
 
-def cells(robot: dict[str, Any]) -> str:
-    """Rows of the robot's table."""
-    rows = []
-    for strength, cell in robot["strengths"].items():
-        for policy in LOOK:
-            one = cell[policy]
-            outcomes, (value, low, high) = list(one["outcome"]), one["success"]
-            several = len(outcomes) > 1
-            final = np.array(one["final"], dtype=float)
-            rows.append(
-                [
-                    f"{strength}, {policy}", f"{np.mean(one['rms']):.3g}", f"{np.max(one['worst']):.3g}",
-                    f"{np.nanmean(final):.3g}" if np.isfinite(final).any() else "-",
-                    f"{outcomes.count('reached')}/{len(outcomes)}",
-                    f"{100 * value:.1f} ({100 * low:.1f} to {100 * high:.1f}) %" if several else "",
-                    *(outcomes.count(outcome) for outcome in ("collided", "timed out", "diverged")),
-                    f"{cell['p_value']:.1g}" if several and policy == FEEDBACK else "",
-                ]
-            )  # fmt: skip
-    head = (
-        "strength, policy", "rms, mean", "largest of all", "final, mean", "reached", "", "collided", "timed out",
-        "lost", "p",
-    )  # fmt: skip
-    return table(head, rows)
+def reached(one: dict[str, Any]) -> str:
+    """The share in %; of a single trial, as undisturbed, without an interval."""
+    percent = [100 * value for value in one["success"]]
+    return between(percent, ".1f") if one["trials"] > 1 else f"{percent[0]:.0f}"
 
 
 def statements(result: Result) -> list[Statement]:
@@ -237,9 +210,8 @@ def statements(result: Result) -> list[Statement]:
         said.append(
             Statement(
                 where="Sec. VI-A",
-                paper="the control policy can account for disturbances"
-                + ("" if name == "differential_drive" else f", said of the drive; here the {NAMES[name]}"),
-                test="the goal reached more often than without feedback, the 95 % intervals apart",
+                paper=f"the policy can account for disturbances; {NAMES[name]}",
+                test="the goal reached more often than without feedback, intervals apart",
                 ours=f"{100 * value:.1f} % ({100 * low:.1f} to {100 * high:.1f}) with feedback,"
                 f" {100 * bare:.1f} % ({100 * bare_low:.1f} to {100 * bare_high:.1f}) without",
                 holds=low > bare_high,

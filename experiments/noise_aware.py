@@ -44,7 +44,8 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             "## Plans under noise",
-            "Noise that depends on state and control in the plan itself, and a risk.",
+            "Noise that depends on state and control in the plan itself, and a risk; trials are by the problem's own"
+            " model.",
             *report_of(SECTIONS, result),
         ]
     )

@@ -28,10 +28,7 @@ IPOPT the dynamics, too. A solver whose final plan costs more is not asked when 
 solver's own measure of optimality, which are not the same: the decrease of the cost that is still promised, relative to
 the cost, or the residuals of the optimality conditions. "Optimality reached" is the same for all: the residual of the
 first-order conditions of the plan that is returned, recomputed in NumPy with the multipliers that make it least, and
-relative to the slope of the cost. "Within 1 %" counts the instances where a verified plan costs
-at most 1.01 times the least cost of all solvers. "Against IPOPT" is how much dearer the plan is than IPOPT's from the
-same start, where both are solved and in the same optimum, their costs within 0.1 %: of several instances the largest
-difference.
+relative to the slope of the cost.
 
 Each plan that is returned is recomputed in NumPy, apart from all solvers: dynamics and constraints are to be kept to
 1e-6, and the cost is to be the claimed one. What is claimed but not so counts as not solved, and reaches nothing. Of
@@ -63,7 +60,7 @@ from tqdm import tqdm
 from lqrsim.errors import check_count, check_name
 
 ABOVE_BEST = 1.001  # times the least cost of all: the target where Altro.jl's is not reached or known
-AS_GOOD, SAME = 1.01, 1e-3  # times the least cost of all, a plan that is as good; and of IPOPT's, one of its optimum
+SAME = 1e-3  # relative difference of costs up to which two plans are of one optimum
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +118,6 @@ def _family(name: str, config: Config, most: int, bar: Any) -> Result:
         else:
             found[solver] = _solve_all(solve, problems, f"{name}, {solver}")
         bar.update()
-    best = _least(list(found.values()), len(problems))
     from_start = _least([outcomes for solver, outcomes in found.items() if solver != SEARCH], len(problems))
     published = FAMILIES[name].published
     targets = [ABOVE_BEST * cost for cost in from_start]
@@ -134,7 +130,6 @@ def _family(name: str, config: Config, most: int, bar: Any) -> Result:
         "target": "Altro.jl" if by_altro else "best",
         "targets": _numbers(targets),
         "absent": absent,
-        "best": _numbers(best),
         "solvers": {solver: _summary(outcomes, targets, f"{name}, {solver}") for solver, outcomes in found.items()},
     }
 
@@ -165,13 +160,10 @@ def _summary(outcomes: Sequence[Outcome], targets: Sequence[float], name: str) -
     exact = [one.run.exact if one.solved else None for one in outcomes]
     return {
         "solved": [one.solved for one in outcomes],
-        "status": [one.run.status for one in outcomes],
         "faults": [list(one.verified.faults) for one in outcomes],
         "refuted": [one.refuted for one in outcomes],
         "cost": _numbers(np.nan if one.verified.faults else one.verified.cost for one in outcomes),
         "optimality": _numbers(one.verified.optimality if one.solved else np.nan for one in outcomes),
-        "motion": _numbers(one.verified.motion for one in outcomes),
-        "violation": _numbers(one.verified.violation for one in outcomes),
         "target": _moments(reached),
         "exact": _moments(exact),
     }
@@ -198,71 +190,55 @@ def _progress(items: Sequence[Any], name: str) -> Any:
 
 
 def report(result: Result) -> str:
-    head = (
-        "problem", "solver", "instances", "solved", "at the target", "iterations", "ms", "at 1e-8", "iterations", "ms",
-        "final cost", "optimality reached", "within 1 %", "against IPOPT",
-    )  # fmt: skip
-    rows, notes = [], []
-    absent: dict[str, list[str]] = {}
-    for name, family in result["problems"].items():
+    problems, notes, absent = result["problems"], [], dict[str, list[str]]()
+    unsolved = []
+    for name, family in problems.items():
         for solver, one in family["solvers"].items():
-            near = sum(
-                cost is not None and cost <= AS_GOOD * best
-                for cost, best in zip(one["cost"], family["best"], strict=True)
-            )
-            beside = _against(one, family["solvers"].get("IPOPT"))
-            rows.append([name, solver, family["instances"], sum(one["solved"]), *_row(one), near, beside])
+            if not all(one["solved"]):
+                unsolved.append(f"{name} by {solver} ({sum(one['solved'])} of {family['instances']})")
             notes += [
                 f"{name}, {solver}, instance {i}: claimed, but {'; '.join(faults)}."
                 for i, (faults, refuted) in enumerate(zip(one["faults"], one["refuted"], strict=True))
                 if refuted
             ]
         for solver, why in family["absent"].items():
-            absent.setdefault(f"without {solver}, {why}", []).append(name)
-    targets = [
-        (name, *(family["published"] or ("-", "-")), family["target"], _median(family["targets"], ".6g"))
-        for name, family in result["problems"].items()
-    ]
+            absent.setdefault(f"Without {solver}, {why}", []).append(name)
+    solvers = [name for name in CONTESTANTS if any(name in one["solvers"] for one in problems.values())]
+    main = [one for one in ("lqrsim", "FATROP", "IPOPT") if one in solvers]
+    brief = ("iterations to 1e-8", "ms to 1e-8", "optimality reached")
     peers = ", ".join(" ".join(one) for one in result["peers"].items())
+    parts = [
+        "## A league of solvers",
+        "`experiments/solver_league.py` states problems, solvers and measures. In brackets is a number of instances,"
+        f" whose medians are told; a dash stands where no more than half get there. {peers or 'No peers installed.'}",
+        table(("problem", *(f"{one}, {what}" for what in brief for one in main)), _rows(problems, main, brief)),
+    ]
+    for what in BY_SOLVER:
+        parts += [f"{what[0].upper()}{what[1:]}:", table(("problem", *solvers), _rows(problems, solvers, [what]))]
     return "\n\n".join(
         [
-            "## A league of solvers",
-            table(head, rows),
-            f"Medians over the instances; a dash where no more than half get there. {peers or 'No peers installed.'}",
-            table(("problem", "Altro.jl, iterations", "Altro.jl, cost", "target of", "target"), targets),
+            *parts,
+            f"Not solved: {'; '.join(unsolved) or 'none'}.",
             *notes,
-            *(f"{', '.join(names)}: {what}." for what, names in absent.items()),
-            *_by_measure(result["problems"]),
-            *_beside_fatrop(result["problems"]),
+            *(f"{what}: {', '.join(names)}." for what, names in absent.items()),
+            *_beside_fatrop(problems),
         ]
     )
 
 
-def _by_measure(problems: dict[str, Any]) -> list[str]:
-    """The same numbers, a table for each measure with a column for each solver, as the pages have them."""
-    solvers = [name for name in CONTESTANTS if any(name in one["solvers"] for one in problems.values())]
-    labels = {
-        name: name + (f" ({family['instances']})" if family["instances"] > 1 else "")
+def _rows(problems: dict[str, Any], solvers: Sequence[str], measures: Sequence[str]) -> list[list[str]]:
+    """A row a problem: a cell for each measure of each solver, empty where it does not take the problem."""
+    return [
+        [
+            name + (f" ({family['instances']})" if family["instances"] > 1 else ""),
+            *(
+                MEASURES[what](family["solvers"][one]) if one in family["solvers"] else ""
+                for what in measures
+                for one in solvers
+            ),
+        ]
         for name, family in problems.items()
-    }
-
-    def row(name: str, chosen: Sequence[str], measures: Sequence[str]) -> list[str]:
-        found = problems[name]["solvers"]
-        return [
-            labels[name],
-            *(MEASURES[what](found[one]) if one in found else "" for what in measures for one in chosen),
-        ]
-
-    brief = ("iterations to 1e-8", "ms to 1e-8", "optimality reached")
-    main = [one for one in ("lqrsim", "FATROP", "IPOPT") if one in solvers]
-    heads = [f"{one}, {what}" for what in brief for one in main]
-    parts = ["In short:", table(("problem", *heads), [row(name, main, brief) for name in problems])]
-    for what in MEASURES:
-        parts += [
-            f"By solver: {what}.",
-            table(("problem", *solvers), [row(name, solvers, [what]) for name in problems]),
-        ]
-    return parts
+    ]
 
 
 def _beside_fatrop(problems: dict[str, Any]) -> list[str]:
@@ -305,33 +281,13 @@ def _beside_fatrop(problems: dict[str, Any]) -> list[str]:
 
 
 MEASURES: dict[str, Callable[[Result], str]] = {
-    "instances solved": lambda one: str(sum(one["solved"])),
     "iterations to 1e-8": lambda one: _median(one["exact"]["iterations"], "g"),
     "ms to 1e-8": lambda one: _median(one["exact"]["milliseconds"], ".1f"),
     "optimality reached": lambda one: _median(one["optimality"], ".0e"),
     "final cost": lambda one: _median(one["cost"], ".4g"),
     "iterations to the target": lambda one: _median(one["target"]["iterations"], "g"),
-    "ms to the target": lambda one: _median(one["target"]["milliseconds"], ".1f"),
 }
-
-
-def _against(one: Result, peer: Result | None) -> str:
-    """How much more the plans cost than another solver's in the same optimum: of several the largest difference."""
-    if peer is None or peer is one:
-        return ""
-    pairs = zip(one["cost"], peer["cost"], one["solved"], peer["solved"], strict=True)
-    dearer = [ours / theirs - 1 for ours, theirs, *solved in pairs if all(solved)]
-    same = [share for share in dearer if abs(share) < SAME]
-    return f"{max(same, key=abs):+.0e}" if same else "-"
-
-
-def _row(one: Result) -> list[str]:
-    cells = []
-    for which in ("target", "exact"):
-        counts = one[which]["iterations"]
-        cells += [str(sum(count is not None for count in counts)), _median(counts, "g")]
-        cells.append(_median(one[which]["milliseconds"], ".1f"))
-    return [*cells, _median(one["cost"], ".6g"), _median(one["optimality"], ".0e")]
+BY_SOLVER = ("iterations to 1e-8", "ms to 1e-8", "final cost", "iterations to the target")
 
 
 def _median(values: Sequence[float | None], spec: str) -> str:

@@ -66,7 +66,7 @@ def main(config: Config) -> Result:
         times = timed(contestants, rounds, case)
         result["robots"][case] = {
             solver: {
-                "milliseconds": {robot: numbers(1e3 * times[robot, solver], 4) for robot in ROBOTS},
+                "milliseconds": {robot: numbers([1e3 * median(times[robot, solver])], 4)[0] for robot in ROBOTS},
                 "ratio": interval(bootstrap(of_medians, *(times[robot, solver] for robot in reversed(ROBOTS)))),
             }
             for solver in SOLVERS
@@ -129,7 +129,7 @@ def draw(config: Config, result: Result) -> None:
             axes.plot(chain["states"], chain["milliseconds"], ".-", color=colours[solver])
         for (solver, marker), aside in zip(MARKERS.items(), (0.93, 1.0, 1.07), strict=True):
             for case, face in ((EQUAL, colours[solver]), (AS_THEY_ARE, "white")):
-                values = [median(result["robots"][case][solver]["milliseconds"][robot]) for robot in ROBOTS]
+                values = list(result["robots"][case][solver]["milliseconds"].values())
                 at = aside * np.array([3, 12])
                 axes.plot(at, values, marker, color=colours[solver], markerfacecolor=face, markersize=6, zorder=3)
         sizes, first = np.array([3.0, 12.0]), list(result["chains"].values())[-1]["milliseconds"][0]
@@ -153,27 +153,30 @@ def draw(config: Config, result: Result) -> None:
 
 
 def report(result: Result) -> str:
-    rows = []
-    for case, solvers in result["robots"].items():
-        for solver, found in solvers.items():
-            each = (f"{median(found['milliseconds'][robot]):.4f}" for robot in ROBOTS)
-            rows.append([f"{solver}, {case}", *each, between(found["ratio"], ".1f")])
-    rows.append(["the paper", "", "", PAPER])
-    chains = []
-    for solver, found in result["chains"].items():
-        first, last = found["between"]
-        each = (f"{value:.4f}" for value in found["milliseconds"])
-        chains.append([solver, *each, f"{between(found['power'])} ({first} to {last} states)"])
-    sizes = next(iter(result["chains"].values()))["states"]
+    rows = [
+        [
+            f"{solver}, {case}",
+            *(f"{each:.4f}" for each in found["milliseconds"].values()),
+            between(found["ratio"], ".1f"),
+        ]
+        for case, solvers in result["robots"].items()
+        for solver, found in solvers.items()
+    ]
+    chains = [
+        [solver, *(f"{value:.4f}" for value in found["milliseconds"]), between(found["power"])]
+        for solver, found in result["chains"].items()
+    ]
+    chain = next(iter(result["chains"].values()))
+    first, last = chain["between"]
     return "\n\n".join(
         [
             "## Time of an iteration and the dimension of the state",
             picture(result, "state_dimension", "Time of an iteration against the number of states"),
-            "Milliseconds an iteration, medians; the ratio with its 95 % bootstrap interval over rounds:",
-            table(("", "drive, 3 states", "quadrotor, 12 states", "ratio"), rows),
-            "Chains of masses, which differ in nothing but their length. The power of the number of states that time"
-            " grows as is that between the sizes in brackets; longer chains may grow faster:",
-            table(("ms an iteration", *(f"{size} states" for size in sizes), "power"), chains),
+            "Milliseconds an iteration, medians:",
+            table(("", "drive, 3 states", "quadrotor, 12 states", "ratio"), [*rows, ["the paper", "", "", PAPER]]),
+            "Chains of masses, which differ in nothing but their length; the power of the number of states that time"
+            f" grows as from {first} to {last} states:",
+            table(("ms an iteration", *(f"{size} states" for size in chain["states"]), "power"), chains),
         ]
     )
 

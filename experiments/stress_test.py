@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 from paper.common import picture
 from paper.stress_figures import NAMES, WORDS, draw_alone, draw_together
-from runner import FolderSettings, Result, between, counting, interval, opening, run, table
+from runner import FolderSettings, Result, counting, interval, opening, run, table
 
 import lqrsim as ls
 from lqrsim.disturbances import Disturbance
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 
-FAILURES = {"collided": "collided", "timed out": "timed out", "diverged": "lost", "error": "error"}
 # Of all disturbances together: those of the presets, and beyond, where they can be so strong.
 STRENGTHS = (0.125, 0.25, *PRESETS.values(), 6.0)
 GRID = (2.0 ** (np.arange(-4, 15) / 2)).tolist()  # of one kind alone
@@ -73,25 +72,15 @@ def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, A
         replan_every=scenario.problem.steps * scenario.problem.dt / 10,
     )  # fmt: skip
     results = finished(config, asked, folder / "together")
-    outcomes = {cell: results.outcomes(cell) for cell in results.cells}
-    against = {one.second: one for one in analysis.comparisons(outcomes)}
     cells = []
-    for cell, ended in outcomes.items():
-        found = analysis.success(cell, ended)
+    for cell in results.cells:
+        found = analysis.success(cell, results.outcomes(cell))
         cells.append({
             "policy": cell.policy, "strength": cell.strength, "reached": found.reached, "trials": found.trials,
-            "exact": interval(found.exact), "band": interval(found.band),
-            "modes": [[*mode, count] for mode, count in analysis.modes(ended).items()],
+            "band": interval(found.band),
         })  # fmt: skip
-        if cell in against:
-            one = against[cell]
-            cells[-1]["against"] = {
-                "only_smooth": one.only_first, "only_this": one.only_second, "p_value": one.adjusted,
-            }  # fmt: skip
     plans = {policy: plan_of(results.solution(policy)) for policy in ("smooth", "ilqr")}
-    words = [one.describe(scenario.plant()) for one in light]
-    told = {"disturbances": words, "plans": plans, "replan_every": asked.replan_every, "trials": asked.trials}
-    return told | {"together": cells}
+    return {"plans": plans, "replan_every": asked.replan_every, "trials": asked.trials, "together": cells}
 
 
 def plan_of(solution: ls.Solution) -> dict[str, float]:
@@ -128,24 +117,16 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
             half = half_fail(success(found[name]))
             low, high = half["above"] or 0.0, half["below"] or np.inf
             asked[name] = {strength for strength in grid if low < strength < high} - set(found[name])
-    rows = [told(name, one, plant, found[name]) for name, one in kinds.items()]
+    rows = [told(name, success(outcomes)) for name, outcomes in found.items()]
     # What never fails half of the time comes last, what fails more often before what fails less.
-    rows.sort(key=lambda row: (row["half"]["value"] or np.inf, row["success"][-1][0]))
+    rows.sort(key=lambda row: (row["half"]["value"] or np.inf, row["at_last"]))
     return {"alone": rows, "trials_alone": trials}
 
 
-def told(name: str, one: Disturbance, plant: ls.Plant, found: dict[float, ls.stress.Outcomes]) -> dict[str, Any]:
-    """The result of one kind of disturbance, in words."""
-    points = success(found)
-    strengths, half = [strength for strength, _ in points], half_fail(points)
-    # Half of the trials fail between two strengths that were tried; how they fail is told of the upper one.
-    strength = half["value"] or strengths[-1]
-    upper = next(tried for tried in strengths if tried >= strength)
-    return {
-        "kind": name, "light": one.describe(plant), "strengths": strengths, "success": [rates for _, rates in points],
-        "half": half, "there": one.scaled(float(f"{strength:.2g}") if half["value"] else strength).describe(plant),
-        "modes": [[*mode, count] for mode, count in analysis.modes(found[upper]).items()],
-    }  # fmt: skip
+def told(name: str, points: Sequence[tuple[float, list[float]]]) -> dict[str, Any]:
+    """The result of one kind of disturbance."""
+    (first, _), (last, (at_last, *_)) = points[0], points[-1]
+    return {"kind": name, "range": [first, last], "at_last": at_last, "half": half_fail(points)}
 
 
 def success(found: dict[float, ls.stress.Outcomes]) -> list[tuple[float, list[float]]]:
@@ -202,24 +183,17 @@ def report(result: Result) -> str:
         picture(result, "stress_test", "Success against the strength of all disturbances, with Wilson's 95 % bands"),
         "No statement of the paper's, but what it takes to believe the others. Strength 1 is the preset 'light', and"
         f" the presets are {', '.join(f'{name!r} {strength:g}' for name, strength in PRESETS.items())}. All policies"
-        " meet the same trials. Open loop is the plan of smoothing without feedback. Replanning solves again from where"
-        f" the robot is measured to be, every {robots['differential_drive']['replan_every']:g} s (differential drive)"
-        f" and {robots['quadrotor']['replan_every']:g} s (quadrotor).",
+        " meet the same trials. Replanning solves again every"
+        f" {robots['differential_drive']['replan_every']:g} s (differential drive) and"
+        f" {robots['quadrotor']['replan_every']:g} s (quadrotor).",
     ]
     for name, robot in robots.items():
+        plans = ", ".join(f"{WORDS[policy]}'s {plan['clearance']:.3f} m" for policy, plan in robot["plans"].items())
         parts += [
-            f"{NAMES[name].capitalize()}, {robot['trials'] * len(robot['together'])} trials, {robot['trials']} a line;"
-            f" at strength 1: {brief('; '.join(robot['disturbances']))}. "
-            + " ".join(
-                f"The plan of {WORDS[policy]} costs {plan['cost']:.4g}, and its clearance is {plan['clearance']:.3f} m."
-                for policy, plan in robot["plans"].items()
-            ),
+            f"{NAMES[name].capitalize()}, reached (%), {robot['trials']} trials each; clearance of the plans: {plans}.",
             of_policies(robot["together"]),
         ]
     parts += [
-        "Intervals are Clopper and Pearson's, of 95 %. The last columns hold"
-        " each policy against smoothing: in how many trials only one of the two reached the goal, and the"
-        " p-value of McNemar's exact test, corrected for all comparisons of the robot after Holm.",
         "### What breaks first",
         picture(
             result,
@@ -227,60 +201,40 @@ def report(result: Result) -> str:
             "The strength of one kind of disturbance alone at which half of the trials fail, between those at"
             " which that is surely not yet and surely already so; an open arrow where that is beyond what was tried",
         ),
-        "Smoothing's policy under one kind of disturbance at a time, made stronger in steps. Between two of them"
-        " success first falls through one half, which is interpolated. In brackets are the last strength up to which"
-        " success is surely above one half and the first at which it is surely below, by exact intervals of 95 %."
-        " Multiples of the preset are not the same effort for all kinds: the third column says what they come to.",
+        "Smoothing's policy under one kind at a time, made stronger in steps; success falls through one half between"
+        " two of them, which is interpolated. In brackets are the last strength at which success is surely above one"
+        " half and the first at which it is surely below.",
     ]
     for name, robot in robots.items():
-        count = sum(len(kind["strengths"]) for kind in robot["alone"])
-        each = robot["trials_alone"]
-        parts += [f"{NAMES[name].capitalize()}, {each * count} trials, {each} a strength.", of_kinds(robot["alone"])]
+        title = f"{NAMES[name].capitalize()}, {robot['trials_alone']} trials a strength."
+        parts += [title, of_kinds(robot["alone"])]
     return "\n\n".join(parts)
 
 
 def of_policies(cells: Sequence[dict[str, Any]]) -> str:
-    rows = []
-    for cell in cells:
-        ends = ends_of(cell["modes"])
-        hit = next((mode[1] for mode in cell["modes"] if mode[1]), "")
-        against = cell.get("against")
-        compared = ["", "", ""]
-        if against:
-            compared = [against["only_smooth"], against["only_this"], f"{against['p_value']:.1g}"]
-        share = between([100 * value for value in cell["exact"]], ".1f")
-        rows.append([f"{cell['strength']:g}, {WORDS[cell['policy']]}", share, *ends.values(), hit, *compared])
-    head = (
-        "strength, policy", "reached (%)", *FAILURES.values(), "hit most often", "only smoothing", "only this", "p",
-    )  # fmt: skip
-    return table(head, rows)
+    """A row for each strength, a column for each policy."""
+    policies = list(dict.fromkeys(cell["policy"] for cell in cells))
+    shares = {(cell["strength"], cell["policy"]): 100 * cell["reached"] / cell["trials"] for cell in cells}
+    rows = [
+        [f"{strength:g}", *(f"{shares[strength, policy]:.1f}" for policy in policies)]
+        for strength in dict.fromkeys(cell["strength"] for cell in cells)
+    ]
+    return table(("strength", *(WORDS[policy] for policy in policies)), rows)
 
 
 def of_kinds(kinds: Sequence[dict[str, Any]]) -> str:
     rows = []
     for kind in kinds:
         half, low, high = (kind["half"][name] for name in ("value", "above", "below"))
-        first, last = kind["strengths"][0], kind["strengths"][-1]
+        first, last = kind["range"]
         if low == last:
             where = f"over {last:.3g}"
         else:
             span = f"{f'under {first:.3g}' if low is None else f'{low:.3g}'} to"
             span += f" over {last:.3g}" if high is None else f" {high:.3g}"
             where = f"{span}" if half is None else f"{half:.2g} ({span})"
-        ends = ends_of(kind["modes"])
-        how = ", ".join(f"{count} {FAILURES[outcome]}" for outcome, count in ends.items() if count) or "-"
-        rows.append([kind["kind"], where, brief(kind["there"]), how, brief(kind["light"])])
-    return table(("kind", "half fail at", "which is", "failures there", "strength 1"), rows)
-
-
-def ends_of(modes: Sequence[Sequence[Any]]) -> dict[str, int]:
-    """Number of trials by kind of failure."""
-    return {outcome: sum(count for end, _, count in modes if end == outcome) for outcome in FAILURES}
-
-
-def brief(text: str) -> str:
-    """The text with numbers rounded to three digits."""
-    return re.sub(r"\d+\.\d{2,}", lambda number: f"{float(number[0]):.3g}", text)
+        rows.append([kind["kind"], where])
+    return table(("kind", "half fail at"), rows)
 
 
 if __name__ == "__main__":

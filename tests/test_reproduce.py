@@ -61,7 +61,7 @@ def test_a_script_that_fails_does_not_stop_the_others(
     saved = json.loads((tmp_path / "out" / "results.json").read_text())
     assert list(saved["results"]) == ["table_1"]
     text = (tmp_path / "out" / "results.md").read_text()
-    assert "| it works (Sec. X) | 1 is 1 | 1 | holds | [table_1](figures/table_1.png) |" in text
+    assert "| it works (Sec. X) | 1 is 1 | 1 | holds |" in text
     assert "Of 1 tests of what the paper says, 1 hold and 0 do not." in text
     assert main(["reproduce", "table_1", "--out", str(tmp_path / "out")]) == 0
 
@@ -208,11 +208,10 @@ def test_stress_test_counts_what_simulations_do(quick: tuple[Path, dict[str, Any
         light = ls.disturbances.preset("light", plant)
         run = ls.simulate(plant, solution, disturbances=light, trials=cell["trials"], contacts=False, frames=False)
         assert run.outcome.count("reached") == cell["reached"]
-        assert sum(count for *_, count in cell["modes"]) == cell["trials"] - cell["reached"]
         for alone in robot["alone"]:
             if alone["kind"] in kinds:
                 (disturbance,) = [one for one in light if isinstance(one, kinds[alone["kind"]])]
-                strength, (rate, *_) = alone["strengths"][-1], alone["success"][-1]
+                strength, rate = alone["range"][-1], alone["at_last"]
                 run = ls.simulate(
                     plant, solution, disturbances=[disturbance.scaled(strength)], trials=robot["trials_alone"],
                     contacts=False, frames=False,

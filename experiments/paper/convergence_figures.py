@@ -1,7 +1,6 @@
 """The figures of `convergence.py`."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -80,11 +79,15 @@ def _drive(axes: Axes, log: Log, what: str) -> None:
 
 
 def draw_order(
-    drawn: Figure, logs: Logs, cases: tuple[str, str], rates: Mapping[str, Any], thrown_away: Mapping[str, Any]
+    drawn: Figure,
+    logs: Logs,
+    cases: tuple[str, str],
+    factors: Mapping[str, Sequence[float]],
+    predicted: Mapping[str, Sequence[float]],
 ) -> None:
     """Each error against the one before, for both solvers, and measured factors against those that are explained."""
     panels = drawn.subplots(1, 3)
-    for axes, solver in zip(panels, rates, strict=False):
+    for axes, solver in zip(panels, factors, strict=False):
         for case, colour, marker in zip(cases, (RUNS[0], RUNS[1]), ("o", "^"), strict=True):
             for one in logs:
                 error = tail(np.array([iteration.cost for iteration in one[case][solver]]))
@@ -111,9 +114,8 @@ def draw_order(
     ]
     panels[0].legend(handles=handles, loc="upper left")
     axes = panels[2]
-    for (solver, found), colour, marker in zip(rates.items(), (RUNS[0], RUNS[2]), ("o", "x"), strict=True):
-        measured = [np.nan if value is None else value for value in found["factor"]]
-        axes.plot(thrown_away[solver]["factor"], measured, marker, color=colour, markersize=4, alpha=0.7, label=solver)
+    for (solver, measured), colour, marker in zip(factors.items(), (RUNS[0], RUNS[2]), ("o", "x"), strict=True):
+        axes.plot(predicted[solver], measured, marker, color=colour, markersize=4, alpha=0.7, label=solver)
     factor = np.linspace(0, 1, 101)
     axes.plot(factor, factor, "-", color=LIMIT, linewidth=1, zorder=0)
     axes.plot(factor, factor**3, "--", color=LIMIT, linewidth=1, zorder=0)

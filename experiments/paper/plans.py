@@ -49,7 +49,7 @@ def weighted(problem: ls.Problem, obstacles: float, effort: float) -> ls.Problem
 
 def sensitive(
     scenario: ls.Scenario, result: Result, grids: dict[str, list[ls.Solution]], plans: dict[str, ls.Solution]
-) -> dict[str, Array]:
+) -> tuple[dict[str, list[dict[str, Any]]], dict[str, Array]]:
     """Which way each plan goes that converged and is clear, by letters, the commonest first; a path for each letter."""
     pillars = np.array([one.position[:2] for one in scenario.scene.world.obstacles if one.kind == "cylinder"])
     start, goal = scenario.problem.start, scenario.problem.goal
@@ -60,25 +60,23 @@ def sensitive(
         """From the wished start to the goal, for a homotopy keeps its ends; the plan's are centimetres away."""
         return np.vstack([start[:2], plan.trajectory.states[:, :2], goal[:2]])
 
-    result["grids"] = {name: [described(plan) for plan in grid] for name, grid in grids.items()}
+    cells = {name: [described(plan) for plan in grid] for name, grid in grids.items()}
     entries = [*zip(result["plans"].values(), plans.values(), strict=True)]
     for name, grid in grids.items():
-        entries += zip(result["grids"][name], grid, strict=True)
+        entries += zip(cells[name], grid, strict=True)
     found: dict[Way, list[tuple[dict[str, Any], Array]]] = {}
     for entry, plan in entries:
         entry["way"] = ""
         if entry["clear"]:
             found.setdefault(way(path(plan), pillars), []).append((entry, path(plan)))
     paths = {}
-    result["ways"] = {}
-    for number, (crossed, members) in enumerate(sorted(found.items(), key=lambda item: -len(item[1]))):
+    for number, members in enumerate(sorted(found.values(), key=len, reverse=True)):
         name = letters(number)
         for entry, _ in members:
             entry["way"] = name
         lengths = [float(np.linalg.norm(np.diff(taken, axis=0), axis=1).sum()) for _, taken in members]
         paths[name] = members[int(np.argmin(lengths))][1]
-        result["ways"][name] = {"crossed": list(crossed), "length": numbers([min(lengths)], 4)[0]}
-    return paths
+    return cells, paths
 
 
 def letters(number: int) -> str:

@@ -23,12 +23,10 @@ class Rate:
     Attributes:
       order: p of `e[k+1] = C e[k]^p`, the slope of a line through all pairs of the tail, log over log.
       factor: of an iteration, the geometric mean over the second half of the tail.
-      spread: of the factors of the tail: the 90th percentile over the 10th.
     """
 
     order: float
     factor: float
-    spread: float
 
 
 def errors(costs: Array) -> Array:
@@ -50,11 +48,9 @@ def rate(costs: Array) -> Rate:
     """Of a run by its costs (K,)."""
     left = np.log(tail(costs))
     if len(left) < FEWEST:
-        return Rate(np.nan, np.nan, np.nan)
-    steps, half = np.diff(left), left[(len(left) - 1) // 2 :]
-    low, high = np.percentile(steps, (10, 90))
+        return Rate(np.nan, np.nan)
+    half = left[(len(left) - 1) // 2 :]
     return Rate(
         order=float(np.polyfit(left[:-1], left[1:], 1)[0]),
         factor=float(np.exp((half[-1] - half[0]) / (len(half) - 1))),
-        spread=float(np.exp(high - low)),
     )

@@ -73,7 +73,7 @@ def draw_alone(config: FolderSettings, result: Result) -> None:
 def draw_halves(axes: Axes, kinds: Sequence[dict[str, Any]]) -> None:
     for row, kind in enumerate(kinds):
         half, low, high = (kind["half"][name] for name in ("value", "above", "below"))
-        first, last = kind["strengths"][0], kind["strengths"][-1]
+        first, last = kind["range"]
         axes.plot([low or first, high or last], [row, row], color=RUNS[0], linewidth=2.4, solid_capstyle="butt")
         if half is not None:
             axes.plot(half, row, "o", color=RUNS[0], markersize=6)

@@ -50,7 +50,8 @@ def of_quadrotor(config: Config) -> dict[str, Any]:
                 if found[-1][1][2] < 0.5:
                     break  # surely more than half fail, and stronger is no better
         half = {policy: half_fail(found) for policy, found in points.items()}
-        rows.append({"kind": in_words(one), "half": half, "light": one.describe(plant), "points": points})
+        last = {policy: found[-1][0] for policy, found in points.items()}
+        rows.append({"kind": in_words(one), "half": half, "last": last})
     return {"rows": rows, "trials": config.alone}
 
 
@@ -63,16 +64,15 @@ def report(found: dict[str, Any]) -> list[str]:
         ]
         head = ("half fail at strength", OWN, DEFAULT, SAFE, "last against first")
         lines += [
-            f"{NAMES[name].capitalize()}, {robot['trials']} trials a strength; 1 is that of the preset 'light'. In"
-            " brackets are the strengths between which it surely is: where the exact interval of 95 % is above one"
-            " half, and where it is below.",
+            f"{NAMES[name].capitalize()}, {robot['trials']} trials a strength, as under"
+            " [What breaks first](#what-breaks-first).",
             table(head, rows),
         ]
     return lines
 
 
 def told(row: dict[str, Any], policy: str) -> str:
-    half, last = row["half"][policy], row["points"][policy][-1][0]
+    half, last = row["half"][policy], row["last"][policy]
     if half["value"] is None:
         return f"over {half['above']:.3g}" if half["above"] else f"about {last:.3g}"
     low, high = (f"{half[side]:.3g}" if half[side] else "" for side in ("above", "below"))
@@ -83,4 +83,4 @@ def ratio(row: dict[str, Any]) -> str:
     before, after = row["half"][OWN]["value"], row["half"][SAFE]["value"]
     if before is None:
         return "-"
-    return f"{after / before:.2g}" if after else f"over {row['points'][SAFE][-1][0] / before:.2g}"
+    return f"{after / before:.2g}" if after else f"over {row['last'][SAFE] / before:.2g}"

@@ -45,17 +45,12 @@ def measure(config: Config) -> dict[str, Any]:
 
 def of_number(config: Config, make: Callable[[int], Case], number: int) -> dict[str, Any]:
     case = make(number)
-    plan, tube = case.plan, case.plan.tube
-    row: dict[str, Any] = {
-        "number": number, "asked": plan.asked, "linear": tube.linear_chance, "predicted": tube.collision_chance,
-        "strays": tube.strays, "saturation": float(tube.saturation.mean()), "weight": plan.weight,
-    }  # fmt: skip
-    measured, simulations = measured_chance(config, case)
-    return row | {"measured": measured, "simulations": simulations}
+    plan = case.plan
+    return {"asked": plan.asked, "predicted": plan.tube.collision_chance, "measured": measured_chance(config, case)}
 
 
-def measured_chance(config: Config, case: Case) -> tuple[list[float] | None, int]:
-    """The chance of collision with its interval, and the number of simulations; None if splitting found none."""
+def measured_chance(config: Config, case: Case) -> list[float] | None:
+    """The chance of collision with its interval; None if splitting found no collision."""
     plan = case.plan
     if plan.tube.collision_chance < COUNTED:
         score = ls.stress.TrialScore(case.plant, plan.solution, case.disturbances, controller=plan.controller)
@@ -63,11 +58,11 @@ def measured_chance(config: Config, case: Case) -> tuple[list[float] | None, int
         try:
             split = ls.stress.failure_probability(score, score.size, seed=config.seed, **options)
         except ls.stress.NoFailure:
-            return None, score.simulations
-        return interval(split.probability), split.simulations
+            return None
+        return interval(split.probability)
     trials = config.world_trials
     rollout = run(case.plant, plan.solution, plan.controller, case.disturbances, trials=trials, seed=config.seed)
-    return interval(rate(int(np.isfinite(rollout.collided_at).sum()), trials)), trials
+    return interval(rate(int(np.isfinite(rollout.collided_at).sum()), trials))
 
 
 def quadrotor(preset: str, number: int) -> Case:
@@ -138,24 +133,14 @@ CASES: dict[str, Callable[[int], Case]] = {
 
 
 def report(found: dict[str, Any]) -> list[str]:
-    head = ("plan", "asked", "by moments", "predicted", "measured", "95 %", "predicted / measured", "strays (%)",
-            "simulations")  # fmt: skip
-    lines = [
-        f"OffsetFree on safe plans; predictions below {COUNTED:g} are held against splitting, others are counted. By"
-        " moments is what the linear model predicts; strays are trials that leave the plan by more than six of its"
-        " standard deviations.",
-    ]
-    for name, rows in found.items():
-        ratios = [row["predicted"] / row["measured"][0] for row in rows if row["measured"] and row["measured"][0] > 0]
-        summary = f": predicted / measured {min(ratios):.2g} to {max(ratios):.2g}" if ratios else ""
-        lines += [f"{name.capitalize()}{summary}.", table(head, [cells(row) for row in rows])]
-    return lines
-
-
-def cells(row: dict[str, Any]) -> list[Any]:
-    value, low, high = row["measured"] or (np.nan,) * 3
-    ratio = row["predicted"] / value if value > 0 else np.nan
+    rows = []
+    for name, plans in found.items():
+        ratios = [row["predicted"] / row["measured"][0] for row in plans if row["measured"] and row["measured"][0] > 0]
+        shares = [f"{pick(ratios):.2f}" if ratios else "-" for pick in (min, np.median, max)]
+        asked = ", ".join(f"{chance:g}" for chance in sorted({row["asked"] for row in plans}))
+        rows.append([name, len(plans), asked, *shares])
     return [
-        row["number"], f"{row['asked']:g}", f"{row['linear']:.2g}", f"{row['predicted']:.2g}", f"{value:.2g}",
-        f"{low:.2g} to {high:.2g}", f"{ratio:.2g}", f"{100 * row['strays']:.2g}", row["simulations"],
-    ]  # fmt: skip
+        "OffsetFree on safe plans: the predicted chance over the measured one. Predictions below"
+        f" {COUNTED:g} are held against splitting, others are counted.",
+        table(("robot, preset", "plans", "asked", "least", "median", "most"), rows),
+    ]

@@ -60,8 +60,8 @@ def report(found: dict[str, Any]) -> list[str]:
     ]
     head = ("preset", "trials", "NEES / n", "inside its band (%)", "NIS / n", "inside its band (%)")
     return [
-        f"Of {found['trials']} trials those that reach the goal. The band is that in which the mean over the trials"
-        " is at 95 % of the knots if the filter is exactly right, as it is in tests/test_kalman.py for linear systems.",
+        f"Of {found['trials']} trials those that reach the goal. The band holds the mean over the trials at 95 % of the"
+        " knots if the filter is exactly right.",
         table(head, rows),
     ]
 

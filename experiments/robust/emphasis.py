@@ -20,6 +20,7 @@ from robust.common import Config, reach_exactly
 
 LESS = (1.0, 3.0, 10.0, 20.0, 50.0, 100.0)  # factors by which the second plan may be asked for less, in this order
 SAME = 1.001  # costs that differ by no more are the same
+TEN = 10.0  # factor from which queries are counted
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -30,7 +31,8 @@ def measure(config: Config) -> dict[str, Any]:
     return found
 
 
-def of_query(config: Config, query: int, preset: str) -> dict[str, Any]:
+def of_query(config: Config, query: int, preset: str) -> list[list[float] | None]:
+    """The chances of the first plan and of the second, each with its interval."""
     scenario = ls.scenarios.quadrotor(query)
     plant, problem = scenario.plant(), reach_exactly(scenario.problem)
     disturbances = ls.disturbances.preset(preset, plant)
@@ -48,44 +50,19 @@ def of_query(config: Config, query: int, preset: str) -> dict[str, Any]:
         if not plan.success or plan.cost > SAME * first.cost:
             break
         best = min(best, plan, key=lambda one: one.tube.collision_chance)
-    row: dict[str, Any] = {"query": query, "asked": asked}
-    for name, plan in (("margins", first), ("emphasis", best)):
-        measured, simulations = measured_chance(config, Case(plant, disturbances, plan))
-        row[name] = {
-            "cost": plan.cost, "predicted": plan.tube.collision_chance, "measured": measured,
-            "simulations": simulations,
-        }  # fmt: skip
-    return row
+    return [measured_chance(config, Case(plant, disturbances, plan)) for plan in (first, best)]
 
 
 def report(found: dict[str, Any]) -> list[str]:
-    head = ("query", "cost, margins alone", "cost, with emphasis", "chance, margins alone", "95 %",
-            "chance, with emphasis", "95 %", "ratio")  # fmt: skip
-    lines = []
-    for preset, rows in found.items():
-        ratios = [ratio for row in rows if np.isfinite(ratio := ratio_of(row))]
-        less = (
-            f"{len(ratios)} queries: with emphasis, the quadrotor collides less often by a factor of"
-            f" {np.median(ratios):.3g} in the median, {min(ratios):.3g} to {max(ratios):.3g}"
-            if ratios
-            else f"no query of {len(rows)} in which both plans collide in what was run"
-        )
-        lines += [
-            f"Preset '{preset}', {less}.",
-            table(head, [cells(row) for row in rows]),
-        ]
-    return lines
-
-
-def ratio_of(row: dict[str, Any]) -> float:
-    before, after = (row[name]["measured"] for name in ("margins", "emphasis"))
-    return before[0] / after[0] if before and after and after[0] > 0 else np.nan
-
-
-def cells(row: dict[str, Any]) -> list[Any]:
-    shown = []
-    for name in ("margins", "emphasis"):
-        value, low, high = row[name]["measured"] or (np.nan,) * 3
-        shown += [f"{value:.2g}", f"{low:.2g} to {high:.2g}"]
-    costs = [f"{row[name]['cost']:.4g}" for name in ("margins", "emphasis")]
-    return [row["query"], *costs, *shown, f"{ratio_of(row):.2g}"]
+    rows = []
+    for preset, pairs in found.items():
+        ratios = [before[0] / after[0] for before, after in pairs if before and after and after[0] > 0]
+        apart = sum(bool(before and after) and after[2] < before[1] for before, after in pairs)
+        factors = [f"{pick(ratios):.3g}" if ratios else "-" for pick in (np.median, min, max)]
+        rows.append([preset, len(ratios), *factors, sum(ratio >= TEN for ratio in ratios), apart])
+    head = ("preset", "queries", "factor, median", "least", "most", f"at least {TEN:g}", "95 % intervals disjoint")
+    return [
+        "By what factor the quadrotor collides less often with emphasis than with margins alone, on plans that cost at"
+        f" most {100 * (SAME - 1):g} % more.",
+        table(head, rows),
+    ]

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from runner import between, progress, table
+from runner import between, interval, progress, table
 
 import lqrsim as ls
 from lqrsim.disturbances import Disturbance, MeasurementDropouts, MeasurementNoise, MotorLag
@@ -80,10 +80,7 @@ def of_query(config: Config, query: int) -> dict[str, Any]:
     exact = reach_exactly(problem)
     known = possible(plant, exact, safe.solution, of(safe), disturbances, trials=few, seed=config.seed)
     counts[KNOWN] = [int(known.sum()), few]
-    return {
-        "query": query, "weight": safe.weight, "predicted": safe.tube.collision_chance, "counts": counts,
-        "clearance": float(np.min(safe.solution.clearance)) if safe.solution.clearance is not None else None,
-    }  # fmt: skip
+    return {"predicted": safe.tube.collision_chance, "counts": counts}
 
 
 def of(safe: ls.types.SafePlan) -> ls.OffsetFree:
@@ -118,28 +115,16 @@ def with_thrust(plant: ls.Plant, solution: ls.Solution, thrust: tuple[float, flo
 
 
 def report(found: dict[str, Any]) -> list[str]:
-    rows = found["rows"]
-    names = list(rows[0]["counts"])
-    each = [
-        [row["query"], f"{row['weight']:g}", f"{100 * row['predicted']:.1f}"]
-        + [f"{100 * good / trials:.1f}" for good, trials in (row["counts"][name] for name in names)]
-        for row in rows
-    ]
-    totals = [tuple(sum(row["counts"][name][i] for row in rows) for i in (0, 1)) for name in names]
-    shares = [rate(good, trials) for good, trials in totals]
-    last = [between([100 * one.value, 100 * one.low, 100 * one.high], ".1f") for one in shares]
-    last = [f"{share} of {trials:,}" for share, (_, trials) in zip(last, totals, strict=True)]
-    chances = np.mean([row["predicted"] for row in rows])
+    plans = found["rows"]
+    rows = []
+    for name in plans[0]["counts"]:
+        good, trials = (sum(plan["counts"][name][i] for plan in plans) for i in (0, 1))
+        rows.append([name, between([100 * value for value in interval(rate(good, trials))], ".1f"), f"{trials:,}"])
+    chance = np.mean([plan["predicted"] for plan in plans])
     return [
-        "Preset 'severe'. How many trials reach the goal (%), with `OffsetFree`: on the safe plan; on it with a filter"
-        " that takes the uncertainty as it is stated, which is not offset-free; on the plan of smooth; on the safe plan"
-        " with something better and a law made for that. Last, how many have a plan that reaches the goal and knows"
-        " what the trial meets, apart from noise and losses of commands: no law can have more, except by what a local"
-        " solution misses. Predicted is the chance of collision (%) of the first; the weight is by how much the safe"
-        " plan multiplies that of the obstacles. The last row is of all plans, with exact intervals of 95 %, and their"
-        " trials.",
-        table(
-            ("query", "weight", "predicted", *names),
-            [*each, ["all", "", f"{100 * chances:.1f}", *last]],
-        ),
+        f"Preset 'severe', {len(plans)} queries, `OffsetFree`. Better conditions are on the safe plan, whose predicted"
+        f" chance of collision is {100 * chance:.1f} %, with a law made for them. {KNOWN.capitalize()} counts trials"
+        " that have a plan which reaches the goal and knows what the trial meets, apart from noise and losses of"
+        " commands: no law can have more, except by what a local solution misses.",
+        table(("", "reached (%)", "trials"), rows),
     ]

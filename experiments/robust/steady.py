@@ -59,9 +59,9 @@ def hover(config: Config) -> dict[str, float]:
 
 def report(found: dict[str, Any]) -> list[str]:
     rows = [[name, between(told, ".1f")] for name, told in found["reached"].items()]
-    still = [[name, f"{1000 * error:.1f}"] for name, error in found["hover"].items()]
+    still = ", ".join(f"{1000 * error:.1f} ({name})" for name, error in found["hover"].items())
     return [
-        "Laws of the preset 'moderate', to which wind and mass are small and random, and not steady; no noise.",
+        "Laws of the preset 'moderate', to which wind and mass are small and random, and not steady; no noise. When"
+        f" hovering for {HOVER:g} s, the largest error in the last second is, in mm: {still}.",
         table(("steady disturbance: policy", "reached (%)"), rows),
-        table((f"hovering for {HOVER:g} s", "largest error in the last second (mm)"), still),
     ]

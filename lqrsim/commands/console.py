@@ -40,7 +40,6 @@ def run(command: Runnable, name: str) -> int:
       The exit code.
 
     Raises:
-      InputError: raised by the command.
       process.Unprintable: stdout cannot be written.
     """
     if not getattr(command, "json", False):
@@ -98,11 +97,7 @@ def say(text: str = "") -> None:
 
 
 def check_output(field: str, folder: Path, name: str = "") -> None:
-    """Check before the work starts that `folder`, or the file `name` in it, can be written.
-
-    Raises:
-      InputError: it cannot.
-    """
+    """Check before the work starts that `folder`, or the file `name` in it, can be written."""
     existing = folder.absolute()
     while not os.path.exists(existing) and existing != existing.parent:
         existing = existing.parent
@@ -150,11 +145,7 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
 
 
 def load_with_scenario(path: Path, named: str | None) -> "tuple[Solution, Scenario]":
-    """The solution in a file, and the scenario in which it runs: the named one, else its own if `lqrsim list` has it.
-
-    Raises:
-      InputError: the file is no solution, or no scenario is named.
-    """
+    """The solution in a file, and its scenario: the named one, else its own if `lqrsim list` has it."""
     from lqrsim.results import save_load
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.references import resolve

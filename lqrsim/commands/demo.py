@@ -37,9 +37,6 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
 
     Returns:
       1 if a plan did not converge, or an undisturbed run left its plan by more than the scenario's bound; else 0.
-
-    Raises:
-      InputError: an unknown scenario, or a folder that cannot be written.
     """
     console.check_output("--out", out)
     scenarios = {reference: resolve(reference) for reference in references}

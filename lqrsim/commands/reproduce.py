@@ -66,9 +66,6 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
 
     Returns:
       1 if a script failed, else 0, whether or not the paper's statements hold.
-
-    Raises:
-      InputError: an unknown script, a folder that cannot be written, or results that cannot be kept.
     """
     named = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
     chosen = [name for name in SCRIPTS if name in named]
@@ -154,28 +151,30 @@ def results_page(saved: Mapping[str, Any]) -> str:
     statements = [statement for one in results.values() for statement in one["statements"]]
     versions = next(iter(results.values()))["result"]["versions"]
     rows = [
-        f"| {one['paper']} ({one['where']}) | {one['test']} | {one['ours']} | {VERDICTS[one['holds']]}"
-        f" | [{one['figure']}](figures/{one['figure']}.png) |"
+        f"| {one['paper']} ({one['where']}) | {one['test']} | {one['ours']} | {VERDICTS[one['holds']]} |"
         for one in statements
     ]
     size = "a quick run, on a small part of the problems" if saved["quick"] else "a full run"
     command = "lqrsim reproduce --quick" if saved["quick"] else "lqrsim reproduce"
     parts = [
         "# The paper's results, reproduced",
-        f"Written by `{command}`, {size}: every number and picture on this page is. Each section is one script of"
-        " `experiments/`, which also runs by itself; the numbers query by query are in"
-        " [results.json](results.json), beside this page.",
+        f"Written by `{command}`, {size}. Each section is one script of `experiments/`, which also runs by itself; its"
+        " help says how it measures. [results.json](results.json) has the numbers unrounded.",
         "The paper: J. van den Berg, *Iterated LQR Smoothing for Locally-Optimal Feedback Control of Systems with"
         " Non-Linear Dynamics and Non-Quadratic Cost*, American Control Conference, 2014.",
         f"Computed with {', '.join(f'{name} {version}' for name, version in versions.items())} on {saved['machine']}.",
+        "Intervals in brackets are of 95 %: exact for shares, by bootstrap over queries or rounds otherwise. Times are"
+        " on one thread. In the paper's problems obstacles are a cost, which nothing forbids to pay: a plan that has"
+        " converged may collide. Presets and strengths are those of"
+        " [Stress testing](stress_testing.md#presets).",
     ]
     if statements:
-        head = "| the paper says | counts as holding | what came out | verdict | figure |"
+        head = "| the paper says | counts as holding | what came out | verdict |"
         parts += [
             "## Which of the paper's statements hold",
             f"{_count(statements)} A statement can have several tests; what counts as holding"
             " is this project's choice.",
-            "\n".join([head, "| --- " * 5 + "|", *rows]),
+            "\n".join([head, "| --- " * 4 + "|", *rows]),
         ]
     for name, one in results.items():
         options = "" if not saved["quick"] else " --quick"

@@ -154,9 +154,6 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
       given: the controller; None for the policy of the plan.
       plan: the plan; None for the controller's own.
       dynamics: dynamics of the robot that the controller runs on.
-
-    Raises:
-      InputError: the object is no controller, or there is no plan.
     """
     wanted = "a Plan, such as smooth(problem), which may be followed by another policy: controller=policy"
     check_kind("plan", plan, (Plan, type(None)), wanted)

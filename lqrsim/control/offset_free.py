@@ -161,9 +161,6 @@ class OffsetFree(Controller):
         Args:
           solution: a solution of the same problem.
           uncertainty: uncertainty of the run.
-
-        Raises:
-          InputError: as for a new OffsetFree.
         """
         return OffsetFree(self.problem, solution, uncertainty, **self._stated)
 

@@ -62,12 +62,7 @@ class Sensor(NamedTuple):
 
 
 def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
-    """Return the sensor for a user's `sensors`.
-
-    Raises:
-      InputError: there is no such state, a matrix has another shape, or a function depends on something that is no
-        state.
-    """
+    """Return the sensor for a user's `sensors`."""
     if sensors is None:
         sensors = space.names
     if callable(sensors):

@@ -208,9 +208,6 @@ class ReplanRule:
     Attributes:
       periods: control periods between two solves. delay: control periods until the answer comes into force.
       solver: the prepared solver.
-
-    Raises:
-      InputError: as `Replanner`.
     """
 
     def __init__(

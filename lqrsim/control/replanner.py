@@ -63,9 +63,6 @@ class LiveReplanner:
       active: the plan in force, `active.plan`, and the control period at which it begins, `active.first`.
       log: the log of the solves: `log.records`, a `ReplanRecord` of each; `log.solved`, the number of solves that were
         used; and `log.kept`, reason why a solve was not used, and the previous law continued -> number.
-
-    Raises:
-      InputError: as `Replanner.live`.
     """
 
     def __init__(self, rule: ReplanRule, *, interpolate: bool, clock: Callable[[], float]) -> None:
@@ -131,9 +128,6 @@ class LiveReplanner:
 
         Returns:
           (m,).
-
-        Raises:
-          InputError: the state is not finite, the time is negative, or the thread does not run.
         """
         if self._thread is None or not self._thread.is_alive():
             raise InputError(
@@ -282,9 +276,6 @@ class Replanner(Controller):
 
         Returns:
           A LiveReplanner, for one run.
-
-        Raises:
-          InputError: the deadline is zero, or an option is not as described.
         """
         return LiveReplanner(self.rule, interpolate=interpolate, clock=clock)
 

@@ -293,9 +293,6 @@ def track(
 
     Returns:
       The policy.
-
-    Raises:
-      InputError: the solution is of another system; tolerances or uncertainty do not fit it, or neither is given.
     """
     check_plan("track", problem, solution)
     risk = check_number("track: risk", risk)

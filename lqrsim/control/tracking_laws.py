@@ -60,9 +60,6 @@ class Weights:
         Args:
           at_end: factor on the tolerances of the position at the end; on the tolerances of all states if there is no
             position.
-
-        Raises:
-          InputError: there is no such name or unit, or a tolerance is not positive.
         """
         space = dynamics.state_coordinates
         state = per_entry("tolerate", tolerate, space, above=0.0)
@@ -87,11 +84,7 @@ class Weights:
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
-    """Return the tolerated effort of each control, (m,); by default a fraction of its range.
-
-    Raises:
-      InputError: as `Weights.of`, or there is neither an effort nor a range.
-    """
+    """Return the tolerated effort of each control, (m,); by default a fraction of its range."""
     controls = dynamics.control_coordinates
     if effort is not None:
         return per_entry("effort", effort, controls, above=0.0)

@@ -57,9 +57,6 @@ class Tube:
       strays: fraction of the trials that get farther from the plan than six of the position's largest standard
         deviations; without a position, of the states of the goal, each divided by its range over the plan. The moments
         do not describe them. None without trials.
-
-    Raises:
-      InputError: arrays that do not fit together.
     """
 
     plan: Trajectory
@@ -95,9 +92,6 @@ class Tube:
 
         Returns:
           The rollout with its `tube` and `collision_chance`.
-
-        Raises:
-          InputError: the rollout is a run of another plan, or the robot has no position.
         """
         check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not self.state_coordinates.position:

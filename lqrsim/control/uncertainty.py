@@ -47,9 +47,6 @@ class Unknown:
       order: 1, or 2 for noise filtered by (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and
         upward.
       drift: random walk of a constant, per square root of a second; must be 0 for other unknowns.
-
-    Raises:
-      InputError: a number is out of range.
     """
 
     of: str | Mapping[str, float]
@@ -117,9 +114,6 @@ class Uncertainty:
       command_loss: fraction of the commands that get lost; the actuators then keep the last command that arrived.
       obstacles: standard deviation of an obstacle's position in m, along each of the world's axes; planes stay.
       left_out: disturbances that no linear model can represent, for the record.
-
-    Raises:
-      InputError: a number is out of range.
     """
 
     unknowns: Sequence[Unknown] = ()
@@ -159,9 +153,6 @@ class Uncertainty:
 
         Args:
           dynamics: dynamics of the system.
-
-        Raises:
-          InputError: something does not fit.
         """
         states, controls = dynamics.state_coordinates, dynamics.control_coordinates
         for name in SUMMED:
@@ -182,9 +173,6 @@ class Uncertainty:
 
         Returns:
           An Uncertainty.
-
-        Raises:
-          InputError: a number is out of range.
         """
         memory = check_seconds("memory", memory, above=0.0)
         share = check_number("share", share, at_least=0.0)
@@ -221,9 +209,6 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
 
     Args:
       above: a bound that each must exceed; by default numbers may be 0, and names may be left out.
-
-    Raises:
-      InputError: there is no such name or unit, the count is wrong, or a number is out of range.
     """
     if isinstance(numbers, Mapping):
         given = space._by_name(field, numbers, check_number)
@@ -296,11 +281,7 @@ def triangular_root(root: Array) -> Array:
 
 
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
-    """Combine several uncertainties; noises of the same kind add up.
-
-    Raises:
-      InputError: the numbers of two are not of the same form.
-    """
+    """Combine several uncertainties; noises of the same kind add up."""
     total = Uncertainty()
     for one in parts:
         numbers = {name: _added(name, getattr(total, name), getattr(one, name)) for name in SUMMED}

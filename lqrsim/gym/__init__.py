@@ -35,9 +35,6 @@ def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any
       scenario: a Scenario, or a reference as on the command line: a name with settings, "quadrotor,query=3"; your own
         function, "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}".
       options: options of `Environment` and of `gymnasium.make`.
-
-    Raises:
-      InputError: as `Environment` does.
     """
     return gymnasium.make(ANY, scenario=scenario, **options)
 
@@ -47,9 +44,6 @@ def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasi
 
     Args:
       scenario: as in `make_env`. num_envs: number of environments. options: options of `VectorEnvironment`.
-
-    Raises:
-      InputError: as `VectorEnvironment` does.
     """
     return VectorEnvironment(scenario, num_envs=num_envs, **options)
 

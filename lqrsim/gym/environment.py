@@ -58,9 +58,6 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
 
     Attributes:
       task: the scenario and its plant. solution: the solution with the plan.
-
-    Raises:
-      InputError: there is no such scenario, disturbance, camera or mode; or a control has no limits.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as in its base class
@@ -97,11 +94,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         return episode.observations[0], self._info(episode)
 
     def step(self, action: npt.ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Run one control period.
-
-        Raises:
-          InputError: the action is not finite, or not (m,); or no episode is running.
-        """
+        """Run one control period."""
         episode = self._current()
         if episode.ended[0]:
             raise InputError("step: the episode has ended, call reset() first")
@@ -110,11 +103,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         return moment.observations[0], float(moment.rewards[0]), *ended, self._info(episode)
 
     def render(self) -> npt.NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A picture of the current state, (height, width, 3); None without a render_mode.
-
-        Raises:
-          InputError: there is no OpenGL, or no such camera.
-        """
+        """A picture of the current state, (height, width, 3); None without a render_mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() draws nothing without render_mode='rgb_array'")
             return None
@@ -148,9 +137,6 @@ class Expert:
     Args:
       env: the environment, possibly in wrappers that change neither observations nor actions.
       controller: as in `simulate`; by default the policy of the environment's solution.
-
-    Raises:
-      InputError: the environment is not one of lqrsim's, or the controller is invalid.
     """
 
     def __init__(self, env: Any, controller: ControllerLike | None = None) -> None:
@@ -187,9 +173,6 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
       frames: whether `rollout()` can be drawn; it takes memory.
 
     The other arguments are the arguments of `Environment`.
-
-    Raises:
-      InputError: as `Environment` does.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 - as in its base class
@@ -229,11 +212,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         return episode.observations, self._info(episode)
 
     def step(self, actions: npt.ArrayLike) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:
-        """Run one control period of all episodes that have not ended.
-
-        Raises:
-          InputError: the actions are not finite, or not (K, m); or all episodes have ended.
-        """
+        """Run one control period of all episodes that have not ended."""
         episode = self._current()
         if episode.ended.all():
             raise InputError("step: all episodes have ended, call reset() first")

@@ -51,9 +51,6 @@ class Task:
 
     Attributes:
       scenario, plant: robot and problem of the episodes. low, high: limits of the controls, (m,) each.
-
-    Raises:
-      InputError: as `Environment` does.
     """
 
     def __init__(
@@ -136,11 +133,7 @@ class Task:
         return tuple(found if strength == 1 else [one.scaled(strength) for one in found])
 
     def trials(self, following: int, options: Any) -> tuple[int, tuple[Disturbance, ...]]:
-        """The first trial for the options of a `reset`, by default `following`, and the disturbances.
-
-        Raises:
-          InputError: an option is unknown or invalid.
-        """
+        """The first trial for the options of a `reset`, by default `following`, and the disturbances."""
         given = reset_options(options)
         for name in given:
             check_name("options", name, RESET_OPTIONS)

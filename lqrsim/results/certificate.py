@@ -35,9 +35,6 @@ class FailureCertificate:
       seed: seed of all random numbers.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       keep: fraction of the trials that exceeds the next level; 0 if failures were counted.
-
-    Raises:
-      InputError: the parts do not fit together.
     """
 
     solution: Solution

@@ -263,9 +263,6 @@ class Coordinates:
 
         Returns:
           Index of each entry that is named -> the value that `check` returned.
-
-        Raises:
-          InputError: there is no such name or unit.
         """
         units, found = set(self.units) - {""} - set(self.names), {}
         for key in sorted(given, key=lambda key: key not in units):  # units first, so that names take precedence
@@ -284,9 +281,6 @@ class Coordinates:
 
         Returns:
           (n,).
-
-        Raises:
-          InputError: there is no such name or unit, or a number is not finite.
         """
         out = np.zeros(len(self))
         for i, number in self._by_name(field, given, check_number).items():

@@ -53,11 +53,7 @@ class BallRecord:
 
     @property
     def tracked(self) -> tuple[int, Array]:
-        """The body that the last ball is fixed to, and its position on that body, (3,).
-
-        Raises:
-          InputError: the last ball names no site.
-        """
+        """The body that the last ball is fixed to, and its position on that body, (3,)."""
         body, *place = self.anchors[-1].tolist()
         if not np.isfinite(body):
             raise InputError("balls: got no site for the last ball, want one in sites= of CollisionSpheres")
@@ -279,9 +275,6 @@ class Rollout:
 
         Returns:
           (T+1, 2 or 3), in metres.
-
-        Raises:
-          InputError: there is no such trial.
         """
         if not check_count("trial", trial, at_least=0) < self.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {self.trials - 1}")

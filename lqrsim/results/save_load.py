@@ -72,9 +72,6 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     Args:
       result: a Solution, a Rollout, a policy, a Funnel or a FailureCertificate.
       path: FILE.npz.
-
-    Raises:
-      InputError: the file cannot be written, or its content could not be read again.
     """
     path = check_path("output", path)
     write(path, *_content(result))
@@ -116,9 +113,6 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
       path: path of a file that `save` wrote.
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.types.OutputFeedbackPolicy`,
         `ls.types.Funnel` or `ls.stress.FailureCertificate`. By default, any.
-
-    Raises:
-      InputError: the file is missing, damaged, of another version or of another kind.
     """
     if kind is not None and kind not in FORMATS:
         names = (f"ls.{'stress.' if one is FailureCertificate else ''}{one.__name__}" for one in FORMATS)

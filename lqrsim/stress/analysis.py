@@ -229,9 +229,6 @@ def quantiles(outcomes: Outcomes, measure: str, levels: Sequence[float] = LEVELS
     """Quantiles of a measure (see MEASURES) over the trials for which it is defined; NaN if there are none.
 
     Infinite values count: without obstacles, clearance is infinite.
-
-    Raises:
-      InputError: there is no such measure, or a level is not in [0, 1].
     """
     shares = check_array("levels", levels, (None,))
     if not ((shares >= 0) & (shares <= 1)).all():

@@ -46,9 +46,6 @@ class DataTable:
       formats: heading -> format of the numbers in LaTeX and Markdown, such as ".3f"; by default "g". A CSV has all
         digits.
       notes: lines that say what the numbers are: comments in LaTeX, lines below the table in Markdown, not in a CSV.
-
-    Raises:
-      InputError: there are no columns, they have different lengths, or a field is not as described.
     """
 
     columns: Mapping[str, Sequence[Entry]]
@@ -81,9 +78,6 @@ class DataTable:
 
         Args:
           headings: headings of columns.
-
-        Raises:
-          InputError: the table has no such column, or none is given.
         """
         given = check_items("headings", headings, object, "a list of headings")
         chosen = {name: self.columns[check_name("headings", name, self.columns)] for name in given}
@@ -128,9 +122,6 @@ class DataTable:
 
         Returns:
           The path.
-
-        Raises:
-          InputError: the name has another ending, or the file cannot be written.
         """
         path = check_table_path("path", path)
         text = _WRITERS[path.suffix](self)

@@ -90,7 +90,6 @@ def smallest_failure(
       progress: called with the number of finished rounds, the number of all rounds, and the distance so far as text.
 
     Raises:
-      InputError: an option is out of range, or none of the failures fails.
       NoFailure: no failure was given, and none was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
     """

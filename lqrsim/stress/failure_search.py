@@ -77,9 +77,6 @@ class ReliabilityProblem:
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
       goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
       solution: a Solution, or the path of one, to run instead of solving the scenario, as in `run_campaign`.
-
-    Raises:
-      InputError: a field is not as described.
     """
 
     scenario: str
@@ -193,7 +190,6 @@ class ReliabilityProblem:
           The probability with its interval, and the failures that were found.
 
         Raises:
-          InputError: an option is out of range, or for the reasons of `score`.
           NoFailure: no failure was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
@@ -347,11 +343,7 @@ class RareFailures:
         return "; ".join(few) if len(self.splitting.levels) > 1 else ""
 
     def typical(self, count: int = 8) -> Array:
-        """The random numbers of at most `count` failures, (k, d): first the worst, then a sample of the others.
-
-        Raises:
-          InputError: `count` is not a positive whole number.
-        """
+        """The random numbers of at most `count` failures, (k, d): first the worst, then a sample of the others."""
         check_count("count", count)
         scores = self.splitting.scores
         worst = int(scores.argmax())
@@ -371,11 +363,7 @@ class RareFailures:
         )  # fmt: skip
 
     def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout:
-        """Write rare.json, certificate.npz, and `shown` typical failures as rollout.npz. Returns these.
-
-        Raises:
-          InputError: they cannot be written.
-        """
+        """Write rare.json, certificate.npz, and `shown` typical failures as rollout.npz. Returns these."""
         folder, result, one = check_path("folder", folder, "the path of a folder"), self.splitting, self.probability
         numbers = self.typical(check_count("shown", shown))
         found = {

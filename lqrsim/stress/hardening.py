@@ -161,9 +161,6 @@ class HardenedPlan:
 
         Returns:
           The typical failures that were written.
-
-        Raises:
-          InputError: they cannot be written.
         """
         folder = check_path("folder", folder, "the path of a folder")
         rounds = [

@@ -135,7 +135,6 @@ def failure_probability(
         as text.
 
     Raises:
-      InputError: an option is out of range, or a score is NaN.
       NoFailure: no failure was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the result of the repetitions that are done, None if none has failed.
     """

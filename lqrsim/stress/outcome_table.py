@@ -85,9 +85,6 @@ class Outcomes:
 
         Args:
           count: number of trials; more than there are means all.
-
-        Raises:
-          InputError: the number is not positive.
         """
         check_count("count", count)
         return replace(self, **{name: column[:count] for name, column in self.columns().items()})
@@ -114,9 +111,6 @@ def outcomes(
       problem: the problem that defines the cost; without it the cost is NaN.
       goal_radius: radius in metres, in place of the rollout's; see `simulate`.
       goal_tolerance: a scaled error, in place of the rollout's; see `simulate`.
-
-    Raises:
-      InputError: the problem does not fit the rollout, or a goal option is out of range or does not fit its goal.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     check_kind("problem", problem, (Problem, type(None)), "a Problem or None")

@@ -181,9 +181,6 @@ def make_controller(
       solution: the solution with the plan.
       design: the disturbances for which "track" and "offset_free" are designed.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
-
-    Raises:
-      InputError: there is no such controller, or it does not fit the scenario and the solution.
     """
     problem = scenario.settled(solution).problem
     match check_name("controller", name, CONTROLLERS):

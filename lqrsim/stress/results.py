@@ -50,9 +50,6 @@ class Results:
     Attributes:
       manifest: the contents of manifest.json.
       cells: the cells of the campaign.
-
-    Raises:
-      InputError: the folder is not a campaign's, is damaged, or has another version of the format.
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
@@ -127,9 +124,6 @@ class Results:
 
         Returns:
           Outcome -> number of trials.
-
-        Raises:
-          InputError: as `outcomes` does.
         """
         counts: Counter[str] = Counter()
         for _, table in self.tables(cell, partial=partial):
@@ -168,9 +162,6 @@ class Results:
         It has the columns sweep, strength, policy, trials, a count of each outcome, and success, low and high: the
         fraction of trials that reached their goal, with its exact interval. A cell without trials has no rate, and
         one in which nothing is drawn has no interval, because all of its trials are one run.
-
-        Raises:
-          InputError: a file is damaged.
         """
         head = ("sweep", "strength", "policy", "trials", *OUTCOMES, "success", "low", "high")
         rows: list[tuple[Any, ...]] = []
@@ -285,9 +276,6 @@ class Results:
 
         Args:
           policy: name of the policy.
-
-        Raises:
-          InputError: the policy's file is damaged.
         """
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
         hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
@@ -317,9 +305,6 @@ class Results:
 
         Args:
           cell: one of `cells`.
-
-        Raises:
-          InputError: it is not one of `cells`.
         """
         check_kind("cell", cell, Cell, "a Cell of the campaign")
         if cell not in self.cells:
@@ -368,9 +353,6 @@ class Results:
 
         Args:
           shard: one of `shards`.
-
-        Raises:
-          InputError: the file is missing or damaged.
         """
         path = self.path(shard)
         if not path.is_file():
@@ -393,9 +375,6 @@ class Results:
         Args:
           command: "report" or "replay".
           *options: further words of the command line.
-
-        Raises:
-          InputError: another command, or an option that is not text.
         """
         check_name("command", command, ("report", "replay"))
         for option in options:
@@ -455,9 +434,6 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
     """A line for each value of a replayed trial that differs from its row in the table.
 
     A row describes the time until the trial ended, so it does not matter whether obstacles then stopped the robot.
-
-    Raises:
-      InputError: the row's file is missing or damaged.
     """
     was, now = row(results, cell, trial), results.trials.outcomes(again).columns()
     return [

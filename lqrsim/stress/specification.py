@@ -38,9 +38,6 @@ class Cell:
       policy: name of the policy; see `Campaign`.
       sweep: the name of the disturbances.
       strength: factor by which they are scaled, 0 or more.
-
-    Raises:
-      InputError: a name is empty or not text, or the strength is negative or not finite.
     """
 
     policy: str
@@ -62,9 +59,6 @@ class Cell:
         Args:
           text: the number, from 0, or the three parts separated by commas.
           cells: the cells to choose from.
-
-        Raises:
-          InputError: there is no such cell.
         """
         cells = check_items("cells", cells, Cell, "a list of Cell")
         if not cells:
@@ -118,9 +112,6 @@ class Campaign:
       goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
       shard: trials per file.
       time_limit: seconds after which a shard counts as hung.
-
-    Raises:
-      InputError: a field is not as described.
     """
 
     scenario: str
@@ -189,9 +180,6 @@ class Campaign:
 
         Args:
           cell: one of the campaign's cells.
-
-        Raises:
-          InputError: the cell belongs to another campaign.
         """
         check_kind("cell", cell, Cell, "a Cell of the campaign")
         check_name("cell: sweep", cell.sweep, self.sweeps)
@@ -213,9 +201,6 @@ class Campaign:
 
         Args:
           fields: the result of `as_json`.
-
-        Raises:
-          InputError: the data is damaged, or a disturbance is not known here.
         """
         check_kind("campaign", fields, Mapping, "what lqrsim wrote")
         try:

@@ -30,20 +30,12 @@ class Estimate:
 
 
 def rate(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """A success rate with its exact (Clopper-Pearson) interval, whose coverage is at least the confidence.
-
-    Raises:
-      InputError: no trials, or more successes than trials.
-    """
+    """A success rate with its exact (Clopper-Pearson) interval, whose coverage is at least the confidence."""
     return _rate(successes, trials, confidence, "exact")
 
 
 def wilson(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """A success rate with Wilson's interval, for plots: it is narrower, and its coverage is right on average.
-
-    Raises:
-      InputError: as `rate` does.
-    """
+    """A success rate with Wilson's interval, for plots: it is narrower, and its coverage is right on average."""
     return _rate(successes, trials, confidence, "wilson")
 
 
@@ -73,11 +65,7 @@ class Pairs:
 
 
 def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
-    """Compare two policies trial by trial; `first` and `second` (K,) say whether each trial succeeded.
-
-    Raises:
-      InputError: they have different lengths, or no trials, or are not booleans.
-    """
+    """Compare two policies trial by trial; `first` and `second` (K,) say whether each trial succeeded."""
     from scipy import stats
 
     one, other = _flags("first", first), _flags("second", second)
@@ -105,9 +93,6 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
 
     Args:
       only_first, only_second: number of trials in which only this policy succeeded. trials: number of all trials.
-
-    Raises:
-      InputError: there are no trials, or fewer than those with different results.
     """
     from scipy import stats
 
@@ -144,9 +129,6 @@ def independent_difference(
 
     Returns:
       The rate of the first minus that of the second, and the p-value.
-
-    Raises:
-      InputError: as `rate` does.
     """
     from scipy import stats
 
@@ -167,11 +149,7 @@ def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> f
 
 
 def mean(sample: npt.ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
-    """The mean of a sample (K,) with Student's interval.
-
-    Raises:
-      InputError: there are fewer than two numbers, or one is not finite.
-    """
+    """The mean of a sample (K,) with Student's interval."""
     from scipy import stats
 
     numbers = check_array("sample", sample, (None,))
@@ -209,10 +187,6 @@ def bootstrap(
       confidence: confidence of the interval.
       resamples: number of bootstrap samples.
       seed: seed of the resampling.
-
-    Raises:
-      InputError: there are fewer than two rows, the samples have different lengths, or the statistic is no such
-        function.
     """
     from scipy import stats
 

@@ -235,9 +235,6 @@ class TrialScore:
 
         Args:
           numbers: (K, size).
-
-        Raises:
-          InputError: the shape is wrong, or a score is NaN.
         """
         vectors = check_array("numbers", numbers, (None, self.size))
         parts: Iterable[Array] = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))

@@ -1,6 +1,7 @@
 """Prints the numbers of the pages again: runs the commands that the pages name, and looks for the numbers beside them.
 
-    python3 run.py numbers                    # every command, some hours on an idle machine
+    python3 run.py numbers                    # every command but those of docs/long_runs.md
+    python3 run.py numbers --long             # those, too: some hours on an idle machine
     python3 run.py numbers --only league      # commands that contain this text
     python3 run.py numbers --list             # the commands, with the number of rows that each is to print
     python3 run.py numbers --folder models    # also those that want a folder, of the models of other packages
@@ -59,6 +60,8 @@ class Config:
     """Only commands that contain this text."""
     list: bool = False
     """Print the commands without running them."""
+    long: bool = False
+    """Also the commands of docs/long_runs.md."""
     again: bool = False
     """Run a command also if its output, by the same code, is there."""
     folder: Path | None = None
@@ -170,18 +173,19 @@ def last_commit() -> str:
     return git("log", "-1", "--format=%h") + ("-dirty" if git("status", "--porcelain") else "")
 
 
-def all_claims() -> dict[str, list[Claim]]:
+def all_claims(*, long: bool = False) -> dict[str, list[Claim]]:
     """The claims of all pages, by command."""
     found: dict[str, list[Claim]] = {}
+    left_out = {"results.md"} if long else {"results.md", "long_runs.md"}
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
-        if page.name != "results.md":
+        if page.name not in left_out:
             for claim in claims(page):
                 found.setdefault(claim.command, []).append(claim)
     return found
 
 
 def main(config: Config) -> int:
-    chosen = {command: rows for command, rows in all_claims().items() if config.only in command}
+    chosen = {command: rows for command, rows in all_claims(long=config.long).items() if config.only in command}
     if config.list or not chosen:
         for command, rows in chosen.items():
             rows_of_tables = sum(row.in_table for row in rows)
