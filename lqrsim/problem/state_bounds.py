@@ -1,15 +1,15 @@
 """Bounds and goals of states: classes and kernel."""
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from math import inf
+from collections.abc import Callable, Mapping, Sequence, Set
+from math import floor, inf
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_items, check_number, numbers_of
+from lqrsim.errors import Array, InputError, check_array, check_flag, check_items, check_number, numbers_of
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, Side, by_name
 from lqrsim.problem.dynamics import Dynamics
 
@@ -23,14 +23,19 @@ class GoalState(Constraint):
 
     Args:
       goal: (n,) the state, in the states' units; or a dictionary of name or unit: number, for some of the states, such
-        as {"m/s": 0} for all velocities. Angles count whole turns, as for a QuadraticCost.
+        as {"m/s": 0} for all velocities.
+      count_turns: whether a goal of 2 pi is another than 0. By default, the states that the dynamics declare as angles
+        reach their goals up to whole turns, and a search may take any. A QuadraticCost about a goal counts them.
       **named: name of a state -> number, in place of a dictionary.
 
     Raises:
       InputError: no goal, a number that is not finite, or a state that is named twice.
     """
 
-    def __init__(self, goal: npt.ArrayLike | Mapping[str, float] | None = None, /, **named: float) -> None:
+    def __init__(
+        self, goal: npt.ArrayLike | Mapping[str, float] | None = None, /, *, count_turns: bool = False, **named: float
+    ) -> None:
+        self.count_turns = check_flag("GoalState: count_turns", count_turns)
         self.goal: Array | dict[str, float]
         if goal is None or named or isinstance(goal, Mapping):
             self.goal = by_name("GoalState", goal, named, "a number", check_number)
@@ -46,11 +51,19 @@ class GoalState(Constraint):
             raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {each}")
         return dict(enumerate(goal.tolist()))
 
+    def turning_states(self, dynamics: Dynamics) -> Set[int]:
+        angles = () if self.count_turns else dynamics.state_coordinates.angles
+        return self.final_states(dynamics).keys() & angles
+
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
+        turning = self.turning_states(dynamics)
         rows = list(self.final_states(dynamics).items())
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
-        data = _bound_data([(i, 1.0, np.inf, np.array([number])) for i, number in rows])
+        periods = [2 * np.pi if i in turning else 0.0 for i, _ in rows]
+        data = _bound_data(
+            [(i, 1.0, np.inf, period, np.array([number])) for (i, number), period in zip(rows, periods, strict=True)]
+        )
         return ConstraintTerm(
             source_of(__name__), data, len(rows), described.__getitem__, equality=True, final_only=True,
             names=tuple(names[i] for i, _ in rows),
@@ -58,7 +71,8 @@ class GoalState(Constraint):
 
     def with_added_state(self, dynamics: Dynamics) -> "GoalState":
         names = dynamics.state_coordinates.names  # numbers by unit would also apply to the added state
-        return GoalState({names[i]: number for i, number in self.final_states(dynamics).items()})
+        goal = {names[i]: number for i, number in self.final_states(dynamics).items()}
+        return GoalState(goal, count_turns=self.count_turns)
 
 
 class StateBounds(Constraint):
@@ -124,7 +138,7 @@ class StateBounds(Constraint):
                 if i in goals and sign * (goals[i] - numbers[-1]) < 0:
                     goal = _quantity(goals[i], units[i])
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
-                rows.append((i, sign, len(times) - 2 if i in goals else np.inf, numbers))
+                rows.append((i, sign, len(times) - 2 if i in goals else np.inf, 0.0, numbers))
                 described.append(wanted)
                 named.append(f"{name} {('low', 'high')[side]}")
         return ConstraintTerm(
@@ -161,10 +175,10 @@ def _side(field: str, given: object) -> Side:
     return numbers if numbers.ndim else numbers.item()
 
 
-def _bound_data(rows: Sequence[tuple[int, float, float, Array]]) -> Array:
-    """The numbers of the kernel: of each row the state, the sign, the last step, and one bound or K of them."""
+def _bound_data(rows: Sequence[tuple[int, float, float, float, Array]]) -> Array:
+    """The numbers of the kernel: of each row the state, the sign, the last step, the period, and one bound or K."""
     knots = max(len(bounds) for *_, bounds in rows)
-    table = [[i, sign, last, *np.broadcast_to(bounds, knots)] for i, sign, last, bounds in rows]
+    table = [[*numbers, *np.broadcast_to(bounds, knots)] for *numbers, bounds in rows]
     return np.concatenate([[knots], np.ravel(table)])
 
 
@@ -180,8 +194,9 @@ def _quantities(numbers: Array, unit: str) -> str:
 
 # The kernel: the distance of a state to a bound, positive on the feasible side. `data` has the number of knots K with a
 # bound of their own, and then for each row the index of the state, 1 for a lower or -1 for an upper bound, the last
-# step at which it holds, and K bounds, infinite at knots without one. The last bound holds from its knot on.
-INDEX, SIGN, LAST, BOUNDS = 0, 1, 2, 3
+# step at which it holds, the period in which the distance is taken, 0 for none, and K bounds, infinite at knots without
+# one. The last bound holds from its knot on.
+INDEX, SIGN, LAST, PERIOD, BOUNDS = 0, 1, 2, 3, 4
 
 
 def value(x, u, t, row, data):
@@ -189,7 +204,11 @@ def value(x, u, t, row, data):
     first = row_at(row, data)
     if t > data[first + LAST]:
         return inf
-    return data[first + SIGN] * (x[int(data[first + INDEX])] - data[first + BOUNDS + min(t, int(data[0]) - 1)])
+    far = x[int(data[first + INDEX])] - data[first + BOUNDS + min(t, int(data[0]) - 1)]
+    period = data[first + PERIOD]
+    if period > 0:
+        far -= period * floor(far / period + 0.5)
+    return data[first + SIGN] * far
 
 
 def slope(x, u, t, row, data, gradient):

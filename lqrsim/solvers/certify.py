@@ -42,6 +42,7 @@ def certified(
     kept: bool = True,
     claimed: float | None,
     tolerance: float | None,
+    least: float = 0.0,
 ) -> tuple[Certificate, str]:
     """Certify a plan; also return, in words, contradictions to a solver's claim of convergence.
 
@@ -51,6 +52,7 @@ def certified(
       violation: violation of the worst constraint. kept: whether that is within the equalities' tolerance.
       claimed: the last cost in the log; None if the solver does not claim success.
       tolerance: tolerance of the optimality; None if only the cost was tested.
+      least: the least cost to which the optimality is relative, as that of time where the duration was free.
     """
     numbers = np.zeros(1, CERTIFICATE)
     to_go = no_value(states)
@@ -59,7 +61,7 @@ def certified(
     # Without a cost-to-go, the cost of noise is weighed by the policy's own.
     weighed = value is None and problem.noise_term is not None
     work(declarations.EVALUATE if weighed else declarations.CERTIFY, to_go, numbers)
-    certificate = certificate_of(problem, numbers[0], states, violation=violation)
+    certificate = certificate_of(problem, numbers[0], states, violation=violation, least=least)
     if value is None:
         certificate = replace(certificate, optimality=np.inf)
     if claimed is None:
@@ -68,7 +70,7 @@ def certified(
         # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
         own = np.zeros(1, CERTIFICATE)
         work(declarations.EVALUATE, no_value(states), own)
-        optimality = certificate_of(problem, own[0], states, violation=violation).optimality
+        optimality = certificate_of(problem, own[0], states, violation=violation, least=least).optimality
         certificate = replace(certificate, optimality=optimality)
     rest = REST * float(numbers["scale"][0])
     return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)
@@ -80,7 +82,9 @@ def no_value(states: Array) -> CostToGo:
     return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
 
-def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:
+def certificate_of(
+    problem: Problem, found: np.void, states: Array, *, violation: float, least: float = 0.0
+) -> Certificate:
     """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote."""
     cost, scale, typical, motion, law, beyond, decrease, _ = (float(found[name]) for name in CERTIFICATE.names or ())
     start = 0.0
@@ -88,7 +92,7 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
         start = float(np.abs(states[0] - problem.initial.numbers).max())
     if not np.isfinite(cost):
         decrease = np.inf
-    least = max(abs(cost), TYPICAL * typical, 1e-26 * scale, 1e-300)
+    least = max(abs(cost), least, TYPICAL * typical, 1e-26 * scale, 1e-300)
     optimality = decrease / least if np.isfinite(decrease) else np.inf
     return Certificate(
         cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),

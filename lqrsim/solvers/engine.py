@@ -592,6 +592,7 @@ class SolveRun:
             found.states, value, violation=violation, kept=self.work.keeps(values),
             claimed=self.budget.log[-1].cost if found.success else None,
             tolerance=self.final if found.status is Status.CONVERGED else None,
+            least=0.0 if self.initial_guess.found is None else self.initial_guess.found.scale,
         )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
             certificate = replace(certificate, cost=self._expected_cost(found))

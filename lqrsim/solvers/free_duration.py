@@ -5,6 +5,7 @@ Runge-Kutta step over `dt` becomes a step over `share * dt`. The interior point 
 once. With the duration found, the problem is an ordinary one, and the plan is already at its optimum.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -19,18 +20,23 @@ from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
 from lqrsim.problem.last_command import unused
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Callback, Laps, Stop
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
+from lqrsim.solvers.interior_run import MUCH
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.ways import ways
 
 # The added state, and the parameter to which it is relative; with underscores after them if the system has such names.
 STATE, STATED = "duration", "stated_duration"
 MOST = 300  # largest number of iterations
 # Number of shorter durations that are tried, factor between them, and number of iterations for each.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
+# Durations of the sketches, relative to the stated one; the largest number of iterations of a sketch, its tolerance,
+# that of constraints in their units, and that of what is worth going on from, violations and gaps.
+SKETCHED, SKETCH, ROUGH, KEPT, WORTH = (1.0, 2.0), 100, 1e-2, 1e-4, 1e-2
 FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
 
 
@@ -38,98 +44,200 @@ def solve_for_duration(
     problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], *,
     attentive: bool, callback: Callback | None, stop: Stop, begin: Solution | None = None,
 ) -> Solution:  # fmt: skip
-    """Solve for the stated duration, then find the best duration near it, and finish the plan with that duration.
+    """Find the best duration, and finish the plan with that duration.
 
-    A plan `begin` takes the place of the first solve. With a weight on time, and no start from the caller, shorter
-    durations are also tried, because they may lead to another route. A search for the best duration that ends elsewhere
-    goes on from a plan of the duration at which it ended, as long as such plans become cheaper. `solve` is for problems
-    with a fixed duration, within the time of `stop`; for `attentive` see `Budget`.
+    Without a start from the caller, ways to the goal are sketched, for the stated duration and a longer one. Then comes
+    the solution for the stated duration, in whose place a plan `begin` may be. From each of these the search goes to
+    the best duration nearby. `solve` is for problems with a fixed duration, within the time of `stop`; for `attentive`
+    see `Budget`.
     """
-    budget, total = Budget(settings.max_iterations, stop, callback=callback), 0
-    log = budget.log
+    search = Search(problem, settings, solve, attentive, callback, stop)
+    if begin is None and settings.start is None and settings.safeguard:
+        search.follow_ways()
+    search.go_on_from(begin)
+    return stop.finish(search.solution())
 
-    def solved(fixed: Problem, options: SmootherSettings) -> Solution:
-        nonlocal total
-        solution = solve(fixed, options)
-        total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
+
+class Search:
+    """A search for the best duration, from one plan after another.
+
+    Attributes:
+      best: the cheapest optimum so far: the problem with its duration, and what the interior point found; or None.
+      candidates: what was tried.
+    """
+
+    def __init__(
+        self, problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution],
+        attentive: bool, callback: Callback | None, stop: Stop,
+    ) -> None:  # fmt: skip
+        assert problem.duration is not None
+        self._problem, self._settings, self._solve = problem, settings, solve
+        self._range, self._stop, self._attentive = problem.duration, stop, attentive
+        self._budget = Budget(settings.max_iterations, stop, callback=callback)
+        self.best: tuple[Problem, Found] | None = None
+        self.candidates = list[Candidate]()
+        self._log = list[Iteration]()  # of the search that led to the best plan
+        self._fixed, self._total = list[Solution](), 0
+
+    def follow_ways(self) -> None:
+        """Sketch the ways, and go on from the sketches that keep the constraints."""
+        problem, stop = self._problem, self._stop
+        stated = settled(problem, problem.steps * problem.dt)
+        with stop.not_counting():  # compiling
+            stages = Stages(stated)
+        known, sketches = list(ways(stated, stages)), list[tuple[str, Trajectory]]()
+        lengths = dict.fromkeys(float(np.clip(share * stated.dt * stated.steps, *self._range)) for share in SKETCHED)
+        for duration, way in itertools.product(lengths, known):
+            fixed = settled(problem, duration)
+            with stop.reporting("smooth", self._attentive), stop.heeding():
+                found, iterations = sketch(fixed, way.over(fixed), self._settings.price, stop)
+                name, plan = f"{way.name}, {duration:g} s", Trajectory(found.plan.states, found.plan.controls, fixed.dt)
+                if found.measures.violation < WORTH and found.measures.gap < WORTH:
+                    sketches.append((name, plan))
+                else:
+                    self.candidates.append(Candidate(name, np.inf, iterations, None, plan))
+                self._total += iterations
+            if stop.due:
+                return
+        for name, plan in sketches:
+            if stop.due:
+                return
+            before = self._total
+            _, ordinary, found = self._find(plan, Budget(self._settings.max_iterations, stop))
+            status = Status.CONVERGED if found.solved else Status.STALLED
+            cost = found.measures.cost if np.isfinite(found.measures.cost) else np.inf
+            end = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+            self.candidates.append(Candidate(name, cost, self._total - before, status, end))
+
+    def go_on_from(self, begin: Solution | None) -> None:
+        """Go on from the solution for the stated duration; with a weight on time, also from those for shorter ones.
+
+        A shorter duration may lead to another route. Where a way has led to a plan, the first attempts of the solver
+        must do, for the others take long and are for problems of which no plan is known.
+        """
+        problem, settings = self._problem, self._settings
+        ways, before = self.best, self._total
+        if ways is not None:
+            settings = replace(settings, safeguard=False)
+        first = begin or self._solved(settled(problem, problem.steps * problem.dt), settings)
+        self._fixed.append(first)
+        shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
+        tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
+        if ways is None or first.success:
+            self._settle(first.trajectory, settings)
+        while self.best is not None and shorter and not self._budget.over:
+            shorter, plan = shorter - 1, self.best[0]
+            less = self._solved(settled(problem, max(SHORTER * plan.steps * plan.dt, self._range[0])), tries)
+            if not (less.success and not self._budget.over and self._find(less.trajectory, self._budget)[0]):
+                break
+        if self.candidates:
+            status, cost, plan = first.status, self._rank(first)[1], first.trajectory
+            if self.best is not ways and self.best is not None:
+                ordinary, found = self.best
+                status, cost = Status.CONVERGED, found.measures.cost
+                plan = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+            name = f"the nominal control, {first.trajectory.horizon:g} s"
+            self.candidates.append(Candidate(name, cost, self._total - before, status, plan))
+
+    def _settle(self, begin: Trajectory, settings: SmootherSettings) -> bool:
+        """Find the best duration near a plan's; return whether it is the cheapest so far.
+
+        A search that ends elsewhere may only have ended far from the constraints. It goes on from a plan of the
+        duration at which it ended, as long as such plans become cheaper.
+        """
+        while not self._budget.over:
+            cheaper, ordinary, found = self._find(begin, self._budget)
+            if found.solved or not np.isfinite(found.plan.states).all() or self._stop.due:
+                return cheaper
+            start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+            again = self._solved(ordinary, replace(settings, start=start, starts=None))
+            least = min(self._rank(one) for one in self._fixed)
+            self._fixed.append(again)
+            missed, cost = self._rank(again)
+            if not again.success or not (missed, cost + FELL * abs(cost)) < least:
+                return False
+            begin = again.trajectory
+        return False
+
+    def _find(self, begin: Trajectory, budget: Budget) -> tuple[bool, Problem, Found]:
+        """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
+        problem, settings, before = self._problem, self._settings, len(budget.log)
+        with self._stop.reporting("smooth", self._attentive):
+            ordinary, found = find_duration(
+                problem, begin, tolerance=settings.final(problem), violation=settings.violation_tolerance(problem),
+                most=budget.left, budget=budget, price=settings.price,
+            )  # fmt: skip
+        self._total += len(budget.log) - before
+        cheaper = found.solved and (self.best is None or found.measures.cost < self.best[1].measures.cost)
+        if cheaper:
+            self.best, self._log = (ordinary, found), list(budget.log)
+        return cheaper, ordinary, found
+
+    def _solved(self, fixed: Problem, settings: SmootherSettings) -> Solution:
+        """Solve with a fixed duration."""
+        solution = self._solve(fixed, settings)
+        self._total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
         return solution
 
-    assert problem.duration is not None
-    first = begin = begin or solved(settled(problem, problem.steps * problem.dt), settings)
-    shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
-    best, fixed = None, [first]
-    while not budget.over:
-        with stop.reporting("smooth", attentive):
-            ordinary, found = find_duration(
-                problem, begin.trajectory, tolerance=settings.final(problem),
-                violation=settings.violation_tolerance(problem), most=budget.left, budget=budget, price=settings.price,
-            )  # fmt: skip
-        if found.solved and (best is None or found.measures.cost < best[1].measures.cost):
-            best = ordinary, found
-            if not shorter or stop.due:
-                break
-            shorter -= 1
-            less = max(SHORTER * ordinary.steps * ordinary.dt, problem.duration[0])
-            tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-            begin = solved(settled(problem, less), tries)
-            if not begin.success:
-                break
-        elif best is None and np.isfinite(found.plan.states).all() and not stop.due:
-            # The search may only have ended far from the constraints: go on from a plan of that duration.
-            start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
-            begin = solved(ordinary, replace(settings, start=start, starts=None))
-            least = min(_rank_with_time(one, problem, settings.price) for one in fixed)
-            fixed.append(begin)
-            missed, cost = _rank_with_time(begin, problem, settings.price)
-            if not begin.success or not (missed, cost + FELL * abs(cost)) < least:
-                break
-        else:
-            break
-    if best is not None:
-        ordinary, found = best
-        m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
-        guess = InitialGuess(
-            np.zeros((ordinary.steps, m, n)), found.plan.controls, f"a plan of {ordinary.steps * ordinary.dt:.6g} s",
-            found=found, log=tuple(log),
-        )  # fmt: skip
-        chosen = solved(ordinary, replace(settings, start=guess, starts=None))  # its log begins with the search's
-        return stop.finish(_described(chosen, problem, total))
-    chosen = min(fixed, key=lambda one: _rank_with_time(one, problem, settings.price))
-    status, remedy = Status.STALLED, "state another dt" if chosen.success else "state a dt that allows enough time"
-    if stop.due:
-        status, remedy = Status.TIME_LIMIT, "raise time_limit"
-    elif not budget.left or chosen.status is Status.MAX_ITERATIONS:
-        status, remedy = Status.MAX_ITERATIONS, "raise max_iterations"
-    detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
-    iterations = (*first.iterations, *log, *(chosen.iterations if chosen is not first else ()))
-    chosen = replace(
-        chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations,
-        remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
-    )  # fmt: skip
-    return stop.finish(_described(chosen, problem, total + len(log)))
+    def _rank(self, solution: Solution) -> tuple[float, float]:
+        """Sort key, best first: the violation of a failed plan, then the cost with prices of time and violations."""
+        problem, plan, price = self._problem, solution.trajectory, self._settings.price
+        missed, paid = 0.0 if solution.success else solution.violation, 0.0
+        if np.isfinite(price):
+            stages = Stages(settled(problem, plan.horizon))
+            paid = _paid(stages, Motion(in_c_order(plan.states), in_c_order(plan.controls)), price)
+        return missed, solution.cost + problem.time_weight * plan.horizon + paid
+
+    def solution(self) -> Solution:
+        """The best plan, finished with its duration; or the best for a fixed duration, if none was found."""
+        settings = replace(self._settings, starts=None)
+        if self.best is not None:
+            ordinary, found = self.best
+            m, n = found.plan.controls.shape[1], found.plan.states.shape[1]
+            summary = f"a plan of {ordinary.steps * ordinary.dt:.6g} s"
+            gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
+            guess = InitialGuess(gain, found.plan.controls, summary, found=found, log=log)
+            return self._described(self._solved(ordinary, replace(settings, start=guess)))  # its log begins with this
+        first, chosen = self._fixed[0], min(self._fixed, key=self._rank)
+        status, remedy = Status.STALLED, "state another dt" if chosen.success else "state a dt that allows enough time"
+        if self._stop.due:
+            status, remedy = Status.TIME_LIMIT, "raise time_limit"
+        elif not self._budget.left or chosen.status is Status.MAX_ITERATIONS:
+            status, remedy = Status.MAX_ITERATIONS, "raise max_iterations"
+        detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
+        log = (*first.iterations, *self._budget.log, *(chosen.iterations if chosen is not first else ()))
+        self._total += len(self._budget.log)
+        return self._described(replace(
+            chosen, status=status, detail=detail.removesuffix("; "), iterations=log,
+            remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
+        ))  # fmt: skip
+
+    def _described(self, solution: Solution) -> Solution:
+        """The solution with the free duration among its options, in words, and with all that was tried."""
+        (low, high), weight = self._range, self._problem.time_weight
+        price = f", at a price of {weight:g} a second" if weight else ""
+        effort = f"{self._total} iterations in all solves" if self._total > len(solution.iterations) else ""
+        return replace(
+            solution,
+            options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"},
+            detail="; ".join(part for part in (solution.detail, effort) if part),
+            candidates=(*self.candidates, *solution.candidates),
+        )
 
 
-def _described(solution: Solution, problem: Problem, total: int) -> Solution:
-    """The solution with the free duration among its options, in words, and with the iterations of all solves."""
-    assert problem.duration is not None
-    low, high = problem.duration
-    price = f", at a price of {problem.time_weight:g} a second" if problem.time_weight else ""
-    effort = f"{total} iterations in all solves" if total > len(solution.iterations) else ""
-    return replace(
-        solution,
-        options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"},
-        detail="; ".join(part for part in (solution.detail, effort) if part),
-    )
+def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop) -> tuple[Found, int]:
+    """What a few iterations of the interior point make of a way, and their number."""
+    stages, count = Stages.lent(problem), 0
 
+    def watch(measures: Measures, seconds: float) -> bool:
+        nonlocal count
+        count += 1
+        return stop.due
 
-def _rank_with_time(solution: Solution, problem: Problem, price: float) -> tuple[float, float]:
-    """Sort key, best first: the violation of a failed plan, then the cost with the prices of time and violations."""
-    missed, plan = 0.0 if solution.success else solution.violation, solution.trajectory
-    paid = 0.0
-    if np.isfinite(price):
-        stages = Stages(settled(problem, plan.horizon))
-        paid = _paid(stages, Motion(in_c_order(plan.states), in_c_order(plan.controls)), price)
-    return missed, solution.cost + problem.time_weight * plan.horizon + paid
+    point = InteriorPoint(stages, Motion(*map(in_c_order, (way.states, way.controls))), room=MUCH.room, price=price)
+    found = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=watch)
+    stages.give_back()
+    return found, count
 
 
 def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:

@@ -162,7 +162,7 @@ class InteriorRun:
         if not np.isfinite(states).all():
             return None
         self._take_multipliers(found, work.constraint_values(states, controls), FIRMNESS)
-        work.take(states, controls, self._run.stages.trial(Motion(states, controls))[0])
+        work.take(states, controls, cost := self._run.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
         with self._budget.joined_with_last(NAME):
@@ -173,6 +173,9 @@ class InteriorRun:
                         break
                     lagrangian.update(growth=1.0)
                     result = self._newton(lagrangian, found.scale)
+                if not (result.success and lagrangian.kept):  # as where no other plan takes as little time
+                    work.take(states, controls, cost)
+                    result = self._ended_inside(lagrangian, found)
             else:
                 result = self._ended_inside(lagrangian, found)
         detail = ""

@@ -59,6 +59,7 @@ from lqrsim.solvers.multistart import (
 )
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.ways import ways
 
 # Controls are idle if they are this close to the nominal controls, relative to their size, which counts as at least 1.
 IDLE = 1e-6
@@ -406,7 +407,9 @@ class Search:
 
     def _try_elsewhere(self) -> None:
         problem, exact = self._problem, self.best[0].second_order
-        motions = dict[str, StartLike](self._motions()) if exact else {}
+        if exact:
+            self._follow_ways()
+        motions = dict[str, StartLike](self._motions()) if exact and not self.best[1].success else {}
         sways = {f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, one in (motions | sways).items():
             if self._budget.stop.due or self.best[1].success:
@@ -416,6 +419,16 @@ class Search:
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._offer(run, self._finish(run, finish if exact and name in sways else refine))
+
+    def _follow_ways(self) -> None:
+        """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
+        problem = self._problem
+        for way in list(ways(problem, self.best[0].stages)):
+            if self._budget.stop.due:
+                return
+            self._known.from_start = False
+            run = self._add(resolve(way.over(problem), problem), way.name)
+            self._offer(run, self._finish(run, from_states))
 
     @property
     def is_barred(self) -> bool:
@@ -977,7 +990,7 @@ FIRST = (
         Search.try_reweighted,
     ),
     Attempt(
-        "paths from start to goal, then oscillating controls",
+        "ways of states, paths from start to goal, then oscillating controls",
         lambda search: _is_poor(search) and not search.is_guided and search.is_without_plan,
         Search.try_elsewhere,
     ),
