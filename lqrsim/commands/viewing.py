@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional
-from lqrsim.view.options import OVERLAYS, Overlay, Quality
+from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
     from lqrsim.control.replanner import LiveReplanner
@@ -51,10 +51,13 @@ class Render:
     """More cameras, in panes beside the first. top and side are calibrated, and show a mark on the robot."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
     """Title of each run. By default the robot and the scene."""
-    overlays: Annotated[tuple[Overlay, ...], arg(metavar="NAME ...")] = OVERLAYS
-    """Drawn over the scene: plan, ghost, trace, forces, measured, caption. tube: the predicted tube under the run's
-    disturbances, 2 sigma, if there is one. cost_tube: where the total cost is near its minimum; it needs --solution.
-    funnel: the funnel about the plan; it needs --funnel."""
+    overlays: Annotated[
+        tuple[Overlay, ...],
+        arg(
+            metavar="NAME ...",
+            help="Drawn over the scene. " + " ".join(f"{name}: {kind.words}." for name, kind in OVERLAY_KINDS.items()),
+        ),
+    ] = OVERLAYS
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
     """Solution of the runs, one for all or one each, for cost_tube."""
     funnel: Annotated[tuple[Path, ...], optional("FUNNEL ...")] = ()

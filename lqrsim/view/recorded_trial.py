@@ -18,6 +18,8 @@ UNCOLOURED = 0.5, 0.5, 0.5, 1.0  # the colour of a geom whose MJCF gives none
 SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker
 
+Triangles = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]  # vertices (v, 3) in metres, and faces (f, 3)
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnGeom:
@@ -29,8 +31,7 @@ class DrawnGeom:
       size: (3,) as in the MJCF, in metres; a plane without an end is twice as wide as the scene.
       colour: (4,) red, green, blue and opacity; of a texture, the mean.
       moves: whether its body is not fixed to the world.
-      triangles: vertices (v, 3) in metres and faces (f, 3) of a mesh, a height field or a signed distance function;
-        None for the other kinds.
+      triangles: of a mesh, a height field or a signed distance function; None for the other kinds.
     """
 
     number: int
@@ -39,7 +40,7 @@ class DrawnGeom:
     size: Array
     colour: Array
     moves: bool
-    triangles: tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]] | None
+    triangles: Triangles | None
 
 
 class RecordedTrial:
@@ -119,11 +120,7 @@ class RecordedTrial:
 
     def _between(self, places: Array, times: Array, at: Array | float) -> Array:
         """Points (..., 3) in the world at the times `at`, between places (k, 2 or 3) at `times`."""
-        return self.rollout.in_world(self._interpolated(places, times, at), height=self.floor)
-
-    @staticmethod
-    def _interpolated(values: Array, times: Array, at: Array | float) -> Array:
-        return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
+        return self.rollout.in_world(interpolated(places, times, at), height=self.floor)
 
     def place_in(self, data: mujoco.MjData) -> Array:
         """Place (3,) of the robot in the posed model."""
@@ -147,6 +144,11 @@ class RecordedTrial:
         if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
             return ""
         return f"collided with {run.obstacles[k]}" if run.collided[k] else run.outcome[k]
+
+
+def interpolated(points: Array, times: Array, at: Array | float) -> Array:
+    """Points (..., c) between rows of a table (k, c), which belong to increasing times (k,)."""
+    return np.stack([np.interp(at, times, column) for column in points.T], axis=-1)
 
 
 def _recent_mean(forces: Array, dt: float) -> Array:
@@ -226,7 +228,7 @@ def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:
     return found
 
 
-def _surface(model: mujoco.MjModel, field: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+def _surface(model: mujoco.MjModel, field: int) -> Triangles:
     """Vertices (v, 3) and faces (f, 3) of the upper side of a height field."""
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     x, y, height, _ = model.hfield_size[field]
@@ -304,3 +306,15 @@ def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float
     centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
     hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
     return float(centre[2] - max(hit, 0.0))
+
+
+def quaternion_of(rotation: Array) -> Array:
+    """The quaternion (4,) of a rotation (3, 3) or (9,), scalar first."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    return quaternion
+
+
+def in_bytes(colours: npt.ArrayLike) -> list[list[int]]:
+    """Red, green and blue (k, 3) in bytes, of colours (k, 3 or 4) from numbers between 0 and 1."""
+    return np.round(255 * np.asarray(colours, dtype=np.float64)[:, :3]).astype(int).tolist()

@@ -150,13 +150,7 @@ def render(
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another camera of the model.
       insets: more cameras, in panes next to the first. In panes of `top` and `side` robots have a green mark.
       titles: titles of the runs, in the place of robot and scene.
-      overlays: drawings over the scene. plan: the planned path. ghost: a disc or ball at the robot's planned
-        position, or its hand's. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind,
-        averaged over the last fifth of a second. measured: the last measured states, if they differ from the true
-        states. tube: the states predicted under the disturbances, within 2 standard deviations, if there is a
-        `rollout.tube` and as far as it is not too wide. cost_tube: ellipsoids of low total cost. funnel: its projection
-        onto the position, pale between its knots. caption: time, tracking error, clearance, disturbances, whether the
-        run is in the funnel.
+      overlays: what is drawn over the scene, of `view.OVERLAY_KINDS`.
       solution: the solution that was run, for `cost_tube`; one for all runs, or one for each.
       funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and compression of the video.

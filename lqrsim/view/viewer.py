@@ -31,6 +31,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
+from lqrsim.view.geoms import appending_to
 from lqrsim.view.recorded_trial import model_of
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
@@ -242,14 +243,9 @@ class Window(Viewer):
 
     def show(self, time: float, qpos: Array) -> Array:
         place, scene = super().show(time, qpos), self._viewer.user_scn
-
-        def new() -> mujoco.MjvGeom:
-            scene.ngeom += 1
-            return scene.geoms[scene.ngeom - 1]
-
         with self._viewer.lock():
             scene.ngeom = 0
-            self.draw_overlays(new)
+            self.draw_overlays(appending_to(scene))
         self._viewer.set_texts((None, None, self.caption, None))
         return place
 

@@ -2,22 +2,20 @@
 
 import abc
 import copy
-import itertools
 import time as clock
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.view.overlays import PLAN_RGB, decorate
+from lqrsim.view import geoms
+from lqrsim.view.overlays import Line, MovingBody, colour_of
 from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
-PLANNED_RGBA = (*PLAN_RGB, 0.25)
+GHOST_OPACITY = 0.25
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # number of segments of the plan; the trace has twice as many
 LIFT = 0.008  # m, height of lines above the floor
@@ -197,19 +195,23 @@ class Viewer(abc.ABC):
         """The planned place now, (3,)."""
         return self._on_floor([np.interp(self._time, self._times, column) for column in self._places.T])
 
-    def draw_overlays(self, new: Callable[[], mujoco.MjvGeom]) -> None:
+    def draw_overlays(self, new: geoms.NewGeom) -> None:
         """Draw the plan, the trace and the planned place; `new` returns a new geom."""
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
-        plan = [self._on_floor(self._places[knot]) for knot in knots]
-        width = 0.002 * float(self.model.stat.extent)
-        for points, thick, colour in ((plan, 0.6 * width, (*PLAN_RGB, 1.0)), (self._trace, width, TRACE_RGBA)):
-            for ends in itertools.pairwise(points):
-                geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
-                mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
+        plan = np.array([self._on_floor(self._places[knot]) for knot in knots])
+        width, colour, flat = 0.002 * float(self.model.stat.extent), colour_of("plan"), self.space.from_above
         radius = self.radius if self._balls is None else float(self._balls.radii[-1])
-        flat = self.space.from_above
-        shape = (Geom.mjGEOM_CYLINDER, [radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [radius] * 3)
-        decorate(new(), *shape, self.planned_position(), PLANNED_RGBA)
+        drawables = [
+            Line(name="plan", points=plan, rgba=(*colour, 1.0), profile=(0.6 * width, 0.6 * width)),
+            Line(name="trace", points=np.array(self._trace), rgba=TRACE_RGBA, profile=(width, width)),
+            MovingBody(
+                name="ghost", kind="cylinder" if flat else "sphere", size=np.array([radius, LIFT, 0.0]),
+                rotation=np.eye(3), times=np.zeros(1), places=self.planned_position()[None],
+                rgba=(*colour, GHOST_OPACITY),
+            ),
+        ]  # fmt: skip
+        for drawable in drawables:
+            geoms.draw(drawable, self._time, new, emission=0.0)
 
     def aim_camera(self, camera: mujoco.MjvCamera) -> None:
         """Aim a free camera as the scene's `overview` camera, if it has one."""
