@@ -24,11 +24,7 @@ LETTER_HEIGHTS = 44, 54  # numbers of lines of text in the height of a picture, 
 
 
 class Caption:
-    """The caption of one run, a strip above its part of the picture, where it covers nothing.
-
-    Attributes:
-      height: in pixels, the same at all times.
-    """
+    """The caption of one run, a strip of constant height above its part of the picture, where it covers nothing."""
 
     def __init__(self, overlays: Overlays, box: Box, title: str | None, speed: float) -> None:
         recorded, run = overlays.recorded, overlays.recorded.rollout
@@ -82,11 +78,7 @@ class Caption:
 
 
 class Legend:
-    """The legend of all runs, a strip below them.
-
-    Attributes:
-      height: in pixels; 0 for an empty legend.
-    """
+    """The legend of all runs, a strip below them; its height in pixels is 0 if it is empty."""
 
     def __init__(self, overlays: Sequence[Overlays], size: tuple[int, int]) -> None:
         entries = legend_entries(overlays)

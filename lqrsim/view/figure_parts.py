@@ -67,11 +67,8 @@ class TubeArea(NamedTuple):
 class Views:
     """What views of a robot show: obstacles about it, tubes, paths, balls, and objects that it moved.
 
-    A planar robot is seen in its plane, a robot in space from above and from its longer side.
-
     Attributes:
       title: of each view; where there are two, with its direction.
-      space: coordinates of the robot; without a position, it is seen in the world's axes.
       radius: of the robot, in metres.
       places: (k, 2 or 3), which the views contain.
       planes: of each view, the axes of the places that it shows.
@@ -294,11 +291,7 @@ class MovedObject(NamedTuple):
 
 
 def moved_objects(rollout: Rollout, trial: int) -> list[MovedObject]:
-    """The objects that moved in this trial: kinematic trees that are not the robot's, and that no actuator moves.
-
-    Raises:
-      InputError: the rollout's model cannot be compiled, or lacks a part that was recorded.
-    """
+    """The objects that moved in this trial: kinematic trees that are not the robot's, and that no actuator moves."""
     frames = rollout.frames[trial]
     frames = frames[np.isfinite(frames).all(axis=1)]
     if len(frames) < 2:

@@ -54,7 +54,7 @@ def render_html(
     solution: Solution | None = None,
     funnel: Funnel | None = None,
 ) -> Path:
-    """Write a run as one HTML file, which any browser of 2023 or newer plays without a network.
+    """Write a run as one HTML file, which any browser of 2023 or newer plays without a network; returns its path.
 
     The page shows the scene from all sides, the robot, and the overlays of `render`; it has a time line, and a list of
     the trials with their outcomes. The file has 16 bits for the range of each coordinate, so that places in a run
@@ -68,12 +68,8 @@ def render_html(
       solution: the solution that was run, for `cost_tube`.
       funnel: a funnel about the plan of the run, for the overlay `funnel`.
 
-    Returns:
-      The path.
-
     Raises:
-      InputError: there is no such trial, nothing of it can be drawn, an overlay lacks its solution or funnel, or the
-        file cannot be written.
+      InputError: an overlay lacks its solution or funnel, or nothing of a trial can be drawn.
     """
     path = check_path("path", path)
     if path.suffix.lower() != ".html":

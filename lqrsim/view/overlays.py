@@ -5,7 +5,6 @@ Each is drawn by MuJoCo (`geoms.py`), by a page in a browser (`html_file.py`) an
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,27 +33,25 @@ DOTS = 30  # number of latest measured states that are drawn
 ARROW = 4.0  # length of the largest force's arrow, in radii of the robot: longer than the robot, and no path
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Drawable:
     """Something in the world, in metres and seconds.
 
     Attributes:
       name: of the overlay, of a part of it, or of an obstacle that moves.
-      rgba: colour and opacity.
-      label: its text in the legend.
+      label: in the legend; none if empty.
     """
 
     name: str
     rgba: tuple[float, float, float, float]
-    label: str = ""
+    label: str
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Line(Drawable):
-    """A line through points (k, 3).
+    """A line through points (k, 3), with half its width and half its thickness as profile.
 
     Attributes:
-      profile: half its width, and half its thickness.
       times: (k,) at which it gets to its points; None for a line that is always whole.
       colours: (k-1, 4) of its segments, by the map of the tracking error; None if all have `rgba`.
     """
@@ -74,7 +71,7 @@ class Line(Drawable):
         return points, colours[: len(points) - 1]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Dots(Drawable):
     """Boxes of half sizes (3,) at points (k, 3), each for some `seconds` from its time (k,) on."""
 
@@ -89,7 +86,7 @@ class Dots(Drawable):
         return self.points[(age >= 0) & (age < self.seconds - 1e-9)]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class DrawnTube(Drawable):
     """Ellipsoids at knots (k,) of the plan: centres (k, 3), half axes (k, 3), and rotations (k, 3, 3) of their axes."""
 
@@ -99,7 +96,7 @@ class DrawnTube(Drawable):
     rotations: Array
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class MovingBody(Drawable):
     """A body of a geom's kind, size (3,) and rotation (3, 3), at places (k, 3) at times (k,), and between them."""
 
@@ -114,14 +111,9 @@ class MovingBody(Drawable):
         return interpolated(self.places, self.times, times)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Arrow(Drawable):
-    """The arrow of a force (T, 3) in each period, which begins `gap` away from the robot, where it would be hidden.
-
-    Attributes:
-      width: of the shaft's radius.
-      metres_per_newton: length of the arrow.
-    """
+    """The arrow of a force (T, 3) in each period, `width` thick, which begins `gap` from the robot, to be seen."""
 
     forces: Array
     gap: float
@@ -181,10 +173,6 @@ class Overlays:
     Attributes:
       drawables: in the order of the legend.
       membership: (T+1) whether the run is in the funnel at each step, as text; None without the overlay.
-
-    Raises:
-      InputError: the solution or the funnel is missing or does not belong to the run; the solution has no total cost,
-        or the funnel does not include the position.
     """
 
     def __init__(
@@ -202,22 +190,8 @@ class Overlays:
         self.recorded, self.scale = recorded, scale
         self.membership: tuple[str, ...] | None = None
         self._lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
-        steps = recorded.rollout.plan.steps
-        knots = np.unique(np.linspace(0, steps, min(steps, segments) + 1).astype(int))
-        self._knots = recorded.rollout.times[knots]
-        tube = [*self._tube()] if "tube" in show else []
-        self._width = 0.0035 * recorded.model.stat.extent * (SLIM if tube else 1.0)
-        drawn = {
-            "plan": self._plan, "forces": self._forces, "measured": self._measured, "tube": lambda: tube,
-            "cost_tube": lambda: self._cost_tube(solution), "funnel": lambda: self._funnel(funnel),
-            "trace": self._trace, "ghost": self._ghost,
-        }  # fmt: skip
-        self.drawables: list[Drawable] = [part for name, draw in drawn.items() if name in show for part in draw()]
-        self.drawables += self._moving()
-
-    def named(self, name: str) -> list[Drawable]:
-        """The drawables of this name."""
-        return [drawable for drawable in self.drawables if drawable.name == name]
+        self._funnel = None if "funnel" not in show else self._checked(funnel)
+        self.drawables = [*self._draw(show, solution, segments), *self._moving()]
 
     def readings(self, time: float, speed: float = 1.0) -> list[str]:
         """Time, error, clearance and force at a time, and whether the run is in the funnel or has ended."""
@@ -230,113 +204,69 @@ class Overlays:
             texts.append(f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m")
         if np.isfinite(clearance):
             texts.append(f"clearance {clearance:.2f} m")
-        if self.named("forces"):
+        if any(isinstance(drawable, Arrow) for drawable in self.drawables):
             texts.append(f"force {np.linalg.norm(recorded.force_at(time)):.2f} N")
         if self.membership is not None:
             texts.append(self.membership[recorded.step(time)])
         return texts + ([ending.replace("_", " ")] if (ending := recorded.ending(time)) else [])
 
-    def _plan(self) -> Iterator[Line]:
-        points = self.recorded.planned(self._knots) + 2 * self._lift
-        yield Line(
-            name="plan", points=points, rgba=(*colour_of("plan"), 1.0), label="planned", profile=self._profile(0.8)
-        )
+    def _draw(self, show: Sequence[Overlay], solution: Solution | None, segments: int) -> Iterator[Drawable]:
+        """The overlays but texts, in the order of the legend."""
+        recorded, run, planar, lift = self.recorded, self.recorded.rollout, self.recorded.planar, self._lift
+        knots = np.unique(np.linspace(0, run.plan.steps, min(run.plan.steps, segments) + 1).astype(int))
+        times, position = run.times[knots], list(run.state_coordinates.position)
+        tube = None
+        if "tube" in show and run.tube is not None and run.tube.max() >= 1e-12:
+            ellipsoids = Ellipsoids.predicted(run.plan.states[:, position], run.tube)
+            tube = self._joined("tube", colour_of("tube"), ellipsoids.label, ellipsoids, height=0.6)
+        width = 0.0035 * recorded.model.stat.extent * (1.0 if tube is None else SLIM)
 
-    def _trace(self) -> Iterator[Line]:
-        recorded = self.recorded
-        errors, full = np.interp(self._knots, recorded.times, recorded.error), self.scale.error
-        said = f"{1e3 * full:g} mm" if full < 1 else f"{full:g} m"
-        if recorded.rollout.tracking_unit == OF_RANGE:
-            said = f"{100 * full:g} % of range"
-        yield Line(
-            name="trace",
-            points=recorded.driven(self._knots) + self._lift,
-            times=self._knots,
-            colours=error_colours(0.5 * (errors[1:] + errors[:-1]) / full),
-            rgba=DRIVEN,
-            label=f"driven, tracking error 0 to {said}",
-            profile=self._profile(2.6 if recorded.planar else 1.1),
-        )
+        def profile(relative: float) -> tuple[float, float]:  # on a floor, lines are flat
+            return relative * width, 0.2 * LIFT if planar else relative * width
 
-    def _profile(self, relative: float) -> tuple[float, float]:
-        """The profile of a line, which is flat on a floor."""
-        width = relative * self._width
-        return width, 0.2 * LIFT if self.recorded.planar else width
-
-    def _measured(self) -> Iterator[Dots]:
-        recorded = self.recorded
-        points = recorded.measured_places()
-        if len(points) and not np.array_equal(recorded.measured, recorded.states):
-            width, thickness = self._profile(1.0)
-            yield Dots(
-                name="measured",
-                points=points + 3 * self._lift,
-                times=recorded.times,
-                half_sizes=(width, width, thickness),
-                seconds=DOTS * recorded.rollout.plan.dt,
-                rgba=(*colour_of("measured"), 1.0),
-                label="measured",
-            )
-
-    def _ghost(self) -> Iterator[MovingBody]:
-        recorded, times = self.recorded, self.recorded.rollout.times
-        places, planar = recorded.planned(times), recorded.planar
-        if planar:
-            places[:, 2] = recorded.floor + 3 * LIFT
-        yield MovingBody(
-            name="ghost",
-            kind="cylinder" if planar else "sphere",
-            size=np.array([recorded.ghost_radius, LIFT, 0.0]),
-            rotation=np.eye(3),
-            times=times,
-            places=places,
-            rgba=(*colour_of("ghost"), GHOST_OPACITY[planar]),
-        )
+        if "plan" in show:
+            yield Line("plan", opaque("plan"), "planned", recorded.planned(times) + 2 * lift, profile(0.8))
+        if "forces" in show and self.scale.force >= 1e-6:
+            gap = min(run.radius, 0.1 * recorded.model.stat.extent)  # the radius of an arm is its reach
+            label, longest = f"force, longest {self.scale.force:.2g} N", ARROW * gap
+            thick, for_newton = max(0.1 * gap, 1.5 * width), longest / self.scale.force
+            yield Arrow("forces", opaque("forces"), label, recorded.force, gap, thick, for_newton)
+        points = recorded.measured_places() + 3 * lift
+        if "measured" in show and len(points) and not np.array_equal(recorded.measured, recorded.states):
+            sizes, seconds = (width, *profile(1.0)), DOTS * run.plan.dt
+            yield Dots("measured", opaque("measured"), "measured", points, recorded.times, sizes, seconds)
+        if tube is not None:
+            yield tube
+        if "cost_tube" in show:
+            ellipsoids = self._of_cost(solution)
+            yield self._joined("cost_tube", colour_of("cost_tube"), OF_COST, ellipsoids, height=0.3)
+        if self._funnel is not None:
+            yield from self._draw_funnel(self._funnel)
+        if "trace" in show:
+            errors, full = np.interp(times, recorded.times, recorded.error), self.scale.error
+            end = f"{1e3 * full:g} mm" if full < 1 else f"{full:g} m"
+            end = f"{100 * full:g} % of range" if run.tracking_unit == OF_RANGE else end
+            colours = error_colours(0.5 * (errors[1:] + errors[:-1]) / full)
+            points, wide = recorded.driven(times) + lift, profile(2.6 if planar else 1.1)
+            yield Line("trace", DRIVEN, f"driven, tracking error 0 to {end}", points, wide, times, colours)
+        if "ghost" in show:
+            places, kind = recorded.planned(run.times), "cylinder" if planar else "sphere"
+            if planar:
+                places[:, 2] = recorded.floor + 3 * LIFT
+            rgba, size = (*colour_of("ghost"), GHOST_OPACITY[planar]), np.array([recorded.ghost_radius, LIFT, 0.0])
+            yield MovingBody("ghost", rgba, "", kind, size, np.eye(3), run.times, places)
 
     def _moving(self) -> Iterator[MovingBody]:
         """The obstacles that move, except planes, which have no thickness; infinite ones reach far beyond the scene."""
-        moving, longest, end = self.recorded.rollout.moving, 10 * self.recorded.model.stat.extent, self.recorded.end
-        if moving is None:
-            return
-        each = zip(
-            moving.names, moving.kinds, moving.positions, moving.velocities, moving.sizes, moving.rotations, strict=True
-        )
-        for name, kind, begin, velocity, size, rotation in each:
-            if kind != "plane":
-                yield MovingBody(
-                    name=f"moving {name}",
-                    kind=kind,
-                    size=np.minimum(size, longest),
-                    rotation=rotation,
-                    times=np.array([0.0, end]),
-                    places=np.stack([begin, begin + end * velocity]),
-                    rgba=MOVING,
-                )
+        moving, times = self.recorded.rollout.moving, np.array([0.0, self.recorded.end])
+        for i, kind in enumerate(() if moving is None else moving.kinds):
+            if moving is not None and kind != "plane":
+                size = np.minimum(moving.sizes[i], 10 * self.recorded.model.stat.extent)
+                places = moving.positions[i] + times[:, None] * moving.velocities[i]
+                name = f"moving {moving.names[i]}"
+                yield MovingBody(name, MOVING, "", kind, size, moving.rotations[i], times, places)
 
-    def _forces(self) -> Iterator[Arrow]:
-        recorded, largest = self.recorded, self.scale.force
-        if largest >= 1e-6:
-            # The radius of an arm is its reach.
-            radius = min(recorded.rollout.radius, 0.1 * recorded.model.stat.extent)
-            yield Arrow(
-                name="forces",
-                forces=recorded.force,
-                gap=radius,
-                width=max(0.1 * radius, 1.5 * self._width),
-                metres_per_newton=ARROW * radius / largest,
-                rgba=(*colour_of("forces"), 1.0),
-                label=f"force, longest {largest:.2g} N",
-            )
-
-    def _tube(self) -> Iterator[DrawnTube]:
-        """The predicted tube, if it has a width."""
-        run = self.recorded.rollout
-        if run.tube is not None and run.tube.max() >= 1e-12:
-            ellipsoids = Ellipsoids.predicted(run.plan.states[:, list(run.state_coordinates.position)], run.tube)
-            every = np.arange(len(ellipsoids.centres))
-            yield self._joined("tube", colour_of("tube"), ellipsoids, every, label=ellipsoids.label, height=0.6)
-
-    def _cost_tube(self, solution: Solution | None) -> Iterator[DrawnTube]:
+    def _of_cost(self, solution: Solution | None) -> Ellipsoids:
         """The ellipsoids in which the solution's total cost is near its minimum."""
         run = self.recorded.rollout
         if solution is None:
@@ -345,17 +275,18 @@ class Overlays:
             raise InputError("overlays: got cost_tube for a robot without a position, want other overlays")
         if not np.array_equal(solution.trajectory.states, run.plan.states):
             raise InputError("solution: got a plan other than the run's, want the Solution that was run")
-        ellipsoids = Ellipsoids.of_cost(solution, run.state_coordinates.position)
-        every = np.arange(len(ellipsoids.centres))
-        yield self._joined("cost_tube", colour_of("cost_tube"), ellipsoids, every, label=OF_COST, height=0.3)
+        return Ellipsoids.of_cost(solution, run.state_coordinates.position)
 
-    def _funnel(self, funnel: Funnel | None) -> Iterator[DrawnTube]:
-        """The projection of a funnel onto the position, from its first knot to its last, wherever it has a level."""
-        run = self.recorded.rollout
+    def _checked(self, funnel: Funnel | None) -> Funnel:
         if funnel is None:
             raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
-        if not np.array_equal(funnel.plan.states, run.plan.states):
+        if not np.array_equal(funnel.plan.states, self.recorded.rollout.plan.states):
             raise InputError("funnel: got a funnel about another plan, want a funnel about the plan of the run")
+        return funnel
+
+    def _draw_funnel(self, funnel: Funnel) -> Iterator[DrawnTube]:
+        """The projection of a funnel onto the position, from its first knot to its last, wherever it has a level."""
+        run, planar = self.recorded.rollout, self.recorded.planar
         covariances = funnel.position_covariance / SIGMAS**2  # gives the half axes at the level
         ellipsoids = Ellipsoids(run.plan.states[:, list(run.state_coordinates.position)], covariances)
         levels, knots = np.array([funnel.level(t) for t in run.times]), np.arange(len(run.times))
@@ -370,37 +301,37 @@ class Overlays:
         if len(certified):
             certified = certified[np.linspace(0, len(certified) - 1, min(MOST_ELLIPSOIDS, len(certified))).astype(int)]
             label = f"funnel: {100 * funnel.rate:g} % succeed, confidence {100 * funnel.confidence:g} %"
-            rgba = (*colour_of("funnel"), CERTIFIED_OPACITY[self.recorded.planar])
-            yield self._in_world(ellipsoids, certified, height=0.2, name="funnel", label=label, rgba=rgba)
+            rgba = (*colour_of("funnel"), CERTIFIED_OPACITY[planar])
+            yield DrawnTube("funnel", rgba, label, *self._in_world(ellipsoids, certified, 0.2))
         if len(between):
-            options = {"label": "funnel, interpolated", "opacity": INTERPOLATED_OPACITY}
-            yield self._joined("interpolated", INTERPOLATED, ellipsoids, between, height=0.1, **options)
+            opacity, label = INTERPOLATED_OPACITY, "funnel, interpolated"
+            yield self._joined("interpolated", INTERPOLATED, label, ellipsoids, between, height=0.1, opacity=opacity)
 
     def _joined(
         self,
         name: str,
         colour: Colour,
-        ellipsoids: Ellipsoids,
-        among: npt.NDArray[np.int64],
-        *,
         label: str,
+        ellipsoids: Ellipsoids,
+        among: npt.NDArray[np.int64] | None = None,
+        *,
         height: float,
         opacity: Mapping[bool, float] = TUBE_OPACITY,
     ) -> DrawnTube:
-        """Some of the ellipsoids at these knots. If they overlap, their joint opacity is about the given one."""
+        """Some of the ellipsoids, of those `among` the knots. If they overlap, their joint opacity is about this."""
+        among = np.arange(len(ellipsoids.centres)) if among is None else among
         part = Ellipsoids(ellipsoids.centres[among], ellipsoids.covariances[among])
         chosen = part.spread(MOST_ELLIPSOIDS)
         apart = np.linalg.norm(np.diff(part.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)
         overlap = 2 * float(part.axes()[0][chosen].mean()) / apart if apart > 0 else 1.0
         # Ellipsoids that hardly overlap must not be too opaque: they would show as stripes on the lines within.
         each = 1 - (1 - opacity[self.recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
-        rgba = (*colour, float(each))
-        return self._in_world(ellipsoids, among[chosen], height=height, name=name, label=label, rgba=rgba)
+        return DrawnTube(name, (*colour, float(each)), label, *self._in_world(ellipsoids, among[chosen], height))
 
     def _in_world(
-        self, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], *, height: float, **named: Any
-    ) -> DrawnTube:
-        """The ellipsoids at these knots, at this height above a floor in units of LIFT."""
+        self, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], height: float
+    ) -> tuple[npt.NDArray[np.int64], Array, Array, Array]:
+        """Knots, centres, half axes and rotations of the ellipsoids, at this height above a floor in units of LIFT."""
         space = self.recorded.rollout.state_coordinates
         size, count = len(space.position), len(knots)
         lengths, turns = (part[knots] for part in ellipsoids.axes())
@@ -410,7 +341,7 @@ class Overlays:
         if size == 2:  # the third axis of a flat ellipsoid
             rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
         centres = space.in_world(ellipsoids.centres[knots], height=self.recorded.floor) + height * self._lift
-        return DrawnTube(knots=knots, centres=centres, half_axes=half_axes, rotations=rotations, **named)
+        return knots, centres, half_axes, rotations
 
 
 def colour_of(overlay: Overlay) -> Colour:
@@ -418,6 +349,11 @@ def colour_of(overlay: Overlay) -> Colour:
     colour = OVERLAY_KINDS[overlay].colour
     assert colour is not None
     return colour
+
+
+def opaque(overlay: Overlay) -> tuple[float, float, float, float]:
+    """The colour of an overlay that hides what is behind it."""
+    return (*colour_of(overlay), 1.0)
 
 
 def legend_entries(overlays: Iterable[Overlays]) -> dict[str, Colour | None]:

@@ -28,12 +28,9 @@ DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups t
 
 
 class SceneRenderer:
-    """Draws a trial into an OpenGL context of its own; to be used with `with`, after OpenGL is bound.
+    """Draws views of a trial, in panes of a picture; to be used with `with`, as it holds an OpenGL context.
 
     MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
-
-    Args:
-      views: views and their panes, in a picture of `size`.
     """
 
     def __init__(self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]) -> None:
@@ -178,11 +175,7 @@ QUALITIES: dict[Quality, QualitySettings] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureOptions:
-    """The arguments of these names of `render` and `render_still`, which explain them.
-
-    Raises:
-      InputError: a text, a name or a size is wrong. `open_picture` checks everything that depends on the runs.
-    """
+    """The arguments of these names of `render`; `open_picture` checks everything that depends on the runs."""
 
     trial: int | Sequence[int] = 0
     camera: str = "overview"
@@ -233,11 +226,7 @@ class RunPart:
 
 @contextlib.contextmanager
 def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> Iterator["Picture"]:
-    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts.
-
-    Raises:
-      InputError: an option does not fit the runs, captions fill the picture, or there is no OpenGL.
-    """
+    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts."""
     (width, height), camera, insets = options.pixels, options.camera, options.insets
     distinct, shown = _runs_and_trials(runs, options.trial)
     recordings = [RecordedTrial(distinct[number], row) for number, row in shown]
@@ -330,12 +319,7 @@ class Picture:
 class LivePicture:
     """Draws one running trial, with its plan: opened at the first frame, and redrawn for each.
 
-    Args:
-      camera: as in `render`, except "chase", which needs the whole run.
-      size: as in `render`.
-
-    Raises:
-      InputError: the camera or the size is wrong.
+    The camera may be any of `render` but "chase", which needs the whole run.
     """
 
     def __init__(self, camera: str, size: tuple[int, int]) -> None:
@@ -350,9 +334,6 @@ class LivePicture:
 
         Args:
           so_far: returns the run so far; called when the picture is opened.
-
-        Raises:
-          InputError: there is no such camera, or no OpenGL.
         """
         if self._picture is None:
             self._picture = self._stack.enter_context(open_picture(so_far(), self._options))
@@ -370,7 +351,7 @@ def _checked_size(size: Any) -> tuple[int, int]:
     pixels = check_items("size", size, object, "a width and a height in pixels", at_most=2)
     if len(pixels) != 2:
         raise InputError(f"size: got {excerpt(size)}, want a width and a height in pixels")
-    width, height = (check_count("size", one, at_least=64, at_most=LARGEST) for one in pixels)
+    width, height = (check_count("size", side, at_least=64, at_most=LARGEST) for side in pixels)
     if width % 2 or height % 2:
         raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
     return width, height

@@ -61,9 +61,6 @@ def plot_run(
       world: the obstacles, such as `scene.world`.
       trial: row of each rollout.
       style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
-
-    Raises:
-      InputError: the rollouts are of other systems, there is no such style, or the file cannot be written.
     """
     _check(solution, rollouts, trial, world)
     with styles.figure(path, style=style) as figure:
@@ -297,8 +294,7 @@ def plot_policy(
       style: as in `plot_run`.
 
     Raises:
-      InputError: the solution has no policy, the tube is of another plan or has no position, there is no such style, or
-        the file cannot be written.
+      InputError: the solution has no policy, or the tube is of another plan or has no position.
     """
     check_kind("solution", solution, Solution, "a Solution")
     world = World() if world is None else world
@@ -441,9 +437,6 @@ def plot_funnel(
       world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
       style: as in `plot_run`.
-
-    Raises:
-      InputError: the position is not among the funnel's states, there is no such style, or the file cannot be written.
     """
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     check_kind("world", world, World, "a World, such as scene.world")

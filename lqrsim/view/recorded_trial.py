@@ -23,15 +23,13 @@ Triangles = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]  # vertices (v
 
 @dataclass(frozen=True, eq=False)
 class DrawnGeom:
-    """A geom as pictures outside of MuJoCo draw it, in its own axes.
+    """A geom as pictures outside of MuJoCo draw it, in its own axes, with its number in the model.
 
     Attributes:
-      number: its number in the model.
-      kind: its type in the words of the MJCF, such as "capsule".
-      size: (3,) as in the MJCF, in metres; a plane without an end is twice as wide as the scene.
-      colour: (4,) red, green, blue and opacity; of a texture, the mean.
-      moves: whether its body is not fixed to the world.
-      triangles: of a mesh, a height field or a signed distance function; None for the other kinds.
+      kind: in the words of the MJCF, such as "capsule".
+      size: (3,) as in the MJCF; a plane without an end is twice as wide as the scene.
+      colour: (4,); of a texture, the mean.
+      triangles: of a mesh, a height field or a signed distance function.
     """
 
     number: int
@@ -47,15 +45,12 @@ class RecordedTrial:
     """A trial. A diverged trial stands still from its last finite state on.
 
     Attributes:
-      model: the model to draw.
       robot: number of the robot's body in the model.
       planar: whether the robot is seen from above, with its overlays on the floor.
       floor: height of the ground below the robot in the first frame, in metres.
       size: radius in metres of what stands for the robot at its position; see `drawn_size`.
-      end: end of the plan, in seconds.
-      times: (k,) times of the finite states.
-      states, measured: (k, n).
-      error, clearance: (k,) in metres.
+      end: of the plan, in seconds.
+      times: (k,) of the finite states, with `states`, `measured`, `error` and `clearance`.
       force: (T, 3) in N, averaged over FORCE_WINDOW.
     """
 
@@ -176,13 +171,10 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     hide_hulls(model)
     robot_body(model, rollout.body)
     if rollout.balls is not None and (rollout.balls.anchors[:, 0] >= model.nbody).any():
-        raise InputError(
-            f"rollout.balls.anchors: got a body that the model does not have, want one of its {model.nbody}"
-        )
-    if model.nq != rollout.frames.shape[-1]:
-        raise InputError(
-            f"rollout.frames: got {rollout.frames.shape[-1]} numbers a frame, want {model.nq}, as the model has"
-        )
+        wanted = f"want one of its {model.nbody}"
+        raise InputError(f"rollout.balls.anchors: got a body that the model does not have, {wanted}")
+    if model.nq != (numbers := rollout.frames.shape[-1]):
+        raise InputError(f"rollout.frames: got {numbers} numbers a frame, want {model.nq}, as the model has")
     if (geoms := rollout.obstacle_geoms) is not None:
         if (geoms >= model.ngeom).any():
             raise InputError(f"rollout.obstacle_geoms: got {geoms.max()}, want numbers below {model.ngeom}")
@@ -208,7 +200,7 @@ def with_sky(xml: str) -> str:
 
 def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:
     """The geoms of a model that MuJoCo's own pictures show."""
-    found = []
+    geoms = []
     for geom in range(model.ngeom):
         colour, size = _colour(model, geom), model.geom_size[geom].copy()
         if model.geom_group[geom] >= SHOWN_GROUPS or colour[3] == 0:
@@ -224,8 +216,8 @@ def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:
         if kind == "hfield":
             triangles = _surface(model, shape)
         name, moves = model.geom(geom).name or f"geom {geom}", model.body_weldid[model.geom_bodyid[geom]] != 0
-        found.append(DrawnGeom(geom, name, kind, size, colour, bool(moves), triangles))
-    return found
+        geoms.append(DrawnGeom(geom, name, kind, size, colour, bool(moves), triangles))
+    return geoms
 
 
 def _surface(model: mujoco.MjModel, field: int) -> Triangles:
@@ -259,7 +251,7 @@ def hide_hulls(model: mujoco.MjModel) -> None:
     """Do not draw colliding meshes of bodies that have other meshes, only for drawing, in the same place."""
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < 3)].tolist())
+    drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < SHOWN_GROUPS)].tolist())
     for geom in np.flatnonzero(is_mesh & collides).tolist():
         if int(model.geom_bodyid[geom]) in drawn:
             model.geom_rgba[geom, 3] = 0

@@ -43,7 +43,6 @@ def encoder(
       size: width and height.
       rate: frames per second.
       crf, preset: x264's settings of quality and compression.
-      metadata: text that is embedded in the file.
     """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:
@@ -92,8 +91,8 @@ def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pix
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="encoder") as executor:
         yield put
-        for one in waiting:
-            one.result()
+        for encoded in waiting:
+            encoded.result()
 
 
 FADE_SECONDS = 0.25
@@ -161,9 +160,6 @@ def render(
 
     Returns:
       The path. A notebook shows the video if the call is a cell's last expression.
-
-    Raises:
-      InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
     """
     path = _checked_path(path, ".mp4", ".gif")
     check_progress(progress)
@@ -214,8 +210,7 @@ def render_still(
 ) -> PictureFile:
     """Write a picture (png) of one moment.
 
-    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures. Everything
-    else, including exceptions, is as in `render`.
+    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures.
 
     Args:
       runs: one rollout, or several rollouts to be shown side by side.
@@ -234,9 +229,6 @@ def render_still(
 
     Returns:
       The path. A notebook shows the picture if the call is a cell's last expression.
-
-    Raises:
-      InputError: as in `render`.
     """
     path = _checked_path(path, ".png")
     options = PictureOptions(

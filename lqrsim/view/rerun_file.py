@@ -33,12 +33,7 @@ ENTITIES = {
 
 
 def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> None:
-    """Write a trial as FILE.rrd.
-
-    Raises:
-      InputError: there is no such trial, nothing of it can be drawn, the funnel has another plan or no position, the
-        file cannot be written, or the package is missing.
-    """
+    """Write a trial as FILE.rrd, with a funnel about its plan. Raises InputError if the package is missing."""
     path = check_path("path", path, "the path of a file")
     rerun, recorded = _package(path), RecordedTrial(rollout, trial)
     shown: tuple[Overlay, ...] = OVERLAYS if funnel is None else (*OVERLAYS, "funnel")

@@ -45,21 +45,16 @@ class Viewer(abc.ABC):
     """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
 
     Args:
-      model: the model to be shown.
-      plan: plan of the run.
       space: coordinates of the plan's states.
       body: name of the robot's body in the model.
-      radius: radius of the robot, in metres.
-      balls: the balls with their planned positions, for a robot without a position.
+      balls: with their planned positions, for a robot without a position.
       goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
       push: velocity that a key adds, in m/s.
-      speed: speed of the time shown; 1 is real time.
-      seconds: time after which the viewer closes; never by default.
+      speed: of the time shown; 1 is real time.
+      seconds: after which the viewer closes; never by default.
 
     Attributes:
-      data: the state that is shown.
-      caption: the state as lines of text.
-      remark: further lines of the caption.
+      data: the state that is shown, and its `caption` in lines, the last of which are the `remark`.
       wrench: force and torque (6,) of a drag.
       holds_goal: whether mouse and keys move the goal instead of the robot.
     """
@@ -201,16 +196,13 @@ class Viewer(abc.ABC):
         plan = np.array([self._on_floor(self._places[knot]) for knot in knots])
         width, colour, flat = 0.002 * float(self.model.stat.extent), colour_of("plan"), self.space.from_above
         radius = self.radius if self._balls is None else float(self._balls.radii[-1])
-        drawables = [
-            Line(name="plan", points=plan, rgba=(*colour, 1.0), profile=(0.6 * width, 0.6 * width)),
-            Line(name="trace", points=np.array(self._trace), rgba=TRACE_RGBA, profile=(width, width)),
-            MovingBody(
-                name="ghost", kind="cylinder" if flat else "sphere", size=np.array([radius, LIFT, 0.0]),
-                rotation=np.eye(3), times=np.zeros(1), places=self.planned_position()[None],
-                rgba=(*colour, GHOST_OPACITY),
-            ),
-        ]  # fmt: skip
-        for drawable in drawables:
+        kind, size = "cylinder" if flat else "sphere", np.array([radius, LIFT, 0.0])
+        place, now = self.planned_position()[None], np.zeros(1)
+        for drawable in (
+            Line("plan", (*colour, 1.0), "", plan, (0.6 * width, 0.6 * width)),
+            Line("trace", TRACE_RGBA, "", np.array(self._trace), (width, width)),
+            MovingBody("ghost", (*colour, GHOST_OPACITY), "", kind, size, np.eye(3), now, place),
+        ):
             geoms.draw(drawable, self._time, new, emission=0.0)
 
     def aim_camera(self, camera: mujoco.MjvCamera) -> None:
