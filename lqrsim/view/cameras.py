@@ -216,9 +216,7 @@ def _extent_points(recorded: RecordedTrial) -> Array:
         body, run = 0.0, np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3)])
         for time in np.linspace(recorded.end, 0, POSES):
             recorded.pose(data, float(time))
-            run = np.vstack(
-                [run, *(_corners(recorded, data, geom) for geom in np.flatnonzero(~fixed & shown).tolist())]
-            )
+            run = np.vstack([run, *(_corners(recorded, data, geom) for geom in links)])
     recorded.pose(data, 0.0)
     low, high = run.min(axis=0), run.max(axis=0)
     margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * body
