@@ -222,7 +222,7 @@ class View:
             if self.design_disturbances is not None:
                 check_designed((self.controller,))
             controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
-            disturbances = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
+            disturbances = [kind.scaled(self.disturbances) for kind in scenario.disturbances if self.disturbances]
 
             def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS if goal is None else f"{viewer.KEYS}\n{viewer.GOAL_KEYS}")
@@ -321,9 +321,9 @@ class Verify:
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:
-                found = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
+                verification = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
             else:
-                found = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
-        console.say(found.summary())
-        console.result(verification=as_json.of_verification(found))
-        return 0 if found.passed else 1
+                verification = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
+        console.say(verification.summary())
+        console.result(verification=as_json.of_verification(verification))
+        return 0 if verification.passed else 1

@@ -43,7 +43,7 @@ CERTIFIED = RUNS[0]
 LONG = 0.45  # height over width, below which a view is as wide as the figure
 
 
-class Path(NamedTuple):
+class DrawnPath(NamedTuple):
     """A path through points (k, 2 or 3), as a view shows it."""
 
     points: Array
@@ -84,7 +84,7 @@ class Views:
     radius: float
     places: Array
     planes: Sequence[tuple[int, int]]
-    paths: Sequence[Path]
+    paths: Sequence[DrawnPath]
     tubes: Sequence[TubeArea] = ()
     certified: Ellipsoids | None = None
     moved: Sequence["MovedObject"] = ()
@@ -115,7 +115,7 @@ class Views:
         views = [figure.add_subplot(place) for place in places]
         in_space = len(low) == 3
         for axes, plane in zip(views, self.planes, strict=True):
-            along = list(plane)
+            along, onto = list(plane), np.eye(len(low))[list(plane)]
             if in_space:
                 draw_projected(axes, self.world, low, high, *plane)
             else:
@@ -124,13 +124,12 @@ class Views:
             direction = f", from {'above' if plane == (0, 1) else 'the side'}"
             axes.set_title(self.title + direction * (in_space and not self.balls))
             for centre, radius, colour in self.balls:
-                axes.add_patch(
-                    Circle((centre[plane[0]], centre[plane[1]]), radius, facecolor=colour, edgecolor="none", zorder=2)
-                )
+                across, up = centre[along]
+                axes.add_patch(Circle((across, up), radius, facecolor=colour, edgecolor="none", zorder=2))
             for ellipsoids, label, face, edge in self.tubes:
-                draw_tube(axes, ellipsoids.seen_in(np.eye(len(low))[along]), label, face=face, edge=edge)
+                draw_tube(axes, ellipsoids.seen_in(onto), label, face=face, edge=edge)
             if self.certified is not None:
-                outlines = list(self.certified.seen_in(np.eye(len(low))[along]).outlines())
+                outlines = list(self.certified.seen_in(onto).outlines())
                 looks = {"facecolors": "none", "edgecolors": CERTIFIED, "linewidths": 1.6, "zorder": 2.8}
                 axes.add_collection(PolyCollection(outlines, label="certified", **looks))
             for path in self.paths:
@@ -175,7 +174,7 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
     # Contours of the planner's own distance, for any obstacles. Grid lines through obstacles keep the corners of walls
     # sharp, and those that are smaller than a cell.
     x, y = (
-        np.unique(np.append(np.linspace(low[i], high[i], CELLS), [_across(one, i) for one in flat.obstacles]))
+        np.unique(np.append(np.linspace(low[i], high[i], CELLS), [_across(obstacle, i) for obstacle in flat.obstacles]))
         for i in (0, 1)
     )
     distance = distances.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))

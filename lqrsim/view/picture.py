@@ -34,12 +34,8 @@ class SceneRenderer:
     """
 
     def __init__(self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]) -> None:
-        self.overlays, self.views, self.recorded, self.model = (
-            overlays,
-            views,
-            overlays.recorded,
-            overlays.recorded.model,
-        )
+        self.overlays, self.views = overlays, views
+        self.recorded, self.model = overlays.recorded, overlays.recorded.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
         most = 1000 + (MOST_ROBOTS + 1) * self.model.ngeom + len(overlays.drawables)
         self.scene = mujoco.MjvScene(self.model, maxgeom=most)

@@ -24,7 +24,7 @@ from lqrsim.scenes.world import World
 from lqrsim.view import figure_parts
 from lqrsim.view import style as styles
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
-from lqrsim.view.figure_parts import CERTIFIED, TubeArea, Views, moved_objects, planes_of
+from lqrsim.view.figure_parts import CERTIFIED, DrawnPath, TubeArea, Views, moved_objects, planes_of
 from lqrsim.view.style import LIMIT, LOOKS, PLAN, RUNS, Panel, Style, arrange, legend_below
 
 MOMENTS = 7  # number of times at which the balls of a robot are drawn
@@ -134,10 +134,10 @@ def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: Wo
     """The views of a robot with a position."""
     first, space = next(iter(rollouts.values())), solution.policy.state_coordinates
     driven = [
-        figure_parts.Path(run.places(trial), name, color, "-")
+        DrawnPath(run.places(trial), name, color, "-")
         for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
     ]
-    plan = figure_parts.Path(solution.trajectory.states[:, list(space.position)], "planned")
+    plan = DrawnPath(solution.trajectory.states[:, list(space.position)], "planned")
     moved = moved_objects(first, trial)
     of_world = ["xyz".index(letter) for letter in (space.plane if len(space.position) == 2 else "xyz")]
     shown = [thing.places[:, of_world] for thing in moved]
@@ -164,7 +164,7 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
     moments = np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))
     colours = [_paler(RUNS[0], 0.75 * (1 - i / (MOMENTS - 1))) for i in range(len(moments))]
     paths = [
-        figure_parts.Path(run.places(trial), name, color, "-", zorder=3)
+        DrawnPath(run.places(trial), name, color, "-", zorder=3)
         for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
     ]
     return Views(
@@ -175,7 +175,7 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
         places=np.zeros((0, 3)),
         limits=figure_parts.bounds(alive.reshape(-1, 3), world, float(radii.max()) + 0.1 * float(span.max())),
         planes=[(across, up)],
-        paths=[*paths, figure_parts.Path(first.planned_places, "planned", zorder=3)],
+        paths=[*paths, DrawnPath(first.planned_places, "planned", zorder=3)],
         balls=[
             (centre, float(radius), colour)
             for knot, colour in zip(moments, colours, strict=True)
@@ -213,7 +213,7 @@ def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> 
 def _controls(strips: list[Axes], solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> dict[str, Artist]:
     """The commanded controls over time; returns what the legend says of them."""
     space, plan = next(iter(rollouts.values())).control_coordinates, solution.trajectory
-    found: dict[str, Artist] = {}
+    legend: dict[str, Artist] = {}
     for number, axes in enumerate(strips):
         # Disturbed runs come first, so that the undisturbed one is not hidden.
         for (_, run), color in reversed(list(zip(rollouts.items(), RUNS, strict=False))):
@@ -221,16 +221,15 @@ def _controls(strips: list[Axes], solution: Solution, rollouts: Mapping[str, Rol
         axes.stairs(plan.controls[:, number], plan.times, color=PLAN, baseline=None, linestyle="--", linewidth=0.9)
         for limit in (space.low[number], space.high[number]):
             if np.isfinite(limit):
-                found["limit of a control"] = axes.axhline(
-                    limit, color=LIMIT, linewidth=0.9, linestyle=":", gid="limit"
-                )
+                line = axes.axhline(limit, color=LIMIT, linewidth=0.9, linestyle=":", gid="limit")
+                legend["limit of a control"] = line
         axes.set_title(space.names[number].replace("_", " "))
         axes.set_ylabel("command" + f"\n({space.units[number]})" * bool(space.units[number]))
         axes.margins(x=0.01, y=0.12)
         if len(set(space.units)) == 1:
             axes.label_outer(remove_inner_ticks=False)
     _share_time(strips)
-    return found
+    return legend
 
 
 def _share_time(strips: list[Axes]) -> None:
@@ -327,7 +326,7 @@ def draw_policy(
             tubes.append(TubeArea(ellipsoids, ellipsoids.label, **TUBE))
         elif solution.cost_to_come is not None:
             tubes.append(TubeArea(Ellipsoids.of_cost(solution, space.position), OF_COST, **COST_TUBE))
-        path = figure_parts.Path(plan, "planned", width=1.4 if tube is None else 0.9, zorder=3)
+        path = DrawnPath(plan, "planned", width=1.4 if tube is None else 0.9, zorder=3)
         title = "plan" if tube is None else "predicted tube"
         views = Views(
             title=title, space=space, world=world, radius=radius, places=plan, planes=planes_of(plan), paths=[path],
@@ -353,17 +352,17 @@ def draw_policy(
 
 def _drawn_together(solution: Solution) -> list[list[int]]:
     """The states of each strip: of one unit, and with ranges along the plan that can be seen beside one another."""
-    space, found = solution.policy.state_coordinates, list[list[int]]()
+    space, strips = solution.policy.state_coordinates, list[list[int]]()
     sizes = np.ptp(solution.trajectory.states, axis=0)
     for unit in dict.fromkeys(space.units):
         strip = list[int]()
-        for i in sorted((i for i, one in enumerate(space.units) if one == unit), key=lambda i: -sizes[i]):
+        for i in sorted((i for i, of in enumerate(space.units) if of == unit), key=lambda i: -sizes[i]):
             if strip and 0 < sizes[i] < FLAT * sizes[strip[0]]:
-                found.append(sorted(strip))
+                strips.append(sorted(strip))
                 strip = []
             strip.append(i)
-        found.append(sorted(strip))
-    return sorted(found)
+        strips.append(sorted(strip))
+    return sorted(strips)
 
 
 def _states(strips: list[Axes], together: list[list[int]], solution: Solution) -> None:
@@ -415,7 +414,7 @@ def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolic
 
 def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
     """Norm (T,) of a control's gains on the states of a unit: its largest response to a unit deviation."""
-    chosen = [number for number, one in enumerate(policy.state_coordinates.units) if one == unit]
+    chosen = [i for i, of_state in enumerate(policy.state_coordinates.units) if of_state == unit]
     return np.linalg.norm(policy.gain[:, control, chosen], axis=-1)
 
 
@@ -441,24 +440,29 @@ def plot_funnel(
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     check_kind("world", world, World, "a World, such as scene.world")
     radius = check_number("radius", radius, at_least=0.0)
-    covariances, space = funnel.position_covariance, funnel.state_coordinates
-    plan = funnel.plan.states[:, list(space.position)]
-    certified, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
-    reach = np.sqrt(np.diagonal(covariances[certified], axis1=1, axis2=2))
-    places = np.vstack([plan, plan[certified] - reach, plan[certified] + reach])  # certified outlines as a whole
-    shapes = covariances / SIGMAS**2  # gives the outlines at the level
-    views = Views(
-        title="funnel", space=space, world=world, radius=radius, places=places, planes=planes_of(places),
-        tubes=[TubeArea(Ellipsoids(plan[:last], shapes[:last]), "funnel, interpolated", FACE, EDGE)],
-        certified=Ellipsoids(plan[certified], shapes[certified]),
-        paths=[figure_parts.Path(plan, "planned", width=0.9, zorder=3)],
-    )  # fmt: skip
+    views = funnel_views(funnel, world, radius)
     with styles.figure(path, style=style) as figure:
         *parts, levels = arrange(figure, [*views.panels(style), Panel(1.4 * CURVE)], style)
         drawn = views.draw(figure, parts)
         _levels(figure.add_subplot(levels), funnel)
         legend_below(figure, _entries(drawn[0]))
     return Path(path)
+
+
+def funnel_views(funnel: Funnel, world: World, radius: float) -> Views:
+    """Views of a funnel's projection onto the position, with its certified outlines as a whole."""
+    covariances, space = funnel.position_covariance, funnel.state_coordinates
+    plan = funnel.plan.states[:, list(space.position)]
+    certified, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
+    reach = np.sqrt(np.diagonal(covariances[certified], axis1=1, axis2=2))
+    places = np.vstack([plan, plan[certified] - reach, plan[certified] + reach])
+    shapes = covariances / SIGMAS**2  # gives the outlines at the level
+    return Views(
+        title="funnel", space=space, world=world, radius=radius, places=places, planes=planes_of(places),
+        tubes=[TubeArea(Ellipsoids(plan[:last], shapes[:last]), "funnel, interpolated", FACE, EDGE)],
+        certified=Ellipsoids(plan[certified], shapes[certified]),
+        paths=[DrawnPath(plan, "planned", width=0.9, zorder=3)],
+    )  # fmt: skip
 
 
 def _levels(axes: Axes, funnel: Funnel) -> None:
