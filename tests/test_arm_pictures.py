@@ -16,7 +16,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.rollout import BallRecord
 from lqrsim.view import style, viewer
-from lqrsim.view.plots import MOMENTS, _path_of_balls
+from lqrsim.view.plots import MOMENTS, _of_balls
 from lqrsim.view.viewer_base import Viewer
 
 FLAT = {"size": (640, 480), "fps": 4}
@@ -93,8 +93,7 @@ def test_the_figure_has_the_balls_at_several_times(
     plan: ls.Solution, run: ls.Rollout, plant: ls.Plant, tmp_path: Path
 ) -> None:
     with style.figure(tmp_path / "axes.png", size=(5, 5)) as figure:
-        axes = figure.add_subplot()
-        _path_of_balls(axes, plan, {"run": run}, plant.scene.world, 0)
+        (axes,) = _of_balls(plan, {"run": run}, plant.scene.world, 0).draw(figure, [figure.add_gridspec()[0]])
         circles = [patch for patch in axes.patches if isinstance(patch, Circle)]
     assert run.balls is not None
     assert len(circles) == MOMENTS * 3 * LINK.count

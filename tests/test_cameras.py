@@ -15,7 +15,7 @@ import lqrsim as ls
 from lqrsim.results.rollout import BallRecord
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
-from lqrsim.view.overlays import MARK_RGB, draw_mark, mark_radius
+from lqrsim.view.geoms import MARK_RGB, draw_mark, mark_radius
 from lqrsim.view.recorded_trial import RecordedTrial, drawn_size
 from lqrsim.view.render import encoder
 from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read

@@ -413,9 +413,9 @@ def test_its_picture_shows_all_places_from_which_runs_are_certified(
     points = rng.standard_normal((3000, 12)) * rng.choice([0.1, 1.0], (3000, 12))
     points /= np.linalg.norm(points, axis=1)[:, None]
     places = one.states_at(knot, points, level)[:, :3]
-    for plane in ((0, 1), (0, 2)):
-        axes = Figure().add_subplot()
-        plots._shadow(axes, one, one.position_covariance, ls.World(), 0.3, plane)
+    views, figure = plots.funnel_views(one, ls.World(), 0.3), Figure()
+    grid = figure.add_gridspec(1, 2)
+    for plane, axes in zip(views.planes, views.draw(figure, [grid[0], grid[1]]), strict=True):
         for i, (low, high) in zip(plane, (axes.get_xlim(), axes.get_ylim()), strict=True):
             assert low < places[:, i].min()
             assert places[:, i].max() < high

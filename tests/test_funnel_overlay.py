@@ -14,7 +14,7 @@ from lqrsim.cli import main
 from lqrsim.verify.checks import EMPTY
 from lqrsim.view import gl
 from lqrsim.view.options import OVERLAYS, Overlay
-from lqrsim.view.overlays import BETWEEN, FUNNEL, Overlays, Scale
+from lqrsim.view.overlays import INTERPOLATED, DrawnTube, Overlays, Scale, colour_of, legend_entries
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 
@@ -47,7 +47,7 @@ def random_shapes(solution: ls.Solution, size: int) -> np.ndarray:
 
 
 def overlays_of(run: ls.Rollout, funnel: ls.types.Funnel) -> Overlays:
-    return Overlays(RecordedTrial(run, 0), None, ("funnel",), Scale(1.0, 1.0), funnel)
+    return Overlays(RecordedTrial(run, 0), ("funnel",), Scale(1.0, 1.0), funnel=funnel)
 
 
 def test_what_is_drawn_is_the_shadow_of_the_funnel(flown: tuple[ls.Rollout, ls.Solution]) -> None:
@@ -60,16 +60,14 @@ def test_what_is_drawn_is_the_shadow_of_the_funnel(flown: tuple[ls.Rollout, ls.S
     size, n = len(run.state_coordinates.position), len(run.state_coordinates)
     knots, levels = (5, 60, 100), (0.5, 1.5, 0.0)
     funnel = funnel_by_hand(solution, random_shapes(solution, n), knots=knots, levels=levels)
-    drawn = overlays_of(run, funnel).funnel
-    assert drawn is not None
-    assert drawn.certified is not None
-    assert drawn.between is not None
-    assert drawn.certified.knots.tolist() == [5, 60]  # none where the level is 0
-    between = drawn.between.knots
+    tubes = [tube for tube in overlays_of(run, funnel).drawables if isinstance(tube, DrawnTube)]
+    certified, between = (tube.knots for tube in tubes)
+    assert certified.tolist() == [5, 60]  # none where the level is 0
     assert (between.min(), between.max()) == (6, 99)  # and none before the first knot or after the last one
     assert 60 not in between
-    for tube in (drawn.certified, drawn.between):
-        for knot, centre, half_axes, rotation in zip(tube.knots, *tube.in_world, strict=True):
+    for tube in tubes:
+        each = tube.knots, tube.centres, tube.half_axes, tube.rotations
+        for knot, centre, half_axes, rotation in zip(*each, strict=True):
             assert centre[:size] == pytest.approx(run.plan.states[knot, :size])
             np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
             curve, level = np.linalg.inv(funnel.shape[knot]), np.interp(knot, knots, levels)
@@ -83,26 +81,25 @@ def test_what_is_drawn_is_the_shadow_of_the_funnel(flown: tuple[ls.Rollout, ls.S
 
 def test_what_the_legend_says(flight: ls.Rollout, quadrotor_solution: ls.Solution) -> None:
     """What is drawn, and nothing of what is not: one knot has nothing between, and without levels there is nothing."""
-    certified, between = ("funnel: 90 % succeed, confidence 95 %", FUNNEL), ("funnel, interpolated", BETWEEN)
+    certified = ("funnel: 90 % succeed, confidence 95 %", colour_of("funnel"))
+    between = ("funnel, interpolated", INTERPOLATED)
     for knots, levels, said in (
         ((0, 9), (1.0, 1.0), [certified, between]),
         ((4,), (1.0,), [certified]),
         ((0, 9), (0.0, 0.0), []),
     ):
         overlays = overlays_of(flight, funnel_by_hand(quadrotor_solution, 0.01 * np.eye(3), knots=knots, levels=levels))
-        assert overlays.legend_entries() == said
+        assert list(legend_entries([overlays]).items()) == said
 
 
 def test_the_caption_says_where_the_run_is(drive: ls.Rollout, drive_solution: ls.Solution) -> None:
     """Against the distance to the plan: the funnel is a disc of 5 cm, from 2 s to 10 s."""
     funnel = funnel_by_hand(drive_solution, np.eye(2), knots=(12, 60), levels=(0.05, 0.05))
-    drawn = overlays_of(drive, funnel).funnel
-    assert drawn is not None
     off = np.linalg.norm((drive.states[0] - drive.plan.states)[:, :2], axis=1)
     expected = ["in the funnel" if one < 0.05 else "outside the funnel" for one in off]
     expected[:12] = ["no funnel here"] * 12
     expected[61:] = ["no funnel here"] * (len(off) - 61)
-    assert list(drawn.said) == expected
+    assert overlays_of(drive, funnel).membership == tuple(expected)
     assert set(expected) == {"in the funnel", "outside the funnel", "no funnel here"}
     assert funnel.left_at(drive)[0] == pytest.approx(expected.index("outside the funnel") / 6)
 

@@ -217,8 +217,10 @@ def test_obstacles_that_move(rollout: ls.Rollout, tmp_path: Path) -> None:
         velocities=np.full((3, 3), 0.5),
     )  # fmt: skip
     page = Page(ls.view.render_html(replace(rollout, moving=moving), tmp_path / "run.html", trial=0))
-    ball, bar = page.data["moving"]
-    assert (ball["kind"], ball["size"], ball["place"], ball["velocity"]) == ("sphere", [0.2] * 3, [0, 1, 2], [0.5] * 3)
+    _, ball, bar = page.data["bodies"]  # the first is the planned place
+    assert (ball["kind"], ball["size"]) == ("sphere", [0.2] * 3)
+    places = np.array([0.0, 1.0, 2.0]) + 0.5 * rollout.times[:, None]
+    np.testing.assert_allclose(page.numbers(ball["places"]), places, atol=1e-3)  # 16 bits of metres
     assert bar["kind"] == "cylinder"
     assert np.isfinite(bar["size"]).all()
     assert bar["size"][1] > 5 * model_from_xml(rollout.model, "model").stat.extent
@@ -267,7 +269,7 @@ def test_a_funnel_and_the_cost(folder: Path, rollout: ls.Rollout, tmp_path: Path
     files = ["--funnel", str(tmp_path / "funnel.npz"), "--solution", str(folder / "solution.npz")]
     assert main([*command, *files]) == 0
     page = Page(path)
-    between, certified, _ = page.data["tubes"]
+    _, certified, between = page.data["tubes"]
     np.testing.assert_allclose(page.numbers(certified["sizes"])[:, :size], [[0.25] * size, [0.125] * size], rtol=1e-6)
     assert page.numbers(between["sizes"])[:, :size].max() < 0.25
     assert any("funnel" in label for label, _ in page.data["legend"])

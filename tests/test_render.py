@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import av
 import mujoco
@@ -20,7 +21,7 @@ from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.captions import Legend
 from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay
-from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
+from lqrsim.view.overlays import DrawnTube, Overlays, Scale, colour_of, legend_entries
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.render import render, render_still
@@ -46,6 +47,10 @@ def rollout(request: pytest.FixtureRequest) -> ls.Rollout:
 
 
 BARE: tuple[Overlay, ...] = tuple(one for one in OVERLAYS if one != "caption")  # the whole picture is one pane
+
+
+def overlays_of(run: ls.Rollout, *show: Overlay, **options: Any) -> Overlays:
+    return Overlays(RecordedTrial(run, 0), show, Scale(1.0, 1.0), **options)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -382,12 +387,12 @@ def test_predicted_tube_has_the_half_axes_of_its_covariance(flight: ls.Rollout, 
     for run, size in ((flight, 3), (drive, 2)):
         factors = 0.1 * rng.normal(size=(len(run.times), size, size))
         tube = factors @ factors.transpose(0, 2, 1)
-        assert Overlays(RecordedTrial(run, 0), None, ("tube",), Scale(1.0, 1.0)).tube is None
-        recorded = RecordedTrial(dataclasses.replace(run, tube=tube), 0)
-        overlays = Overlays(recorded, None, ("tube",), Scale(1.0, 1.0))
-        assert overlays.tube is not None
-        assert [text for text, colour in overlays.legend_entries() if colour == TUBE] == [overlays.tube.label]
-        for knot, centre, half_axes, rotation in zip(overlays.tube.knots, *overlays.tube.in_world, strict=True):
+        assert overlays_of(run, "tube").drawables == []
+        (drawn,) = overlays_of(dataclasses.replace(run, tube=tube), "tube").drawables
+        assert isinstance(drawn, DrawnTube)
+        assert drawn.label.startswith("predicted: 2 sigma, 95 % in each direction")
+        each = drawn.knots, drawn.centres, drawn.half_axes, drawn.rotations
+        for knot, centre, half_axes, rotation in zip(*each, strict=True):
             assert centre[:size] == pytest.approx(run.plan.states[knot, :size])
             np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(rotation) == pytest.approx(1)
@@ -435,10 +440,10 @@ def test_what_legends_say_of_tubes_is_said_once(drive: ls.Rollout) -> None:
     assert wide.rollout.tube is not None
     wide.rollout.tube.setflags(write=True)
     wide.rollout.tube[:50] = 0.01 * np.eye(2)
-    overlays = [Overlays(one, None, ("tube",), Scale(1.0, 1.0)) for one in (narrow, wide)]
-    said = [text for one in overlays for text, _ in one.legend_entries()]
-    assert said[1].startswith(f"{said[0]}; drawn up to ")
-    both, second = (Legend(shown, Scale(1.0, 1.0), (640, 360)) for shown in (overlays, overlays[1:]))
+    overlays = [Overlays(one, ("tube",), Scale(1.0, 1.0)) for one in (narrow, wide)]
+    whole, part = (one.drawables[0].label for one in overlays)
+    assert part.startswith(f"{whole}; drawn up to ")
+    both, second = (Legend(shown, (640, 360)) for shown in (overlays, overlays[1:]))
     assert both.tile is not None
     assert second.tile is not None
     np.testing.assert_array_equal(both.tile, second.tile)
@@ -458,16 +463,17 @@ def test_tube_of_the_cost_is_the_shadow_of_what_the_total_cost_allows(
     flight: ls.Rollout, quadrotor_solution: ls.Solution
 ) -> None:
     """Against the cost: of all states with a position on the ellipsoid its least is 2 above the least of all."""
-    overlays = Overlays(RecordedTrial(flight, 0), quadrotor_solution, ("cost_tube",), Scale(1.0, 1.0))
-    assert overlays.cost_tube is not None
-    assert overlays.legend_entries() == [("2 sigma of the cost: total ≤ least + 2", COST_TUBE)]
+    overlays = overlays_of(flight, "cost_tube", solution=quadrotor_solution)
+    (tube,) = overlays.drawables
+    assert isinstance(tube, DrawnTube)
+    assert legend_entries([overlays]) == {"2 sigma of the cost: total ≤ least + 2": colour_of("cost_tube")}
     go, come = quadrotor_solution.cost_to_go, quadrotor_solution.cost_to_come
     assert go is not None
     assert isinstance(come, ls.types.Moments)
-    knots = overlays.cost_tube.knots
+    knots = tube.knots
     assert (knots[0], knots[-1]) == (0, flight.plan.steps)
     for number in (3, 12, 20):
-        centre, half_axes, rotation = (part[number] for part in overlays.cost_tube.in_world)
+        centre, half_axes, rotation = tube.centres[number], tube.half_axes[number], tube.rotations[number]
         knot = knots[number]
         hessian = go.hessian[knot] + np.linalg.inv(come.covariance[knot])
         shown, hidden = hessian[:3, :3], hessian[3:, 3:]

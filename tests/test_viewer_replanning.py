@@ -21,7 +21,7 @@ from viewers import Recorder, said, said_after, viewing
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.view import viewer
-from lqrsim.view.overlays import PLAN_RGB
+from lqrsim.view.overlays import colour_of
 from lqrsim.view.viewer import MovableGoal, model_with_goal
 from lqrsim.view.viewer_base import PUSHES
 
@@ -137,7 +137,7 @@ def test_the_plan_in_force_is_drawn(moved: Run) -> None:
         return geoms[-1]
 
     moved.screen.draw_overlays(new)
-    last = [geom for geom in geoms if np.allclose(geom.rgba, (*PLAN_RGB, 1.0))][-1]
+    last = [geom for geom in geoms if np.allclose(geom.rgba, (*colour_of("plan"), 1.0))][-1]
     ends = last.pos + np.outer((-1, 1), last.size[2] * last.mat[:, 2])
     planned = moved.planners[0].active.plan.trajectory.states[-1, :3]
     assert np.linalg.norm(ends - planned, axis=1).min() < 1e-6

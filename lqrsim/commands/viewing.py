@@ -2,15 +2,15 @@
 
 import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional
-from lqrsim.view.options import OVERLAYS, Overlay, Quality
+from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
     from lqrsim.control.replanner import LiveReplanner
@@ -51,10 +51,13 @@ class Render:
     """More cameras, in panes beside the first. top and side are calibrated, and show a mark on the robot."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
     """Title of each run. By default the robot and the scene."""
-    overlays: Annotated[tuple[Overlay, ...], arg(metavar="NAME ...")] = OVERLAYS
-    """Drawn over the scene: plan, ghost, trace, forces, measured, caption. tube: the predicted tube under the run's
-    disturbances, 2 sigma, if there is one. cost_tube: where the total cost is near its minimum; it needs --solution.
-    funnel: the funnel about the plan; it needs --funnel."""
+    overlays: Annotated[
+        tuple[Overlay, ...],
+        arg(
+            metavar="NAME ...",
+            help="Drawn over the scene. " + " ".join(f"{name}: {kind.words}." for name, kind in OVERLAY_KINDS.items()),
+        ),
+    ] = OVERLAYS
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
     """Solution of the runs, one for all or one each, for cost_tube."""
     funnel: Annotated[tuple[Path, ...], optional("FUNNEL ...")] = ()
@@ -79,73 +82,65 @@ class Render:
         from lqrsim.results.funnel import Funnel
         from lqrsim.results.rollout import Rollout
         from lqrsim.results.solution import Solution
+        from lqrsim.view import html_file, rerun_file
         from lqrsim.view.render import render, render_still
 
         if not self.rollouts:
             raise InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
         out = self.out or self.rollouts[0].with_suffix(".mp4")
-        if out.suffix.lower() in (".html", ".rrd"):
-            return self._for_viewer(out)
-        is_still = out.suffix.lower() == ".png"
-        if out.suffix.lower() not in (".mp4", ".gif", ".png"):
-            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
-        if not is_still and (self.time is not None or self.every is not None):
-            raise InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
+        self._check_options(out)
         console.check_output("--out", out.parent, out.name)
         runs = [save_load.load(path, Rollout) for path in self.rollouts]
         if self.overlays != OVERLAYS and "tube" in self.overlays:
             for path in (path for path, run in zip(self.rollouts, runs, strict=True) if run.tube is None):
                 console.say(f"no tube in {path}: none was predicted for it")
-        solutions = [save_load.load(path, Solution) for path in self.solution]
-        funnels = [save_load.load(path, Funnel) for path in self.funnel]
-        rows = (0,) if self.trial is None else self.trial
-        options = {
-            "trial": rows[0] if len(rows) == 1 else rows, "camera": self.camera, "insets": self.inset,
-            "titles": self.title, "overlays": self.overlays, "quality": self.quality, "size": self.size,
-            "solution": solutions[0] if len(solutions) == 1 else solutions or None,
-            "funnel": funnels[0] if len(funnels) == 1 else funnels or None,
-        }  # fmt: skip
-        drawn = runs[0] if len(runs) == 1 else runs
-        if is_still:
-            render_still(drawn, out, time=self.time, every=self.every, **options)
-        else:
-            with console.progress("rendering", "frame") as progress:
-                render(drawn, out, fps=self.fps, speed=self.speed, progress=progress, **options)
+        solution = _one_or_all([save_load.load(path, Solution) for path in self.solution])
+        funnel = _one_or_all([save_load.load(path, Funnel) for path in self.funnel])
+        drawn, rows = _one_or_all(runs), 0 if self.trial is None else _one_or_all(self.trial)
+        content = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
+        look = {"trial": rows, "camera": self.camera, "insets": self.inset, "titles": self.title}
+        look |= {"quality": self.quality, "size": self.size}
+        match out.suffix.lower():
+            case ".html":
+                html_file.render_html(drawn, out, trial=self.trial, **content)
+            case ".rrd":
+                rerun_file.write(drawn, out, trial=rows, funnel=funnel)
+            case ".png":
+                render_still(drawn, out, time=self.time, every=self.every, **content, **look)
+            case _:
+                with console.progress("rendering", "frame") as progress:
+                    render(drawn, out, fps=self.fps, speed=self.speed, progress=progress, **content, **look)
         console.wrote(out)
         return 0
 
-    def _for_viewer(self, out: Path) -> int:
-        """Write one run for those who choose camera and time themselves: a page, or a recording for Rerun's viewer."""
-        from lqrsim.commands import console
+    def _check_options(self, out: Path) -> None:
+        """Raise InputError for another kind of file, or for options that do not belong to its kind."""
         from lqrsim.errors import InputError
-        from lqrsim.results import save_load
-        from lqrsim.results.funnel import Funnel
-        from lqrsim.results.rollout import Rollout
-        from lqrsim.results.solution import Solution
-        from lqrsim.view import html_file, rerun_file
 
-        is_page, own, rows = out.suffix.lower() == ".html", ["rollouts", "out", "trial", "funnel"], self.trial
-        if is_page:
-            own += ["overlays", "solution"]
-        given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
+        kind = out.suffix.lower()
+        if kind in (".mp4", ".gif") and (self.time is not None or self.every is not None):
+            raise InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
+        if kind in (".mp4", ".gif", ".png"):
+            return
+        if kind not in (".html", ".rrd"):
+            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
+        # Whoever opens such a file chooses the camera and the time.
+        is_page = kind == ".html"
+        taken = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if is_page else [])]
+        others = [f"--{f.name}" for f in fields(self) if f.name not in taken and getattr(self, f.name) != f.default]
         several = max(len(self.rollouts), len(self.solution), len(self.funnel)) > 1
-        if given or several or not (is_page or rows is None or len(rows) == 1):
+        if others or several or not (is_page or self.trial is None or len(self.trial) == 1):
             what = "runs, solutions or funnels" if is_page else "runs, trials or funnels, or none"
-            got = ", ".join(f"--{name}" for name in given) or f"several {what}"
-            want = "one run, at most one --solution and --funnel, and of other options --trial and --overlays"
-            want = want if is_page else "one run, one --trial, at most one --funnel, and no other options"
+            got = ", ".join(others) or f"several {what}"
+            want = "one run, one --trial, at most one --funnel, and no other options"
+            if is_page:
+                want = "one run, at most one --solution and --funnel, and of other options --trial and --overlays"
             raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
-        console.check_output("--out", out.parent, out.name)
-        rollout = save_load.load(self.rollouts[0], Rollout)
-        funnel = save_load.load(self.funnel[0], Funnel) if self.funnel else None
-        if is_page:
-            solution = save_load.load(self.solution[0], Solution) if self.solution else None
-            options = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
-            html_file.render_html(rollout, out, trial=rows, **options)
-        else:
-            rerun_file.write(rollout, out, trial=0 if rows is None else rows[0], funnel=funnel)
-        console.wrote(out)
-        return 0
+
+
+def _one_or_all(items: Sequence[Any]) -> Any:
+    """A single item itself; None for no items."""
+    return items[0] if len(items) == 1 else items or None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +222,7 @@ class View:
             if self.design_disturbances is not None:
                 check_designed((self.controller,))
             controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
-            disturbances = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
+            disturbances = [kind.scaled(self.disturbances) for kind in scenario.disturbances if self.disturbances]
 
             def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS if goal is None else f"{viewer.KEYS}\n{viewer.GOAL_KEYS}")
@@ -326,9 +321,9 @@ class Verify:
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:
-                found = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
+                verification = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
             else:
-                found = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
-        console.say(found.summary())
-        console.result(verification=as_json.of_verification(found))
-        return 0 if found.passed else 1
+                verification = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
+        console.say(verification.summary())
+        console.result(verification=as_json.of_verification(verification))
+        return 0 if verification.passed else 1

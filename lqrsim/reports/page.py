@@ -1,6 +1,7 @@
 """The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
 
 import base64
+import contextlib
 import json
 import os
 import tempfile
@@ -15,7 +16,6 @@ from typing import Any
 import jinja2
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from PIL import Image
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, check_progress
@@ -42,15 +42,11 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLike[str]) -> Path:
     """Write a figure (png, pdf or svg) of each policy's success over strength, with a band; returns its path."""
-    with style.figure(path, size=SIZE) as figure:
-        axes = figure.add_subplot()
+    with _over_strength(curves, path, "trials that reached their goal (%)") as axes:
         for number, (policy, points) in enumerate(curves.items()):
-            strengths = [point.cell.strength for point in points]
-            value, low, high = 100 * np.array([(p.band.value, p.band.low, p.band.high) for p in points]).T
-            _draw(axes, number, policy, strengths, (low, value, high))
-        axes.set(xlabel="strength", ylabel="trials that reached their goal (%)", ylim=(-3, 103))
-        axes.set_yticks(np.linspace(0, 100, 6))
-        _finish(figure, axes, curves)
+            band = 100 * np.array([(point.band.low, point.band.value, point.band.high) for point in points]).T
+            _draw(axes, number, policy, [point.cell.strength for point in points], band)
+        axes.set(ylim=(-3, 103), yticks=np.linspace(0, 100, 6))
     return Path(path)
 
 
@@ -59,10 +55,9 @@ def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.Path
 
     Args:
       curves: policy -> strength -> low, middle and high.
-      label: label of the vertical axis.
+      label: of the vertical axis.
     """
-    with style.figure(path, size=SIZE) as figure:
-        axes = figure.add_subplot()
+    with _over_strength(curves, path, label) as axes:
         disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
         known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
         decades = len(known) > 0 and known.max() > 100 * known.min()
@@ -75,12 +70,10 @@ def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.Path
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
-        axes.set(xlabel="strength", ylabel=label)
-        _finish(figure, axes, curves)
     return Path(path)
 
 
-def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: Sequence[Array] | Array) -> None:
+def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: Array) -> None:
     low, value, high = band
     colour = COLOURS[number % len(COLOURS)]
     axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
@@ -92,14 +85,19 @@ def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: 
     )  # fmt: skip
 
 
-def _finish(figure: Figure, axes: Axes, curves: Mapping[str, object]) -> None:
-    ticks = sorted({round(float(x), 12) for line in axes.lines for x in np.asarray(line.get_xdata())})
-    if len(ticks) <= 8:
-        axes.set_xticks(ticks)
-    axes.margins(x=0.02)
-    figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=min(len(curves), 4), handlelength=3)
-    rows = -(-len(curves) // 4)
-    figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * rows))
+@contextlib.contextmanager
+def _over_strength(curves: Mapping[str, object], path: str | os.PathLike[str], label: str) -> Iterator[Axes]:
+    """Axes of curves of policies over strength, which get ticks and a legend when the block ends."""
+    with style.figure(path, size=SIZE) as figure:
+        axes = figure.add_subplot()
+        axes.set(xlabel="strength", ylabel=label)
+        yield axes
+        ticks = sorted({round(float(x), 12) for line in axes.lines for x in np.asarray(line.get_xdata())})
+        if len(ticks) <= 8:
+            axes.set_xticks(ticks)
+        axes.margins(x=0.02)
+        figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=min(len(curves), 4), handlelength=3)
+        figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * -(-len(curves) // 4)))
 
 
 LARGEST = 1_500_000  # bytes, largest video
@@ -109,51 +107,45 @@ FPS = 15
 
 def videos_of_worst(results: Results, table: analysis.Table, count: int, folder: Path) -> Iterator[Any]:
     """A remark on all videos, and then each video."""
-    chosen = [
-        next((one for one in worst_trials(table, group) if one.outcome != "error"), None)
+    worst = [
+        next((trial for trial in worst_trials(table, group) if trial.outcome != "error"), None)
         for group in policies_and_sweeps(table)
     ]
-    chosen = [one for one in chosen if one is not None][:count]
-    problem = ""
-    if chosen:
-        try:
-            gl.bind()
-        except InputError as error:
-            problem = str(error)
+    chosen, problem = [trial for trial in worst if trial is not None][:count], ""
     if not chosen:
         yield "No videos were requested." if count == 0 else "There is no trial to render."
-    elif problem:
+        return
+    try:
+        gl.bind()
+    except InputError as error:
+        problem = str(error)
         yield f"There are none, for this machine cannot draw pictures: {problem}"
     else:
         yield (
             "The worst trial of each policy and sweep, alternating between policies, repeated from its number alone."
             " Line: the plan; trace: the path, coloured by tracking error."
         )
-    for one in chosen:
-        video = {
-            "label": _label(one),
-            "command": results.command_of("replay", "--cell", str(one.cell), "--trial", str(one.trial)),
-            "data": "",
-            "problem": problem,
-        }
-        yield video if problem else video | _video(results, one, folder)
+    for trial in chosen:
+        command = results.command_of("replay", "--cell", str(trial.cell), "--trial", str(trial.trial))
+        video = {"label": _label(trial), "command": command, "data": "", "problem": problem}
+        yield video if problem else video | _video(results, trial, folder)
 
 
-def _label(one: analysis.Trial) -> str:
-    what = f" with {one.obstacle}" if one.obstacle else ""
+def _label(trial: analysis.Trial) -> str:
+    what = f" with {trial.obstacle}" if trial.obstacle else ""
     return (
-        f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}:"
-        f" {one.outcome}{what} after {one.ended:.2f} s, least clearance {one.clearance:.3f} m."
+        f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}:"
+        f" {trial.outcome}{what} after {trial.ended:.2f} s, least clearance {trial.clearance:.3f} m."
     )
 
 
-def _video(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
+def _video(results: Results, trial: analysis.Trial, folder: Path) -> dict[str, Any]:
     """The video as text, or the reason why there is none."""
     from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
 
     try:
-        rollout = replay(results, one.cell, one.trial)
-        title = f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}"
+        rollout = replay(results, trial.cell, trial.trial)
+        title = f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}"
         for width, height in SIZES:
             path = render(rollout, folder / "video.mp4", titles=[title], size=(width, height), fps=FPS)
             if path.stat().st_size <= LARGEST:

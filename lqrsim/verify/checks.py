@@ -22,7 +22,7 @@ from lqrsim.scenes.mjcf_kinematics import posed
 from lqrsim.verify.verdict import Criterion, Positions, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
-from lqrsim.view.overlays import RIM
+from lqrsim.view.geoms import RIM
 from lqrsim.view.recorded_trial import model_of, place_in, robot_body
 from lqrsim.view.video_metadata import Pane, VideoMetadata
 

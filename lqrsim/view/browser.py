@@ -14,6 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -45,18 +46,20 @@ MOCAP, TIME = mujoco.mjtState.mjSTATE_MOCAP_POS.value, mujoco.mjtState.mjSTATE_T
 RELEASE_AFTER = 0.5  # s without a message, after which a drag counts as released
 
 
+@dataclass(eq=False)
 class _SceneUpdate(messages.Snapshot):
     """From the simulation to the viewer: overlays and caption."""
 
-    def __init__(self, geoms: list[mujoco.MjvGeom], caption: str) -> None:
-        self.geoms, self.caption = geoms, caption
+    geoms: list[mujoco.MjvGeom]
+    caption: str
 
 
+@dataclass(eq=False)
 class _KeyPress(messages.Event):
     """From the viewer to the simulation: a key that pushes the robot or moves the goal."""
 
-    def __init__(self, key: str, azimuth: float) -> None:
-        self.key, self.azimuth = key, azimuth
+    key: str
+    azimuth: float
 
 
 class _ViewerSide(plugin.ViewerPlugin):
@@ -125,12 +128,8 @@ class _SimulationSide(plugin.SimPlugin):
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_edit(self, event: messages.StateEvent) -> bool:
         owner, model, kinds = self.owner, self.owner.model, event.state_sig
-        if (
-            owner.goal_body
-            and kinds & MOCAP
-            and not kinds & TIME
-            and event.state.size == mujoco.mj_stateSize(model, kinds)
-        ):
+        is_drag = kinds & MOCAP and not kinds & TIME and event.state.size == mujoco.mj_stateSize(model, kinds)
+        if owner.goal_body and is_drag:
             mujoco.mj_setState(model, self.edited, event.state, kinds)
             owner.move_goal(owner.space.of_world(self.edited.mocap_pos[model.body_mocapid[owner.goal_body]]))
         return True  # the rest of the state belongs to the simulation
@@ -151,11 +150,8 @@ class Browser(Viewer):
     There can be only one in a process: MuJoCo's user interface is global, and a second viewer may crash.
 
     Args:
-      port: port of the server; 0 takes the first free port from 8080 on.
-      title: title of the page. The other arguments are the arguments of a Viewer.
-
-    Attributes:
-      port: port on which the server listens.
+      port: of the server; 0 takes the first free port from 8080 on.
+      title: of the page. The other arguments are a Viewer's.
 
     Raises:
       InputError: the port is taken, MuJoCo's version is not a tested one, or other machines can reach the server.
@@ -192,7 +188,6 @@ class Browser(Viewer):
 
     @property
     def instructions(self) -> str:
-        """Instructions for opening the page."""
         tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
         return (
             f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
@@ -205,14 +200,8 @@ class Browser(Viewer):
         return self._handle.is_running()
 
     def show(self, time: float, qpos: np.ndarray) -> np.ndarray:
-        place = super().show(time, qpos)
-        geoms: list[mujoco.MjvGeom] = []
-
-        def new() -> mujoco.MjvGeom:
-            geoms.append(mujoco.MjvGeom())
-            return geoms[-1]
-
-        self.draw_overlays(new)
+        place, geoms = super().show(time, qpos), list[mujoco.MjvGeom]()
+        self.draw_overlays(lambda: geoms.append(mujoco.MjvGeom()) or geoms[-1])
         self._handle.send_to_viewer(_SceneUpdate(geoms, self.caption))
         return place
 
@@ -315,14 +304,14 @@ def _check_private(port: int) -> None:
 
 def _other_addresses() -> list[str]:
     """Addresses of this machine at which a server on all interfaces answers, and ours must not."""
-    found = {"127.0.0.2", "::1"}  # a server on all interfaces answers there; a server on 127.0.0.1 does not
+    addresses = {"127.0.0.2", "::1"}  # a server on all interfaces answers there; a server on 127.0.0.1 does not
     with contextlib.suppress(OSError):
-        found |= {str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None)}
+        addresses |= {str(entry[4][0]) for entry in socket.getaddrinfo(socket.gethostname(), None)}
     for family, elsewhere in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect((elsewhere, 9))  # sends nothing, but selects the address that would be used
-            found.add(probe.getsockname()[0])
-    return sorted(found - {LOOPBACK})
+            addresses.add(probe.getsockname()[0])
+    return sorted(addresses - {LOOPBACK})
 
 
 def _request(path: str, host: str, origin: str | None, port: int) -> tuple[int, bool]:

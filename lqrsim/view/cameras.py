@@ -17,7 +17,7 @@ from lqrsim.errors import Array, InputError, check_name
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
-from lqrsim.view.recorded_trial import RecordedTrial
+from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial
 
 _Number = Annotated[float, Bounds()]
 Vector = tuple[_Number, _Number, _Number]
@@ -32,10 +32,7 @@ class Camera:
     Attributes:
       position: in metres; the line from here along `forward` meets the middle of the picture.
       forward, up: orthogonal unit vectors.
-      height: height of the picture, in metres of the world.
-
-    Raises:
-      InputError: a number is not finite, the vectors are no orthogonal unit vectors, or the height is not positive.
+      height: of the picture, in metres of the world.
     """
 
     name: Line
@@ -147,12 +144,7 @@ TURN_SECONDS = 0.8  # s, time over which the chase camera averages its direction
 
 @dataclass(frozen=True)
 class CameraView:
-    """A view of one trial.
-
-    Attributes:
-      place: function that sets the cameras of a scene, after its update, for a given time.
-      camera: the calibrated camera, if the view has one.
-    """
+    """A view of one trial: sets the cameras of a scene, after its update, for a time; and its calibrated camera."""
 
     place: Callable[[mujoco.MjvScene, mujoco.MjData, float], None]
     camera: Camera | None = None
@@ -169,11 +161,14 @@ def camera_view(
     Raises:
       InputError: there is no view of that name.
     """
-    model, of_model = recorded.model, _model_cameras(recorded)
+    model = recorded.model
+    of_model = [model.camera(number).name for number in range(model.ncam) if model.camera(number).name]
     check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
-    alike = [one for one in beside if one.rollout.model == recorded.rollout.model] or [recorded]
+    alike = [trial for trial in beside if trial.rollout.model == recorded.rollout.model] or [recorded]
     if name in CALIBRATED:
-        camera = (top if name == "top" else side)(recorded.rollout, aspect, around=around(alike))
+        runs = {id(trial.rollout): trial.rollout for trial in alike}
+        corners = np.vstack([corner for run in runs.values() for corner in _bounds(run)])
+        camera = (top if name == "top" else side)(recorded.rollout, aspect, around=corners)
         return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
     if name == "chase":
         return _chase(recorded)
@@ -182,18 +177,6 @@ def camera_view(
     view = mujoco.MjvCamera()
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(name).id
     return CameraView(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
-
-
-def _model_cameras(recorded: RecordedTrial) -> list[str]:
-    """The names of the model's cameras."""
-    names = (recorded.model.camera(number).name for number in range(recorded.model.ncam))
-    return [name for name in names if name]
-
-
-def around(alike: Sequence[RecordedTrial]) -> Array:
-    """Corners (k, 3) that a calibrated camera shows of these trials."""
-    runs = {id(one.rollout): one.rollout for one in alike}
-    return np.vstack([corner for run in runs.values() for corner in _bounds(run)])
 
 
 def _overview(recorded: RecordedTrial, like: int | None, aspect: float, alike: Sequence[RecordedTrial]) -> CameraView:
@@ -206,7 +189,7 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float, alike: S
         axes, field_of_view = data.cam_xmat[like].reshape(3, 3), float(model.cam_fovy[like])
         right, forward = axes[:, 0], -axes[:, 2]
     right = right / np.linalg.norm(right)
-    up, points = np.cross(right, forward), np.vstack([_extent_points(one) for one in alike])
+    up, points = np.cross(right, forward), np.vstack([_extent_points(trial) for trial in alike])
     # Far enough back to have every point within both angles of view.
     rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)
@@ -224,36 +207,31 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float, alike: S
 
 def _extent_points(recorded: RecordedTrial) -> Array:
     """Points (k, 3) of the run, and corners of fixed geoms that are near it."""
-    data = mujoco.MjData(recorded.model)
-    recorded.pose(data, 0.0)
-    model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    model, data = recorded.model, mujoco.MjData(recorded.model)
+    run = np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
+    fixed, shown = model.body_weldid[model.geom_bodyid] == 0, model.geom_group < SHOWN_GROUPS
+    surroundings, links = (np.flatnonzero(which & shown).tolist() for which in (fixed, ~fixed))
     body = recorded.rollout.radius
     if recorded.rollout.balls is not None:  # the links of an arm reach farther than the tracked point
-        body = 0.0
-        run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3), *_outer_points(recorded, data, signs)])
+        body, run = 0.0, np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3)])
+        for time in np.linspace(recorded.end, 0, POSES):
+            recorded.pose(data, float(time))
+            run = np.vstack([run, *(_corners(recorded, data, geom) for geom in links)])
+    recorded.pose(data, 0.0)
     low, high = run.min(axis=0), run.max(axis=0)
     margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * body
-    corners = [run]
-    for geom in np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < 3)):
-        middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE.value:  # a plane has no box, and may be infinite
-            middle, half = np.zeros(3), np.where(model.geom_size[geom] > 0, model.geom_size[geom], margin) * [1, 1, 0]
-        seen = data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
-        corners.append(np.clip(seen, low - margin, high + margin))
-    return np.vstack(corners)
+    corners = [_corners(recorded, data, geom, infinite=margin) for geom in surroundings]
+    return np.vstack([run, *(np.clip(points, low - margin, high + margin) for points in corners)])
 
 
-def _outer_points(recorded: RecordedTrial, data: mujoco.MjData, signs: Array) -> list[Array]:
-    """Corners of the boxes about the moving geoms at some times of the run; poses the data at its beginning."""
-    model, corners = recorded.model, list[Array]()
-    moving = np.flatnonzero((model.body_weldid[model.geom_bodyid] != 0) & (model.geom_group < 3))
-    for time in np.linspace(recorded.end, 0, POSES):
-        recorded.pose(data, float(time))
-        for geom in moving.tolist():
-            middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-            corners.append(data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T)
-    return corners
+def _corners(recorded: RecordedTrial, data: mujoco.MjData, geom: int, *, infinite: float = 0.0) -> Array:
+    """The corners (8, 3) of the box about a geom; a plane without an end has this half size."""
+    model = recorded.model
+    middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE.value:  # a plane has no box
+        middle, half = np.zeros(3), np.where(model.geom_size[geom] > 0, model.geom_size[geom], infinite) * [1, 1, 0]
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    return data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
 
 
 def _chase(recorded: RecordedTrial) -> CameraView:

@@ -13,10 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from lqrsim.results.goal import OF_RANGE
-from lqrsim.view.options import Box
-from lqrsim.view.overlays import Colour, Overlays, Scale, error_colours
-from lqrsim.view.recorded_trial import RecordedTrial
+from lqrsim.view.options import Box, Colour
+from lqrsim.view.overlays import Overlays, error_colours, legend_entries
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -26,25 +24,19 @@ LETTER_HEIGHTS = 44, 54  # numbers of lines of text in the height of a picture, 
 
 
 class Caption:
-    """The caption of one run, a strip above its part of the picture, where it covers nothing.
+    """The caption of one run, a strip of constant height above its part of the picture, where it covers nothing."""
 
-    Attributes:
-      height: in pixels, the same at all times.
-    """
-
-    def __init__(self, recorded: RecordedTrial, overlays: Overlays, box: Box, title: str | None, speed: float) -> None:
-        run = recorded.rollout
-        self.recorded, self.overlays, self.speed = recorded, overlays, speed
+    def __init__(self, overlays: Overlays, box: Box, title: str | None, speed: float) -> None:
+        recorded, run = overlays.recorded, overlays.recorded.rollout
+        self.overlays, self.speed, self.width = overlays, speed, box.width
         self.letter_height = _letter_height(box.width, box.height)
-        which = f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else ""
-        title = title or f"{recorded.name}{which}"
-        self.width = box.width
+        title = title or recorded.name + (f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else "")
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
         # Readings keep their place: next to the title in a strip that is wide enough, otherwise in separate lines.
         longest = self._readings_width(1)
         bare_title = text_tile((title,), self.letter_height, width=0)
         beside = bare_title.shape[1] + longest < self.width
-        most = len(self._readings(recorded.end))
+        most = len(overlays.readings(recorded.end, speed))
         self.lines = next((count for count in range(1, most) if self._readings_width(count) <= self.width), most)
         self.place = (self.width - longest, 0) if beside else (0, self.header.shape[0])
         self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
@@ -69,71 +61,27 @@ class Caption:
             readings = readings[: round(1.85 * self.letter_height)]  # up to the next line
         blend(area, readings, left=self.place[0], top=self.place[1])
 
-    def _readings_tile(self, time: float) -> Pixels:
-        return text_tile(self._in_lines(time, self.lines), self.letter_height, width=0, bold=False)
+    def _readings_tile(self, time: float, lines: int | None = None) -> Pixels:
+        """The readings, in at most this number of lines."""
+        readings = self.overlays.readings(time, self.speed)
+        count = min(lines or self.lines, len(readings))
+        cuts = [len(readings) * number // count for number in range(count + 1)]
+        texts = tuple("   ".join(readings[first:last]) for first, last in pairwise(cuts))
+        return text_tile(texts, self.letter_height, width=0, bold=False)
 
     def _readings_width(self, lines: int) -> int:
         """The width in pixels of the readings in this number of lines, with room for longer numbers."""
-        run, times = self.recorded.rollout, [0.0, self.recorded.end]
-        if (funnel := self.overlays.funnel) is not None:
-            times.append(float(run.times[funnel.said.index(max(funnel.said, key=len))]))
-        all_lines = (self._in_lines(time, lines) for time in times)
-        tiles = [text_tile(readings, self.letter_height, width=0, bold=False) for readings in all_lines]
-        return max(tile.shape[1] for tile in tiles) + 3 * self.letter_height
-
-    def _in_lines(self, time: float, most: int) -> tuple[str, ...]:
-        """The readings in at most this number of lines."""
-        readings = self._readings(time)
-        count = min(most, len(readings))
-        cuts = [len(readings) * number // count for number in range(count + 1)]
-        return tuple("   ".join(readings[first:last]) for first, last in pairwise(cuts))
-
-    def _readings(self, time: float) -> list[str]:
-        return readings(self.recorded, self.overlays, time, self.speed)
-
-
-def readings(recorded: RecordedTrial, overlays: Overlays, time: float, speed: float = 1.0) -> list[str]:
-    """Time, error, clearance and force at a time, and whether the run is in the funnel or has ended."""
-    clearance, error = (recorded.interpolate(values, time) for values in (recorded.clearance, recorded.error))
-    found = [f"time {time:.1f} s" + (f" at {speed:g}x" if speed != 1 else "")]
-    if recorded.rollout.tracking_unit == OF_RANGE:
-        found += [f"tracking error {100 * error:.1f} % of range"]
-    else:
-        found += [f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m"]
-    found += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
-    if "forces" in overlays.show:
-        found += [f"force {np.linalg.norm(recorded.force_at(time)):.2f} N"]
-    if overlays.funnel is not None:
-        found += [overlays.funnel.said[recorded.step(time)]]
-    return found + ([ending.replace("_", " ")] if (ending := recorded.ending(time)) else [])
-
-
-def legend_entries(overlays: Sequence[Overlays], scale: Scale) -> dict[str, Colour | None]:
-    """Labels and colours of a picture; the colour None is the map of the tracking error."""
-    named = dict(entry for one in overlays for entry in one.legend_entries())
-    # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
-    entries: dict[str, Colour | None] = {
-        text: colour
-        for text, colour in named.items()
-        if not any(other != text and other.startswith(text) for other in named)
-    }
-    if "trace" in overlays[0].show:
-        full = f"{1e3 * scale.error:g} mm" if scale.error < 1 else f"{scale.error:g} m"
-        if overlays[0].recorded.rollout.tracking_unit == OF_RANGE:
-            full = f"{100 * scale.error:g} % of range"
-        entries[f"driven, tracking error 0 to {full}"] = None
-    return entries
+        run, times = self.overlays.recorded.rollout, [0.0, self.overlays.recorded.end]
+        if (membership := self.overlays.membership) is not None:
+            times.append(float(run.times[membership.index(max(membership, key=len))]))
+        return max(self._readings_tile(time, lines).shape[1] for time in times) + 3 * self.letter_height
 
 
 class Legend:
-    """The legend of all runs, a strip below them.
+    """The legend of all runs, a strip below them; its height in pixels is 0 if it is empty."""
 
-    Attributes:
-      height: in pixels; 0 for an empty legend.
-    """
-
-    def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int]) -> None:
-        entries = legend_entries(overlays, scale)
+    def __init__(self, overlays: Sequence[Overlays], size: tuple[int, int]) -> None:
+        entries = legend_entries(overlays)
         letter_height = max(round(0.8 * _letter_height(*size)), 8)
         self.tile = legend_tile(tuple(entries.items()), letter_height, size[0]) if entries else None
         self.height = 0 if self.tile is None else self.tile.shape[0] + self.tile.shape[0] % 2

@@ -19,13 +19,10 @@ APART = 0.8  # distance between neighbours, in half axes
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoids:
-    """Ellipsoids at the knots of a plan, or at some of them.
+    """Ellipsoids at the knots of a plan, or at some of them: centres (k, d) and covariances (k, d, d).
 
     Attributes:
-      centres: (k, d).
-      covariances: (k, d, d).
-      end: largest half axis in metres that is drawn; from the first larger ellipsoid on, they are left out. None if all
-        are kept.
+      end: largest half axis in metres that is drawn, if ellipsoids are left out from the first larger one on.
     """
 
     centres: Array
@@ -45,9 +42,6 @@ class Ellipsoids:
         """The states whose total cost is at most `COST_ABOVE_LEAST` above its minimum, projected onto d of the states.
 
         The projection of an ellipsoid has the corresponding block of its covariance.
-
-        Raises:
-          InputError: the solution has no total cost.
         """
         total, chosen = solution.total_cost, list(states)
         return cls(total.minimizer()[:, chosen], total.covariance()[:, chosen][:, :, chosen])

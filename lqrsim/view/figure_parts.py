@@ -1,20 +1,28 @@
 """Common parts of figures: obstacles, a plan, predicted tubes, and chances of collision."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
+from matplotlib.patches import Circle
 from mpl_toolkits.mplot3d import Axes3D
 from scipy.spatial import ConvexHull
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.rollout import Rollout
+from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.scenes.world import Obstacle, World
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.moved_objects import MovedObject
-from lqrsim.view.style import MARGIN, PLAN, SOLID
+from lqrsim.view.recorded_trial import drawn_geoms, model_of, robot_body
+from lqrsim.view.style import AROUND, LOOKS, MARGIN, PLAN, RUNS, SOLID, Panel, Style
 
 EDGE = "#5b6470"
 OUTLINES = 24  # number of ellipses whose outlines are drawn
@@ -29,34 +37,116 @@ CELLS = 200  # across a view, of the grid on which obstacles' outlines are found
 RINGS = np.array([-1.1, -1.0, -0.8, 0.0, 0.8, 1.0, 1.1])  # grid lines through a small obstacle, in its half sizes
 NEAR = "closer than the robot's radius"
 THING = "#a6761d"  # colour of what a run moved
+MOVED = 0.01  # way of an object that counts as moved, relative to the extent of the robot's
+SHAPES = "sphere", "capsule", "cylinder", "box"  # other geoms are drawn as their bounding boxes
+CERTIFIED = RUNS[0]
+LONG = 0.45  # height over width, below which a view is as wide as the figure
 
 
-def draw_obstacles(
-    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: tuple[int, int]
-) -> None:
-    """Draw the obstacles around places (k, 2 or 3) of a robot of that radius.
+class DrawnPath(NamedTuple):
+    """A path through points (k, 2 or 3), as a view shows it."""
 
-    A planar robot has its own plane. A robot in space is seen along the third axis; `plane` has the two others.
+    points: Array
+    label: str
+    colour: str = PLAN
+    line: str = "--"
+    width: float = 1.4
+    zorder: float = 2.0
+
+
+class TubeArea(NamedTuple):
+    """A tube, and the colours of its area and of its outlines."""
+
+    ellipsoids: Ellipsoids
+    label: str
+    face: str
+    edge: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Views:
+    """What views of a robot show: obstacles about it, tubes, paths, balls, and objects that it moved.
+
+    Attributes:
+      title: of each view; where there are two, with its direction.
+      radius: of the robot, in metres.
+      places: (k, 2 or 3), which the views contain.
+      planes: of each view, the axes of the places that it shows.
+      certified: ellipsoids with a thick outline.
+      paths: the plan is last, on top, with marks at its ends.
+      balls: centres (3,) and radii of balls, with their colours.
+      limits: lowest and highest corner; by default around the places.
     """
-    low, span = extent(space, world, places, radius)
-    if len(space.position) == 2:
-        draw_in_plane(axes, world.seen_by(space.plane, space.offset), low, low + span, radius, plane=space.plane)
-    else:
-        draw_projected(axes, world, low, low + span, *plane)
+
+    title: str
+    space: Coordinates
+    world: World
+    radius: float
+    places: Array
+    planes: Sequence[tuple[int, int]]
+    paths: Sequence[DrawnPath]
+    tubes: Sequence[TubeArea] = ()
+    certified: Ellipsoids | None = None
+    moved: Sequence["MovedObject"] = ()
+    balls: Sequence[tuple[Array, float, str]] = ()
+    limits: tuple[Array, Array] | None = None
+
+    @property
+    def corners(self) -> tuple[Array, Array]:
+        """The lowest and the highest corner (2 or 3,) of what is shown."""
+        if self.limits is not None:
+            return self.limits
+        ways = np.nanmax(self.places, axis=0) - np.nanmin(self.places, axis=0)
+        margin = np.maximum(1.5 * self.radius, EMPTY * np.maximum(ways, FLAT * ways.max()))
+        margin = margin if self.radius or ways.any() else NOTHING
+        return bounds(self.places, self.world.seen_by(self.space.plane, self.space.offset), margin)
+
+    def panels(self, style: Style) -> list[Panel]:
+        """The panels of the views: wide ones if they are long."""
+        low, high = self.corners
+        shapes = [slenderness((high - low)[list(plane)]) for plane in self.planes]
+        wide, look = max(shapes) < LONG, LOOKS[style]
+        width = look.width / (1 if wide else look.columns) - AROUND[1] * look.text / 72
+        return [Panel(width * min(shape, 1.0), wide) for shape in shapes]
+
+    def draw(self, figure: Figure, places: Sequence[SubplotSpec]) -> list[Axes]:
+        """Draw a view at each of these places of a figure."""
+        low, high = self.corners
+        views = [figure.add_subplot(place) for place in places]
+        in_space = len(low) == 3
+        for axes, plane in zip(views, self.planes, strict=True):
+            along, onto = list(plane), np.eye(len(low))[list(plane)]
+            if in_space:
+                draw_projected(axes, self.world, low, high, *plane)
+            else:
+                flat = self.world.seen_by(self.space.plane, self.space.offset)
+                draw_in_plane(axes, flat, low, high, self.radius, plane=self.space.plane)
+            direction = f", from {'above' if plane == (0, 1) else 'the side'}"
+            axes.set_title(self.title + direction * (in_space and not self.balls))
+            for centre, radius, colour in self.balls:
+                across, up = centre[along]
+                axes.add_patch(Circle((across, up), radius, facecolor=colour, edgecolor="none", zorder=2))
+            for ellipsoids, label, face, edge in self.tubes:
+                draw_tube(axes, ellipsoids.seen_in(onto), label, face=face, edge=edge)
+            if self.certified is not None:
+                outlines = list(self.certified.seen_in(onto).outlines())
+                looks = {"facecolors": "none", "edgecolors": CERTIFIED, "linewidths": 1.6, "zorder": 2.8}
+                axes.add_collection(PolyCollection(outlines, label="certified", **looks))
+            for path in self.paths:
+                looks = {"color": path.colour, "linewidth": path.width, "zorder": path.zorder}
+                axes.plot(*path.points[:, along].T, path.line, label=path.label, **looks)
+            mark_ends(axes, self.paths[-1].points[:, along])
+            letters = "xyz" if in_space else self.space.plane
+            draw_moved(axes, self.moved, ["xyz".index(letters[i]) for i in along])
+        return views
 
 
-def extent(space: Coordinates, world: World, places: Array, radius: float) -> tuple[Array, Array]:
-    """The lowest corner (2 or 3,) of what is drawn around places of a robot of that radius, and its sizes."""
-    ways = np.nanmax(places, axis=0) - np.nanmin(places, axis=0)
-    margin = np.maximum(1.5 * radius, EMPTY * np.maximum(ways, FLAT * ways.max())) if radius or ways.any() else NOTHING
-    low, high = bounds(places, world.seen_by(space.plane, space.offset), margin)
-    return low, high - low
-
-
-def draw_plan(axes: Axes, path: Array, *, linewidth: float = 0.9) -> None:
-    """Draw a planned path (T+1, 2) with its start and its end."""
-    axes.plot(*path.T, "--", color=PLAN, linewidth=linewidth, zorder=3, label="planned")
-    mark_ends(axes, path)
+def planes_of(places: Array) -> list[tuple[int, int]]:
+    """The planes in which places (k, 2 or 3) are seen: from above and, in space, from their longer side."""
+    if places.shape[1] == 2:
+        return [(0, 1)]
+    x, y, _ = np.ptp(places, axis=0)
+    return [(0, 1), (0, 2) if x >= y else (1, 2)]
 
 
 def mark_ends(axes: Axes, path: Array) -> None:
@@ -84,7 +174,7 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
     # Contours of the planner's own distance, for any obstacles. Grid lines through obstacles keep the corners of walls
     # sharp, and those that are smaller than a cell.
     x, y = (
-        np.unique(np.append(np.linspace(low[i], high[i], CELLS), [_across(one, i) for one in flat.obstacles]))
+        np.unique(np.append(np.linspace(low[i], high[i], CELLS), [_across(obstacle, i) for obstacle in flat.obstacles]))
         for i in (0, 1)
     )
     distance = distances.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
@@ -183,18 +273,71 @@ def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
     return np.tensordot(obstacle.rotation, local, axes=1) + obstacle.position[:, None, None]
 
 
+class MovedObject(NamedTuple):
+    """A body that is not driven: its centre of mass (F, 3) in each frame, and its geoms in the first and the last."""
+
+    name: str
+    path: Array
+    first: list[Obstacle]
+    last: list[Obstacle]
+
+    @property
+    def places(self) -> Array:
+        """Its path, and corners (k, 3) around its geoms."""
+        geoms = *self.first, *self.last
+        around = [geom.position + side * geom.size.max() for geom in geoms for side in (-1, 1)]
+        return np.vstack([self.path, *around])
+
+
+def moved_objects(rollout: Rollout, trial: int) -> list[MovedObject]:
+    """The objects that moved in this trial: kinematic trees that are not the robot's, and that no actuator moves."""
+    frames = rollout.frames[trial]
+    frames = frames[np.isfinite(frames).all(axis=1)]
+    if len(frames) < 2:
+        return []
+    model = model_of(rollout, trial)
+    data = placed(model)
+    mujoco.mj_fwdPosition(model, data)  # which also finds what actuators move
+    driven = {int(model.body_treeid[robot_body(model, rollout.body)]), *model.dof_treeid[data.moment_colind].tolist()}
+    objects = [(tree, int(model.tree_bodyadr[tree])) for tree in range(model.ntree) if tree not in driven]
+    path, geoms = np.zeros((len(frames), model.nbody, 3)), list[list[list[Obstacle]]]()
+    for number, frame in enumerate(frames):
+        data.qpos[:] = frame
+        mujoco.mj_kinematics(model, data)
+        path[number] = data.xipos
+        if number in (0, len(frames) - 1):
+            geoms.append([_visible(model, data, tree) for tree, _ in objects])
+    least = MOVED * float(np.ptp(np.vstack([rollout.planned_places, rollout.places(trial)]), axis=0).max())
+    return [
+        MovedObject(model.body(body).name or f"body {body}", path[:, body], first, last)
+        for (_, body), first, last in zip(objects, *geoms, strict=True)
+        if np.linalg.norm(path[:, body] - path[0, body], axis=1).max() > least
+    ]
+
+
+def _visible(model: mujoco.MjModel, data: mujoco.MjData, tree: int) -> list[Obstacle]:
+    """The visible geoms of a kinematic tree, in the pose of the data."""
+    visible = list[Obstacle]()
+    for geom in drawn_geoms(model):
+        i, kind, size = geom.number, geom.kind, geom.size
+        if model.body_treeid[model.geom_bodyid[i]] == tree:
+            axes, place = data.geom_xmat[i].reshape(3, 3).copy(), data.geom_xpos[i].copy()
+            if kind not in SHAPES:
+                kind, size, place = "box", model.geom_aabb[i, 3:].copy(), place + axes @ model.geom_aabb[i, :3]
+            visible.append(Obstacle(f"geom {i}", kind, place, axes, size))
+    return visible
+
+
 def draw_moved(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -> None:
     """Draw objects at the beginning and at the end of a run, and their paths, in a plane of the world's axes."""
-    for one in objects:
-        for geoms, line, face in ((one.first, ":", "none"), (one.last, "-", (THING, 0.3))):
+    for moved in objects:
+        low, high = moved.path.min(axis=0), moved.path.max(axis=0)
+        for geoms, line, face in ((moved.first, ":", "none"), (moved.last, "-", (THING, 0.3))):
+            looks = {"facecolor": face, "edgecolor": THING, "linestyle": line, "zorder": 2.4}
             for geom in geoms:
-                low, high = one.path.min(axis=0), one.path.max(axis=0)
-                axes.fill(
-                    *_outline(geom, low, high, plane).T, facecolor=face, edgecolor=THING, linestyle=line, zorder=2.4
-                )
-        axes.plot(
-            *one.path[:, plane].T, color=THING, linewidth=1.0, zorder=2.5, label=f"{one.name.replace('_', ' ')}, moved"
-        )
+                axes.fill(*_outline(geom, low, high, plane).T, **looks)
+        label = f"{moved.name.replace('_', ' ')}, moved"
+        axes.plot(*moved.path[:, plane].T, color=THING, linewidth=1.0, zorder=2.5, label=label)
 
 
 def draw_tube(axes: Axes, ellipses: Ellipsoids, label: str, *, face: str, edge: str) -> None:

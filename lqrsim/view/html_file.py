@@ -19,27 +19,26 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_path, excerpt
+from lqrsim.errors import Array, InputError, check_items, check_kind, check_path, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view.cameras import camera_view
-from lqrsim.view.captions import legend_entries, readings
-from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay
+from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import (
-    DOTS,
-    FORCE,
-    GHOST_OPACITY,
-    LIFT,
-    MEASURED,
-    MOVING,
-    PLAN_RGB,
+    Arrow,
+    Dots,
+    DrawnTube,
+    Line,
+    MovingBody,
     Overlays,
+    check_overlays,
     common_scale,
     error_colours,
+    legend_entries,
 )
-from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms
+from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms, in_bytes, quaternion_of
 
 ASPECTS = 1.6, 0.6  # of a screen and of a telephone; the page begins with the overview for the nearer one
 LEVELS = np.iinfo(np.uint16).max
@@ -55,7 +54,7 @@ def render_html(
     solution: Solution | None = None,
     funnel: Funnel | None = None,
 ) -> Path:
-    """Write a run as one HTML file, which any browser of 2023 or newer plays without a network.
+    """Write a run as one HTML file, which any browser of 2023 or newer plays without a network; returns its path.
 
     The page shows the scene from all sides, the robot, and the overlays of `render`; it has a time line, and a list of
     the trials with their outcomes. The file has 16 bits for the range of each coordinate, so that places in a run
@@ -69,33 +68,24 @@ def render_html(
       solution: the solution that was run, for `cost_tube`.
       funnel: a funnel about the plan of the run, for the overlay `funnel`.
 
-    Returns:
-      The path.
-
     Raises:
-      InputError: there is no such trial, nothing of it can be drawn, an overlay lacks its solution or funnel, or the
-        file cannot be written.
+      InputError: an overlay lacks its solution or funnel, or nothing of a trial can be drawn.
     """
     path = check_path("path", path)
     if path.suffix.lower() != ".html":
         raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in .html")
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
-    check_kind("funnel", funnel, (Funnel, type(None)), "a Funnel about the plan of the run, or None")
-    shown = check_items("overlays", overlays, object, f"a tuple of: {', '.join(ALL_OVERLAYS)}", at_most=100)
-    for overlay in shown:
-        check_name("overlays", overlay, ALL_OVERLAYS)
-    rows, arrays = _rows(rollout, trial), _Arrays()
+    shown, rows, arrays = check_overlays(overlays), _rows(rollout, trial), _Arrays()
     scale = common_scale(RecordedTrial(rollout, row) for row in rows)
 
     def overlays_of(row: int) -> Overlays:  # one at a time, as each has a model of its own, which may be large
-        return Overlays(RecordedTrial(rollout, row), solution, shown, scale, funnel)
+        return Overlays(RecordedTrial(rollout, row), shown, scale, solution=solution, funnel=funnel)
 
     first = overlays_of(rows[0])
     geoms = drawn_geoms(first.recorded.model)
     described = {
         **_of_run(arrays, first),
-        "legend": list(legend_entries([first], scale).items()),
+        "legend": list(legend_entries([first]).items()),
         "geoms": [_of_geom(arrays, geom) for geom in geoms],
         "trials": [_of_trial(arrays, overlays_of(row), geoms) for row in rows],
     }
@@ -159,8 +149,8 @@ class _Arrays:
 
 def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
     """What all trials share."""
-    recorded, show = overlays.recorded, overlays.show
-    run, lift = recorded.rollout, np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
+    recorded = overlays.recorded
+    run = recorded.rollout
     page: dict[str, Any] = {
         "title": recorded.name,
         "about": "; ".join(run.disturbances) or "undisturbed",
@@ -169,42 +159,37 @@ def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
         "extent": float(recorded.model.stat.extent),
         "middle": np.mean(recorded.planned(run.times), axis=0).tolist(),
         "views": [_view(recorded, aspect) for aspect in ASPECTS],
-        "errors": _bytes(error_colours(np.linspace(0, 1, SHADES))),
+        "errors": in_bytes(error_colours(np.linspace(0, 1, SHADES))),
         "tubes": [],
-        "moving": [],
+        "bodies": [],
     }
-    for tube, colour, height in overlays.tubes():
-        centres, sizes, rotations = tube.in_world
-        page["tubes"].append(
-            {
-                "colour": [*colour, tube.opacity],
-                "places": arrays.rounded(centres + height * lift),
-                "sizes": arrays.exact(sizes, "float32"),
-                "turns": arrays.exact([_quaternion(rotation) for rotation in rotations], "float32"),
-            }
-        )
-    for body in overlays.moving:
-        vectors = {"size": body.size, "place": body.begin, "velocity": body.velocity}
-        page["moving"].append(
-            {"kind": body.kind, "colour": MOVING, "turn": _quaternion(body.rotation).tolist()}
-            | {name: vector.tolist() for name, vector in vectors.items()}
-        )
-    if "plan" in show:
-        points = arrays.rounded(overlays.plan + 2 * lift)
-        page["plan"] = {"points": points, "colour": _bytes([PLAN_RGB])[0], "width": 2 * overlays.plan_width}
-    if "ghost" in show:
-        centres = recorded.planned(run.times)
-        if recorded.planar:
-            centres[:, 2] = recorded.floor + 3 * LIFT
-        page["ghost"] = {
-            "kind": "cylinder" if recorded.planar else "sphere",
-            "colour": [*PLAN_RGB, GHOST_OPACITY[recorded.planar]],
-            "size": [recorded.ghost_radius, LIFT, 0.0],
-            "places": arrays.rounded(centres),
-        }
-    if "forces" in show:
-        page["arrow"] = {"size": overlays.arrow, "colour": [*FORCE, 1.0]}
+    for part in overlays.drawables:
+        match part:
+            case Line(name="plan"):
+                page["plan"] = _of_line(arrays, part)
+            case Arrow():
+                page["arrow"] = {"size": [part.gap, part.width, part.metres_per_newton], "colour": part.rgba}
+            case DrawnTube():
+                tube = {
+                    "colour": part.rgba,
+                    "places": arrays.rounded(part.centres),
+                    "sizes": arrays.exact(part.half_axes, "float32"),
+                    "turns": arrays.exact([quaternion_of(rotation) for rotation in part.rotations], "float32"),
+                }
+                page["tubes"].append(tube)
+            case MovingBody():
+                shape = {"kind": part.kind, "colour": part.rgba, "size": part.size.tolist()}
+                motion = {"turn": quaternion_of(part.rotation).tolist(), "places": arrays.rounded(part.at(run.times))}
+                page["bodies"].append(shape | motion)
     return page
+
+
+def _of_line(arrays: _Arrays, line: Line) -> dict[str, Any]:
+    described: dict[str, Any] = {"points": arrays.rounded(line.points), "width": 2 * line.profile[0]}
+    if line.times is not None and line.colours is not None:
+        colours = arrays.exact(in_bytes(line.colours), "uint8")
+        return described | {"times": arrays.exact(line.times, "float32"), "colours": colours}
+    return described | {"colour": in_bytes([line.rgba])[0]}
 
 
 def _of_geom(arrays: _Arrays, geom: DrawnGeom) -> dict[str, Any]:
@@ -220,7 +205,6 @@ def _of_trial(arrays: _Arrays, overlays: Overlays, geoms: Sequence[DrawnGeom]) -
     """A trial: bodies and lines over time, and geoms in their bodies, or in the world if they do not move."""
     recorded, row, model = overlays.recorded, overlays.recorded.trial, overlays.recorded.model
     run, data = recorded.rollout, mujoco.MjData(model)
-    lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
     moving = [int(model.geom_bodyid[geom.number]) for geom in geoms if geom.moves]
     bodies, poses = np.unique(moving).astype(int), []
     for time in recorded.frame_times:
@@ -229,40 +213,36 @@ def _of_trial(arrays: _Arrays, overlays: Overlays, geoms: Sequence[DrawnGeom]) -
     places = [
         [*model.geom_pos[geom.number], *model.geom_quat[geom.number]]
         if geom.moves
-        else [*data.geom_xpos[geom.number], *_quaternion(data.geom_xmat[geom.number])]
+        else [*data.geom_xpos[geom.number], *quaternion_of(data.geom_xmat[geom.number])]
         for geom in geoms
     ]
     ending = recorded.ending(np.inf)
-    said = f"{ending} at {run.ended[row]:.1f} s" if ending else run.outcome[row]
+    outcome = f"{ending} at {run.ended[row]:.1f} s" if ending else run.outcome[row]
     trial: dict[str, Any] = {
-        "name": f"trial {run.first_trial + row}: {said}".replace("_", " "),
+        "name": f"trial {run.first_trial + row}: {outcome}".replace("_", " "),
         "outcome": run.outcome[row],
         "ended": float(run.ended[row]) if ending else None,
-        "readings": [" · ".join(readings(recorded, overlays, float(time))) for time in run.times],
+        "readings": [" · ".join(overlays.readings(float(time))) for time in run.times],
         "robot": arrays.rounded(recorded.driven(run.times)),
         "times": arrays.exact(recorded.frame_times, "float32"),
         "poses": arrays.rounded(_without_jumps(np.array(poses))),
         "places": arrays.exact(places, "float32"),
         "bodies": [int(np.searchsorted(bodies, model.geom_bodyid[geom.number])) for geom in geoms],
     }
-    if "trace" in overlays.show:
-        errors = 0.5 * (overlays.errors[1:] + overlays.errors[:-1])
-        trial["trace"] = {
-            "times": arrays.exact(overlays.knots, "float32"),
-            "points": arrays.rounded(overlays.trace + lift),
-            "colours": arrays.exact(_bytes(error_colours(errors / overlays.scale.error)), "uint8"),
-            "width": 2 * overlays.trace_width,
-        }
-    if "forces" in overlays.show:
-        trial["forces"] = arrays.rounded(recorded.force)
-    if "measured" in overlays.show:
-        trial["measured"] = {
-            "times": arrays.exact(recorded.times, "float32"),
-            "points": arrays.rounded(overlays.measured + 3 * lift),
-            "colour": _bytes([MEASURED])[0],
-            "width": 2 * overlays.width,
-            "seconds": DOTS * run.plan.dt,
-        }
+    for part in overlays.drawables:
+        match part:
+            case Line(name="trace"):
+                trial["trace"] = _of_line(arrays, part)
+            case Arrow():
+                trial["forces"] = arrays.rounded(part.forces)
+            case Dots():
+                trial["measured"] = {
+                    "times": arrays.exact(part.times, "float32"),
+                    "points": arrays.rounded(part.points),
+                    "colour": in_bytes([part.rgba])[0],
+                    "width": 2 * part.half_sizes[0],
+                    "seconds": part.seconds,
+                }
     return trial
 
 
@@ -282,15 +262,3 @@ def _without_jumps(poses: Array) -> Array:
     signs = np.where(np.sum(turns[1:] * turns[:-1], axis=2) < 0, -1.0, 1.0)
     turns[1:] *= np.cumprod(signs, axis=0)[:, :, None]
     return poses
-
-
-def _quaternion(rotation: Array) -> Array:
-    """The quaternion (4,) of a rotation, scalar first."""
-    found = np.empty(4)
-    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation).ravel())
-    return found
-
-
-def _bytes(colours: npt.ArrayLike) -> list[list[int]]:
-    """Red, green and blue (k, 3) in bytes, of colours (k, 3 or 4) from numbers between 0 and 1."""
-    return np.round(255 * np.asarray(colours)[:, :3]).astype(int).tolist()

@@ -1,22 +1,54 @@
-"""The contents and layout of a picture: overlays, qualities and views by name; parts of runs, and panes in a part.
+"""What can be drawn over a scene, by name; qualities and views by name; and the layout of a picture.
 
 This module imports nothing heavy, so that the command line starts fast.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "cost_tube", "funnel", "caption"]
 Quality = Literal["draft", "standard", "publication"]
+Colour = tuple[float, float, float]
 
+
+class OverlayKind(NamedTuple):
+    """What an overlay draws, in words; its red, green and blue; and whether it is drawn by default.
+
+    The trace has the colours of the error map instead, and text has none.
+    """
+
+    words: str
+    colour: Colour | None = None
+    default: bool = True
+
+
+OVERLAY_KINDS: dict[Overlay, OverlayKind] = {
+    # No colour is in the map of the tracking error, on a robot, or as green as the mark that `lqrsim verify` reads.
+    "plan": OverlayKind("the planned path", (0.78, 0.08, 0.42)),
+    "ghost": OverlayKind("a disc or ball at the robot's planned position, or its hand's", (0.78, 0.08, 0.42)),
+    "trace": OverlayKind("the path so far, coloured by tracking error"),
+    "forces": OverlayKind("arrows of forces and wind, averaged over the last fifth of a second", (0.0, 0.50, 0.36)),
+    "measured": OverlayKind("the last measured states, if they differ from the true states", (0.10, 0.10, 0.12)),
+    "tube": OverlayKind(
+        "the states predicted under the run's disturbances, within 2 standard deviations, if there is a tube and as far"
+        " as it is not too wide",
+        (0.0, 0.70, 0.72),
+    ),
+    # Tubes about one plan hide each other, so these two are not drawn by default.
+    "cost_tube": OverlayKind(
+        "where the total cost is near its minimum; it needs the solution", (0.47, 0.30, 0.78), default=False
+    ),
+    "funnel": OverlayKind(
+        "the funnel about the plan, pale between its knots; it needs the funnel", (0.92, 0.55, 0.0), default=False
+    ),
+    "caption": OverlayKind("time, tracking error, clearance, disturbances, and whether the run is in the funnel"),
+}
+"""What each overlay draws."""
 ALL_OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
-# Tubes about one plan hide each other, so the tube of the cost and the funnel are not drawn by default.
-OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if name not in ("cost_tube", "funnel"))
+OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if OVERLAY_KINDS[name].default)
 CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)
-
-
 INSETS_SHARE = 0.4  # fraction of a run's part for its insets
 
 

@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 from mujoco.rendering.classic import gl_context
 
-from lqrsim.errors import Array, InputError, check_count, check_items, check_kind, check_name, check_text, excerpt, keep
+from lqrsim.errors import Array, InputError, check_count, check_items, check_name, check_text, excerpt, keep
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.view import gl
+from lqrsim.view import geoms, gl
 from lqrsim.view.cameras import CameraView, camera_view
 from lqrsim.view.captions import Caption, Legend, Pixels
-from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Box, Overlay, Quality, side_by_side, split_into_panes
-from lqrsim.view.overlays import Overlays, common_scale, draw_mark, mark_radius
+from lqrsim.view.options import OVERLAYS, Box, Overlay, Quality, side_by_side, split_into_panes
+from lqrsim.view.overlays import Arrow, Overlays, check_overlays, common_scale
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.video_metadata import Pane
 
@@ -27,55 +27,43 @@ MOST_ROBOTS = 50  # largest number of robots in a picture; more cannot be told a
 DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups that MuJoCo shows by default
 
 
-@contextlib.contextmanager
-def open_renderer(
-    recorded: RecordedTrial, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]
-) -> Iterator["SceneRenderer"]:
-    """Open a renderer of a trial for a picture of `size` with these panes; OpenGL must be bound."""
-    model = recorded.model
-    # A larger buffer costs as much as a larger picture, and a smaller one is refused.
-    model.vis.global_.offwidth, model.vis.global_.offheight = size
-    window = gl_context.GLContext(*size)
-    try:
-        window.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        try:
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
-            yield SceneRenderer(recorded, overlays, views, size, window, context)
-        finally:
-            window.make_current()
-            context.free()
-    finally:
-        window.free()
-
-
 class SceneRenderer:
-    """Draws a trial into its own OpenGL context; made by `open_renderer`.
+    """Draws views of a trial, in panes of a picture; to be used with `with`, as it holds an OpenGL context.
 
     MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
     """
 
-    def __init__(
-        self,
-        recorded: RecordedTrial,
-        overlays: Overlays,
-        views: Sequence[tuple[Box, CameraView]],
-        size: tuple[int, int],
-        window: Any,
-        context: mujoco.MjrContext,
-    ) -> None:
-        self.recorded, self.overlays, self.views = recorded, overlays, views
-        self.window, self.context, self.model = window, context, recorded.model
+    def __init__(self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]) -> None:
+        self.overlays, self.views = overlays, views
+        self.recorded, self.model = overlays.recorded, overlays.recorded.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
-        moving = recorded.rollout.moving
-        most = 1000 + (MOST_ROBOTS + 1) * self.model.ngeom + (0 if moving is None else len(moving.names))
+        most = 1000 + (MOST_ROBOTS + 1) * self.model.ngeom + len(overlays.drawables)
         self.scene = mujoco.MjvScene(self.model, maxgeom=most)
+        self.emission = 0.0 if self.recorded.planar else geoms.GLOW
         self.visual_options = mujoco.MjvOption(), mujoco.MjvPerturb()
         self.pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
         # A plane is transparent from behind anyway, and hides nothing from the front.
         solid = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
         self.can_occlude = solid & (self.model.body_weldid[self.model.geom_bodyid] == 0)
         self.faded = np.zeros((len(views), self.model.ngeom))
+        # A larger buffer costs as much as a larger picture, and a smaller one is refused.
+        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
+
+    def __enter__(self) -> "SceneRenderer":
+        height, width = self.pixels.shape[:2]
+        with contextlib.ExitStack() as stack:
+            self.window = gl_context.GLContext(width, height)
+            stack.callback(self.window.free)
+            self.window.make_current()
+            self.context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            stack.callback(self.context.free)
+            stack.callback(self.window.make_current)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
         """The picture (height, width, 3) at `time`, with the robot also at earlier times; the next call overwrites it.
@@ -87,26 +75,28 @@ class SceneRenderer:
         self.recorded.pose(data, time)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self.visual_options[0], None, mujoco.MjvCamera(), everything, scene)
-        own = scene.ngeom
+        of_model, new = scene.ngeom, geoms.appending_to(scene)
         for moment in earlier:
             self.recorded.pose(self.ghost, moment)
             mujoco.mjv_addGeoms(model, self.ghost, *self.visual_options, mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene)
-        self.overlays.draw(scene, data, time)
+        for drawable in self.overlays.drawables:
+            geoms.draw(drawable, time, new, emission=self.emission)
+        of_all_views, place = scene.ngeom, self.recorded.place_in(data)
         self.window.make_current()
         for (box, view), faded in zip(self.views, self.faded, strict=True):
             view.place(scene, data, time)
             self._move_headlight()
             faded += np.clip(self._occluders() - faded, -fade, fade)
-            with self._fade(faded, own):
-                height = self.pixels.shape[0]
-                where = mujoco.MjrRect(box.left, height - box.top - box.height, box.width, box.height)
-                common = scene.ngeom
-                self.overlays.draw_force(scene, data, time)
+            with self._fade(faded, of_model):
+                for arrow in self.overlays.drawables:
+                    if isinstance(arrow, Arrow):
+                        force = self.recorded.force_at(time)
+                        geoms.draw_arrow(arrow, force, place, scene, emission=self.emission)
                 if view.camera is not None:
-                    radius = mark_radius(self.recorded)
-                    draw_mark(scene, view.camera, self.recorded.place_in(data), radius)
-                mujoco.mjr_render(where, scene, self.context)
-                scene.ngeom = common
+                    geoms.draw_mark(scene, view.camera, place, geoms.mark_radius(self.recorded))
+                bottom = self.pixels.shape[0] - box.top - box.height
+                mujoco.mjr_render(mujoco.MjrRect(box.left, bottom, box.width, box.height), scene, self.context)
+                scene.ngeom = of_all_views
         whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
         mujoco.mjr_readPixels(self.pixels, None, whole, self.context)
         return self.pixels[::-1]
@@ -123,7 +113,7 @@ class SceneRenderer:
         up, forward = np.array(view.up, dtype=np.float64), np.array(view.forward, dtype=np.float64)
         right = np.cross(forward, up)
         centre, radius = self.recorded.place_in(self.data), 0.8 * self.recorded.rollout.radius
-        found, geom = np.zeros(self.model.ngeom, dtype=bool), np.zeros(1, np.int32)
+        hidden, geom = np.zeros(self.model.ngeom, dtype=bool), np.zeros(1, np.int32)
         eye = np.array(view.pos, dtype=np.float64)
         for offset in (0 * up, up, -up, right, -right):
             target = centre + radius * offset
@@ -134,15 +124,15 @@ class SceneRenderer:
                 hit = mujoco.mj_ray(self.model, self.data, start, ray, DRAWN_GROUPS, True, -1, geom)
                 if not 0 <= hit < 1:
                     break
-                found[geom[0]] = self.can_occlude[geom[0]]
+                hidden[geom[0]] = self.can_occlude[geom[0]]
                 start = start + (hit + 1e-4) * ray
-        return found
+        return hidden
 
     @contextlib.contextmanager
-    def _fade(self, faded: Array, own: int) -> Iterator[None]:
-        """A block in which geoms of the scene are faded by these fractions (ngeom,)."""
+    def _fade(self, faded: Array, count: int) -> Iterator[None]:
+        """A block in which the model's geoms, the first of the scene, are faded by these fractions (ngeom,)."""
         before: list[tuple[int, float, int]] = []
-        for number in range(own if faded.any() else 0):
+        for number in range(count if faded.any() else 0):
             geom = self.scene.geoms[number]
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and faded[geom.objid] > 0:
                 share, alpha = faded[geom.objid], float(geom.rgba[3])
@@ -181,11 +171,7 @@ QUALITIES: dict[Quality, QualitySettings] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureOptions:
-    """The arguments of these names of `render` and `render_still`, which explain them.
-
-    Raises:
-      InputError: a text, a name or a size is wrong. `open_picture` checks everything that depends on the runs.
-    """
+    """The arguments of these names of `render`; `open_picture` checks everything that depends on the runs."""
 
     trial: int | Sequence[int] = 0
     camera: str = "overview"
@@ -204,9 +190,7 @@ class PictureOptions:
         check_text("camera", self.camera, "the name of a camera")
         wanted = f"a tuple of the names of cameras, {MOST_INSETS} at most"
         insets = check_items("insets", self.insets, str, wanted, at_most=100)
-        overlays = check_items("overlays", self.overlays, object, f"a tuple of: {', '.join(ALL_OVERLAYS)}", at_most=100)
-        for overlay in overlays:
-            check_name("overlays", overlay, ALL_OVERLAYS)
+        overlays = check_overlays(self.overlays)
         titles = check_items("titles", self.titles, str, "a tuple of texts, one for each run", at_most=MOST_RUNS)
         for title in titles:
             check_text("titles", title, "a title", at_most=100, empty=True)
@@ -238,80 +222,71 @@ class RunPart:
 
 @contextlib.contextmanager
 def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> Iterator["Picture"]:
-    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts.
-
-    Raises:
-      InputError: an option does not fit the runs, captions fill the picture, or there is no OpenGL.
-    """
-    size, camera, insets = options.pixels, options.camera, options.insets
+    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts."""
+    (width, height), camera, insets = options.pixels, options.camera, options.insets
     distinct, shown = _runs_and_trials(runs, options.trial)
     recordings = [RecordedTrial(distinct[number], row) for number, row in shown]
-    common = common_scale(recordings)
+    scale = common_scale(recordings)
     solutions = _one_each("solution", options.solution, recordings)
-    for one in solutions:
-        check_kind("solution", one, (Solution, type(None)), "the Solution of the run, or None")
     funnels = _one_each("funnel", options.funnel, recordings)
-    for one in funnels:
-        check_kind("funnel", one, (Funnel, type(None)), "a Funnel about the plan of the run, or None")
     overlays = [
-        Overlays(recorded, solution, options.overlays, common, funnel)
+        Overlays(recorded, options.overlays, scale, solution=solution, funnel=funnel)
         for recorded, solution, funnel in zip(recordings, solutions, funnels, strict=True)
     ]
-    titles = _one_each("titles", list(options.titles), recordings) if options.titles else [None] * len(recordings)
+    titles = _one_each("titles", options.titles or None, recordings)
     gl.bind()
-    legend = Legend(overlays, common, size) if "caption" in options.overlays else None
-    boxes = side_by_side(len(recordings), (size[0], size[1] - (0 if legend is None else legend.height)))
-    captions = [None] * len(recordings)
-    if legend is not None:
-        each_run = zip(recordings, overlays, boxes, titles, strict=True)
-        captions = [Caption(*each, options.speed) for each in each_run]
-    strip = max(0 if one is None else one.height for one in captions)
+    legend, captions = None, [None] * len(recordings)
+    if "caption" in options.overlays:
+        legend = Legend(overlays, (width, height))
+    boxes = side_by_side(len(recordings), (width, height - (0 if legend is None else legend.height)))
+    if "caption" in options.overlays:
+        captions = [Caption(*run, options.speed) for run in zip(overlays, boxes, titles, strict=True)]
+    strip = max(0 if caption is None else caption.height for caption in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
         raise InputError(
-            f"size: got {size[0]} x {size[1]}, which captions would fill, want it larger, or overlays without caption"
+            f"size: got {width} x {height}, which captions would fill, want it larger, or overlays without caption"
         )
     with contextlib.ExitStack() as stack:
         parts: list[RunPart] = []
-        for recorded, box, overlay, caption in zip(recordings, boxes, overlays, captions, strict=True):
+        panes: list[Pane] = []
+        for recorded, drawn, box, caption, (run, row) in zip(recordings, overlays, boxes, captions, shown, strict=True):
             _set_quality(recorded, options.settings)
-            panes = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
-            named = zip((camera, *insets), panes, strict=True)
-            views = [(pane, camera_view(name, recorded, pane.aspect, beside=recordings)) for name, pane in named]
-            renderer = stack.enter_context(open_renderer(recorded, overlay, views, (box.width, box.height)))
+            areas = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
+            named = zip((camera, *insets), areas, strict=True)
+            views = [(area, camera_view(name, recorded, area.aspect, beside=recordings)) for name, area in named]
+            renderer = stack.enter_context(SceneRenderer(drawn, views, (box.width, box.height)))
             parts.append(RunPart(recorded, box, views, renderer, caption))
-        panes = tuple(
-            Pane(part.box.left + box.left, part.box.top + box.top, box.width, box.height, *which, view.camera)
-            for part, which in zip(parts, shown, strict=True)
-            for box, view in part.views
-        )
-        yield Picture(distinct, parts, panes, size, legend)
+            panes += [
+                Pane(box.left + area.left, box.top + area.top, area.width, area.height, run, row, view.camera)
+                for area, view in views
+            ]
+        yield Picture(distinct, parts, tuple(panes), (width, height), legend)
 
 
+@dataclass(frozen=True, eq=False)
 class Picture:
     """A picture of all runs at any time.
 
     Attributes:
       runs: the rollouts, each once.
-      panes: the panes and their places.
       size: width and height in pixels.
-      end: end of the last run, in seconds.
     """
 
-    def __init__(
-        self,
-        runs: Sequence[Rollout],
-        parts: Sequence[RunPart],
-        panes: tuple[Pane, ...],
-        size: tuple[int, int],
-        legend: Legend | None,
-    ) -> None:
-        self.runs, self.parts, self.panes, self.size, self.legend = runs, parts, panes, size, legend
-        self.end = max(part.recorded.end for part in parts)
+    runs: Sequence[Rollout]
+    parts: Sequence[RunPart]
+    panes: tuple[Pane, ...]
+    size: tuple[int, int]
+    legend: Legend | None
+
+    @property
+    def end(self) -> float:
+        """The end of the last run, in seconds."""
+        return max(part.recorded.end for part in self.parts)
 
     @property
     def markers(self) -> tuple[float, ...]:
         """Radii in metres of the robots' marks in calibrated panes."""
-        sizes = {id(part.recorded.rollout): mark_radius(part.recorded) for part in self.parts}
+        sizes = {id(part.recorded.rollout): geoms.mark_radius(part.recorded) for part in self.parts}
         return tuple(sizes[id(run)] for run in self.runs)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
@@ -340,12 +315,7 @@ class Picture:
 class LivePicture:
     """Draws one running trial, with its plan: opened at the first frame, and redrawn for each.
 
-    Args:
-      camera: as in `render`, except "chase", which needs the whole run.
-      size: as in `render`.
-
-    Raises:
-      InputError: the camera or the size is wrong.
+    The camera may be any of `render` but "chase", which needs the whole run.
     """
 
     def __init__(self, camera: str, size: tuple[int, int]) -> None:
@@ -360,9 +330,6 @@ class LivePicture:
 
         Args:
           so_far: returns the run so far; called when the picture is opened.
-
-        Raises:
-          InputError: there is no such camera, or no OpenGL.
         """
         if self._picture is None:
             self._picture = self._stack.enter_context(open_picture(so_far(), self._options))
@@ -380,7 +347,7 @@ def _checked_size(size: Any) -> tuple[int, int]:
     pixels = check_items("size", size, object, "a width and a height in pixels", at_most=2)
     if len(pixels) != 2:
         raise InputError(f"size: got {excerpt(size)}, want a width and a height in pixels")
-    width, height = (check_count("size", one, at_least=64, at_most=LARGEST) for one in pixels)
+    width, height = (check_count("size", side, at_least=64, at_most=LARGEST) for side in pixels)
     if width % 2 or height % 2:
         raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
     return width, height

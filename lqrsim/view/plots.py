@@ -1,23 +1,21 @@
 """The figures of runs, of a policy, and of a funnel."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
-from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text
-from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
+from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
@@ -26,15 +24,11 @@ from lqrsim.scenes.world import World
 from lqrsim.view import figure_parts
 from lqrsim.view import style as styles
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
-from lqrsim.view.moved_objects import moved_objects
-from lqrsim.view.style import AROUND, LIMIT, LOOKS, PLAN, RUNS, Panel, Style, arrange, legend_below
+from lqrsim.view.figure_parts import CERTIFIED, DrawnPath, TubeArea, Views, moved_objects, planes_of
+from lqrsim.view.style import LIMIT, LOOKS, PLAN, RUNS, Panel, Style, arrange, legend_below
 
 MOMENTS = 7  # number of times at which the balls of a robot are drawn
 AREA = "area: "  # prefix of the label of a tube
-LONG = 0.45  # height over width, below which a view is as wide as the figure
-Plane = tuple[int, int]  # the axes of a view, of those of a position
-
-
 CURVE, STRIP, NARROW = 1.2, 0.65, 1.65  # inches: the heights of curves and of strips, and the least width of a strip
 LINES_OF_STRIP = 2.5  # lines of text above and below a strip
 STRIPS = 3  # below one another; more are drawn in columns
@@ -67,43 +61,22 @@ def plot_run(
       world: the obstacles, such as `scene.world`.
       trial: row of each rollout.
       style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
-
-    Raises:
-      InputError: the rollouts are of other systems, there is no such style, or the file cannot be written.
     """
     _check(solution, rollouts, trial, world)
     with styles.figure(path, style=style) as figure:
-        space, first = solution.policy.state_coordinates, next(iter(rollouts.values()))
-        moved = moved_objects(first, trial)
+        first = next(iter(rollouts.values()))
+        views = (_of_positions if first.state_coordinates.position else _of_balls)(solution, rollouts, world, trial)
         chances = [
             (run.times, run.collision_chance, color)
             for run, color in zip(rollouts.values(), RUNS, strict=False)
             if run.collision_chance is not None and run.collision_chance.any()
         ]
-        if space.position:
-            shown = [one.places[:, _axes_of(space)] for one in moved]
-            places = np.vstack([*(points for *_, points in _paths(solution, rollouts, trial)), *shown])
-            span = figure_parts.extent(space, world, places, first.radius)[1]
-            planes = _planes(space, places)
-        else:
-            places = np.zeros(0)
-            low, high, plane = _seen_of_balls(first, world, trial)
-            span, planes = high - low, [plane]
-        views = _views(planes, span, style)
         across, strips = _strips(len(first.control_coordinates), style)
         curves = [Panel(CURVE)] * (1 + bool(chances))
         of_time = [*curves, Panel(CURVE), strips] if strips.wide else [*curves, strips, Panel(CURVE)]
-        parts = arrange(figure, [*views, *of_time], style)
-        drawn = [figure.add_subplot(part) for part in parts[: len(planes)]]
-        for axes, plane in zip(drawn, planes, strict=True):
-            if space.position:
-                _paths_in_view(axes, solution, rollouts, world, trial, places, plane)
-                in_world = [_axes_of(space)[i] for i in plane]
-            else:
-                _path_of_balls(axes, solution, rollouts, world, trial)
-                in_world = list(plane)
-            figure_parts.draw_moved(axes, moved, in_world)
-        *rest, commands, costs = parts[len(planes) :]
+        parts = arrange(figure, [*views.panels(style), *of_time], style)
+        drawn = views.draw(figure, parts[: len(views.planes)])
+        *rest, commands, costs = parts[len(views.planes) :]
         if strips.wide:
             commands, costs = costs, commands
         _tracking_error(figure.add_subplot(rest[0]), rollouts, trial)
@@ -113,20 +86,6 @@ def plot_run(
         _convergence(figure.add_subplot(costs), solution)
         legend_below(figure, _entries(drawn[0]) | controls)
     return Path(path)
-
-
-def _axes_of(space: Coordinates) -> list[int]:
-    """The world's axes of the position."""
-    return ["xyz".index(letter) for letter in (space.plane if len(space.position) == 2 else "xyz")]
-
-
-def _views(planes: Sequence[Plane], span: Array, style: Style) -> list[Panel]:
-    """The panels of views in these planes, of an extent (2 or 3,) in metres: wide ones if they are long."""
-    shapes = [figure_parts.slenderness(span[list(plane)]) for plane in planes]
-    wide = max(shapes) < LONG
-    look = LOOKS[style]
-    width = look.width / (1 if wide else look.columns) - AROUND[1] * look.text / 72
-    return [Panel(width * min(shape, 1.0), wide) for shape in shapes]
 
 
 def _strips(count: int, style: Style) -> tuple[int, Panel]:
@@ -150,7 +109,7 @@ def _grid(figure: Figure, place: SubplotSpec, count: int, across: int) -> list[A
 
 def _entries(*drawn: Axes) -> dict[str, Artist]:
     """What is drawn in these axes, by label."""
-    return {label: one for axes in drawn for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    return {label: artist for axes in drawn for artist, label in zip(*axes.get_legend_handles_labels(), strict=True)}
 
 
 def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, world: World) -> None:
@@ -171,72 +130,65 @@ def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, worl
             raise InputError(f"state_coordinates.position: got none, want {wanted}")
 
 
-def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> list[tuple[str, str, str, Array]]:
-    """Label, colour, line style and places (T+1, 2 or 3) of each path; the plan is last, on top."""
-    position = list(solution.policy.state_coordinates.position)
-    driven = [(name, color, "-", run.places(trial)) for (name, run), color in zip(rollouts.items(), RUNS, strict=False)]
-    planned = solution.trajectory.states[:, position] if position else next(iter(rollouts.values())).planned_places
-    return [*driven, ("planned", PLAN, "--", planned)]
-
-
-def _tubes(rollouts: Mapping[str, Rollout]) -> Iterator[tuple[Ellipsoids, dict[str, str]]]:
-    """The predicted tubes that have a width, with label and colours."""
+def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> Views:
+    """The views of a robot with a position."""
+    first, space = next(iter(rollouts.values())), solution.policy.state_coordinates
+    driven = [
+        DrawnPath(run.places(trial), name, color, "-")
+        for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
+    ]
+    plan = DrawnPath(solution.trajectory.states[:, list(space.position)], "planned")
+    moved = moved_objects(first, trial)
+    of_world = ["xyz".index(letter) for letter in (space.plane if len(space.position) == 2 else "xyz")]
+    shown = [thing.places[:, of_world] for thing in moved]
+    places = np.vstack([*(path.points for path in (*driven, plan)), *shown])
+    tubes = list[TubeArea]()
     for (name, run), color in zip(rollouts.items(), RUNS, strict=False):
         if run.tube is not None and run.tube.any():
-            plan = run.plan.states[:, list(run.state_coordinates.position)]
-            ellipsoids = Ellipsoids.predicted(plan, run.tube)
-            red, green, blue = to_rgb(color)
-            paler = to_hex((0.4 * red + 0.6, 0.4 * green + 0.6, 0.4 * blue + 0.6))
-            yield ellipsoids, {"label": f"{AREA}{name}, {ellipsoids.label}", "face": paler, "edge": color}
+            ellipsoids = Ellipsoids.predicted(run.plan.states[:, list(run.state_coordinates.position)], run.tube)
+            tubes.append(TubeArea(ellipsoids, f"{AREA}{name}, {ellipsoids.label}", _paler(color, 0.6), color))
+    return Views(
+        title="path", space=space, world=world, radius=first.radius, places=places, planes=planes_of(places),
+        paths=[*driven, plan], tubes=tubes, moved=moved,
+    )  # fmt: skip
 
 
-def _paths_in_view(
-    axes: Axes,
-    solution: Solution,
-    rollouts: Mapping[str, Rollout],
-    world: World,
-    trial: int,
-    places: Array,
-    plane: Plane,
-) -> None:
-    radius = next(iter(rollouts.values())).radius
-    onto = _begin_projection(axes, solution.policy.state_coordinates, world, places, radius, plane, "path")
-    for ellipsoids, looks in _tubes(rollouts):
-        figure_parts.draw_tube(axes, ellipsoids.seen_in(onto), **looks)
-    for name, color, line, points in (paths := _paths(solution, rollouts, trial)):
-        axes.plot(*points[:, list(plane)].T, line, color=color, label=name)
-    figure_parts.mark_ends(axes, paths[-1][-1][:, list(plane)])
-
-
-def _seen_of_balls(run: Rollout, world: World, trial: int) -> tuple[Array, Array, Plane]:
-    """The corners (3,) of what is seen of a robot of balls, and the plane: along the axis of least motion."""
-    assert run.balls is not None
-    driven, radii = run.balls.driven[trial], run.balls.radii
-    low, high = np.nanmin(driven, axis=(0, 1)), np.nanmax(driven, axis=(0, 1))
-    across, up = sorted(np.argsort(high - low, kind="stable")[1:].tolist())
-    margin = float(radii.max()) + 0.1 * float((high - low).max())
-    low, high = figure_parts.bounds(driven[np.isfinite(driven).all(axis=(1, 2))].reshape(-1, 3), world, margin)
-    return low, high, (across, up)
-
-
-def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
-    """The balls of the first run at several times and the path of the last, seen along the axis of least motion."""
+def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> Views:
+    """The view of the first run's balls at several times, along the axis of least motion; and paths of the last."""
     first = next(iter(rollouts.values()))
     assert first.balls is not None
     driven, radii = first.balls.driven[trial], first.balls.radii
-    low, high, (across, up) = _seen_of_balls(first, world, trial)
-    figure_parts.draw_projected(axes, world, low, high, across, up)
-    alive = np.flatnonzero(np.isfinite(driven).all(axis=(1, 2)))
-    for number, knot in enumerate(np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))):
-        paler, (red, green, blue) = 0.75 * (1 - number / (MOMENTS - 1)), to_rgb(RUNS[0])
-        face = to_hex((paler + (1 - paler) * red, paler + (1 - paler) * green, paler + (1 - paler) * blue))
-        for centre, radius in zip(driven[alive[knot]], radii, strict=True):
-            axes.add_patch(Circle(centre[[across, up]], radius, facecolor=face, edgecolor="none", zorder=2))
-    paths = _paths(solution, rollouts, trial)
-    for name, color, line, points in paths:
-        axes.plot(*points[:, [across, up]].T, line, color=color, label=name, zorder=3)
-    figure_parts.mark_ends(axes, paths[-1][-1][:, [across, up]])
-    axes.set_title("balls, paler the earlier, and the path of the last")
+    alive = driven[np.isfinite(driven).all(axis=(1, 2))]
+    span = np.ptp(alive, axis=(0, 1))
+    across, up = sorted(np.argsort(span, kind="stable")[1:].tolist())
+    moments = np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))
+    colours = [_paler(RUNS[0], 0.75 * (1 - i / (MOMENTS - 1))) for i in range(len(moments))]
+    paths = [
+        DrawnPath(run.places(trial), name, color, "-", zorder=3)
+        for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
+    ]
+    return Views(
+        title="balls, paler the earlier, and the path of the last",
+        space=first.state_coordinates,
+        world=world,
+        radius=first.radius,
+        places=np.zeros((0, 3)),
+        limits=figure_parts.bounds(alive.reshape(-1, 3), world, float(radii.max()) + 0.1 * float(span.max())),
+        planes=[(across, up)],
+        paths=[*paths, DrawnPath(first.planned_places, "planned", zorder=3)],
+        balls=[
+            (centre, float(radius), colour)
+            for knot, colour in zip(moments, colours, strict=True)
+            for centre, radius in zip(alive[knot], radii, strict=True)
+        ],
+        moved=moved_objects(first, trial),
+    )
+
+
+def _paler(colour: str, white: float) -> str:
+    """A colour with this share of white."""
+    red, green, blue = (white + (1 - white) * part for part in to_rgb(colour))
+    return to_hex((red, green, blue))
 
 
 def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> None:
@@ -261,7 +213,7 @@ def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> 
 def _controls(strips: list[Axes], solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> dict[str, Artist]:
     """The commanded controls over time; returns what the legend says of them."""
     space, plan = next(iter(rollouts.values())).control_coordinates, solution.trajectory
-    found: dict[str, Artist] = {}
+    legend: dict[str, Artist] = {}
     for number, axes in enumerate(strips):
         # Disturbed runs come first, so that the undisturbed one is not hidden.
         for (_, run), color in reversed(list(zip(rollouts.items(), RUNS, strict=False))):
@@ -269,16 +221,15 @@ def _controls(strips: list[Axes], solution: Solution, rollouts: Mapping[str, Rol
         axes.stairs(plan.controls[:, number], plan.times, color=PLAN, baseline=None, linestyle="--", linewidth=0.9)
         for limit in (space.low[number], space.high[number]):
             if np.isfinite(limit):
-                found["limit of a control"] = axes.axhline(
-                    limit, color=LIMIT, linewidth=0.9, linestyle=":", gid="limit"
-                )
+                line = axes.axhline(limit, color=LIMIT, linewidth=0.9, linestyle=":", gid="limit")
+                legend["limit of a control"] = line
         axes.set_title(space.names[number].replace("_", " "))
         axes.set_ylabel("command" + f"\n({space.units[number]})" * bool(space.units[number]))
         axes.margins(x=0.01, y=0.12)
         if len(set(space.units)) == 1:
             axes.label_outer(remove_inner_ticks=False)
     _share_time(strips)
-    return found
+    return legend
 
 
 def _share_time(strips: list[Axes]) -> None:
@@ -342,8 +293,7 @@ def plot_policy(
       style: as in `plot_run`.
 
     Raises:
-      InputError: the solution has no policy, the tube is of another plan or has no position, there is no such style, or
-        the file cannot be written.
+      InputError: the solution has no policy, or the tube is of another plan or has no position.
     """
     check_kind("solution", solution, Solution, "a Solution")
     world = World() if world is None else world
@@ -370,14 +320,21 @@ def draw_policy(
     gains = list(product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(space.units)))
     curves = [Panel(CURVE)] * (1 + chances) + [_strip_panel(len(gains), style)]
     if space.position:
-        plan = solution.trajectory.states[:, list(space.position)]
-        planes = _planes(space, plan)
-        views = _views(planes, figure_parts.extent(space, world, plan, radius)[1], style)
-        parts = arrange(figure, [*views, *curves], style)
-        of_time = parts[len(views) :]
-        drawn = [figure.add_subplot(part) for part in parts[: len(views)]]
-        for axes, plane in zip(drawn, planes, strict=True):
-            _tube(axes, solution, world, radius, plane, tube)
+        plan, tubes = solution.trajectory.states[:, list(space.position)], list[TubeArea]()
+        if tube is not None:
+            ellipsoids = Ellipsoids.predicted(plan, tube.position_covariance)
+            tubes.append(TubeArea(ellipsoids, ellipsoids.label, **TUBE))
+        elif solution.cost_to_come is not None:
+            tubes.append(TubeArea(Ellipsoids.of_cost(solution, space.position), OF_COST, **COST_TUBE))
+        path = DrawnPath(plan, "planned", width=1.4 if tube is None else 0.9, zorder=3)
+        title = "plan" if tube is None else "predicted tube"
+        views = Views(
+            title=title, space=space, world=world, radius=radius, places=plan, planes=planes_of(plan), paths=[path],
+            tubes=tubes,
+        )  # fmt: skip
+        parts = arrange(figure, [*views.panels(style), *curves], style)
+        of_time = parts[len(views.planes) :]
+        drawn = views.draw(figure, parts[: len(views.planes)])
     else:
         together = _drawn_together(solution)
         states, *of_time = arrange(figure, [_strip_panel(len(together), style), *curves], style)
@@ -393,51 +350,19 @@ def draw_policy(
     legend_below(figure, _entries(*drawn[:1], *strips))
 
 
-def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: Plane, tube: Tube | None) -> None:
-    """The tube, the plan and the obstacles, seen along the axis that is not in `plane`."""
-    space = solution.policy.state_coordinates
-    plan = solution.trajectory.states[:, list(space.position)]
-    onto = _begin_projection(axes, space, world, plan, radius, plane, "plan" if tube is None else "predicted tube")
-    if tube is not None:
-        ellipsoids = Ellipsoids.predicted(plan, tube.position_covariance)
-        figure_parts.draw_tube(axes, ellipsoids.seen_in(onto), ellipsoids.label, **TUBE)
-    elif solution.cost_to_come is not None:
-        ellipses = Ellipsoids.of_cost(solution, space.position).seen_in(onto)
-        figure_parts.draw_tube(axes, ellipses, OF_COST, **COST_TUBE)
-    figure_parts.draw_plan(axes, plan[:, list(plane)], linewidth=1.4 if tube is None else 0.9)
-
-
-def _planes(space: Coordinates, places: Array) -> list[Plane]:
-    """The planes in which places (k, 2 or 3) are seen: from above and, in space, from their longer side."""
-    if len(space.position) == 2:
-        return [(0, 1)]
-    x, y, _ = np.ptp(places, axis=0)
-    return [(0, 1), (0, 2) if x >= y else (1, 2)]
-
-
-def _begin_projection(
-    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: Plane, title: str
-) -> Array:
-    """Draw the obstacles around places (k, d), and the title of a view; returns its axes (2, d)."""
-    figure_parts.draw_obstacles(axes, space, world, places, radius, plane)
-    in_space = f"{title}, from {'above' if plane == (0, 1) else 'the side'}"
-    axes.set_title(in_space if len(space.position) == 3 else title)
-    return np.eye(len(space.position))[list(plane)]
-
-
 def _drawn_together(solution: Solution) -> list[list[int]]:
     """The states of each strip: of one unit, and with ranges along the plan that can be seen beside one another."""
-    space, found = solution.policy.state_coordinates, list[list[int]]()
+    space, strips = solution.policy.state_coordinates, list[list[int]]()
     sizes = np.ptp(solution.trajectory.states, axis=0)
     for unit in dict.fromkeys(space.units):
         strip = list[int]()
-        for i in sorted((i for i, one in enumerate(space.units) if one == unit), key=lambda i: -sizes[i]):
+        for i in sorted((i for i, of in enumerate(space.units) if of == unit), key=lambda i: -sizes[i]):
             if strip and 0 < sizes[i] < FLAT * sizes[strip[0]]:
-                found.append(sorted(strip))
+                strips.append(sorted(strip))
                 strip = []
             strip.append(i)
-        found.append(sorted(strip))
-    return sorted(found)
+        strips.append(sorted(strip))
+    return sorted(strips)
 
 
 def _states(strips: list[Axes], together: list[list[int]], solution: Solution) -> None:
@@ -489,11 +414,11 @@ def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolic
 
 def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
     """Norm (T,) of a control's gains on the states of a unit: its largest response to a unit deviation."""
-    chosen = [number for number, one in enumerate(policy.state_coordinates.units) if one == unit]
+    chosen = [i for i, of_state in enumerate(policy.state_coordinates.units) if of_state == unit]
     return np.linalg.norm(policy.gain[:, control, chosen], axis=-1)
 
 
-FACE, EDGE, CERTIFIED = "#cfe3f5", "#5f97c9", RUNS[0]
+FACE, EDGE = "#cfe3f5", "#5f97c9"
 
 
 def plot_funnel(
@@ -511,51 +436,33 @@ def plot_funnel(
       world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
       style: as in `plot_run`.
-
-    Raises:
-      InputError: the position is not among the funnel's states, there is no such style, or the file cannot be written.
     """
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     check_kind("world", world, World, "a World, such as scene.world")
     radius = check_number("radius", radius, at_least=0.0)
-    covariances, space = funnel.position_covariance, funnel.state_coordinates
-    places = _certified_places(funnel, covariances)
-    planes = _planes(space, places)
+    views = funnel_views(funnel, world, radius)
     with styles.figure(path, style=style) as figure:
-        views = _views(planes, figure_parts.extent(space, world, places, radius)[1], style)
-        *parts, levels = arrange(figure, [*views, Panel(1.4 * CURVE)], style)
-        drawn = [figure.add_subplot(part) for part in parts]
-        for axes, plane in zip(drawn, planes, strict=True):
-            _shadow(axes, funnel, covariances, world, radius, plane)
+        *parts, levels = arrange(figure, [*views.panels(style), Panel(1.4 * CURVE)], style)
+        drawn = views.draw(figure, parts)
         _levels(figure.add_subplot(levels), funnel)
         legend_below(figure, _entries(drawn[0]))
     return Path(path)
 
 
-def _certified_places(funnel: Funnel, covariances: np.ndarray) -> Array:
-    """Places (k, 2 or 3) of which the certified outlines are seen as a whole."""
-    plan = funnel.plan.states[:, list(funnel.state_coordinates.position)]
-    held = funnel.knots[funnel.levels > 0]
-    reach = np.sqrt(np.diagonal(covariances[held], axis1=1, axis2=2))
-    return np.vstack([plan, plan[held] - reach, plan[held] + reach])
-
-
-def _shadow(axes: Axes, funnel: Funnel, covariances: np.ndarray, world: World, radius: float, plane: Plane) -> None:
-    """The projection, the plan and the obstacles, seen along the axis that is not in `plane`."""
-    space = funnel.state_coordinates
+def funnel_views(funnel: Funnel, world: World, radius: float) -> Views:
+    """Views of a funnel's projection onto the position, with its certified outlines as a whole."""
+    covariances, space = funnel.position_covariance, funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
-    held, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
-    onto = _begin_projection(axes, space, world, _certified_places(funnel, covariances), radius, plane, "funnel")
-    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # gives the outlines at the level
-    whole = Ellipsoids(every.centres[:last], every.covariances[:last])
-    figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)
-    outlines = every.outlines()[held]
-    axes.add_collection(
-        PolyCollection(
-            list(outlines), facecolors="none", edgecolors=CERTIFIED, linewidths=1.6, zorder=2.8, label="certified"
-        )
-    )
-    figure_parts.draw_plan(axes, plan[:, list(plane)])
+    certified, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
+    reach = np.sqrt(np.diagonal(covariances[certified], axis1=1, axis2=2))
+    places = np.vstack([plan, plan[certified] - reach, plan[certified] + reach])
+    shapes = covariances / SIGMAS**2  # gives the outlines at the level
+    return Views(
+        title="funnel", space=space, world=world, radius=radius, places=places, planes=planes_of(places),
+        tubes=[TubeArea(Ellipsoids(plan[:last], shapes[:last]), "funnel, interpolated", FACE, EDGE)],
+        certified=Ellipsoids(plan[certified], shapes[certified]),
+        paths=[DrawnPath(plan, "planned", width=0.9, zorder=3)],
+    )  # fmt: skip
 
 
 def _levels(axes: Axes, funnel: Funnel) -> None:

@@ -18,19 +18,18 @@ UNCOLOURED = 0.5, 0.5, 0.5, 1.0  # the colour of a geom whose MJCF gives none
 SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker
 
+Triangles = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]  # vertices (v, 3) in metres, and faces (f, 3)
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnGeom:
-    """A geom as pictures outside of MuJoCo draw it, in its own axes.
+    """A geom as pictures outside of MuJoCo draw it, in its own axes, with its number in the model.
 
     Attributes:
-      number: its number in the model.
-      kind: its type in the words of the MJCF, such as "capsule".
-      size: (3,) as in the MJCF, in metres; a plane without an end is twice as wide as the scene.
-      colour: (4,) red, green, blue and opacity; of a texture, the mean.
-      moves: whether its body is not fixed to the world.
-      triangles: vertices (v, 3) in metres and faces (f, 3) of a mesh, a height field or a signed distance function;
-        None for the other kinds.
+      kind: in the words of the MJCF, such as "capsule".
+      size: (3,) as in the MJCF; a plane without an end is twice as wide as the scene.
+      colour: (4,); of a texture, the mean.
+      triangles: of a mesh, a height field or a signed distance function.
     """
 
     number: int
@@ -39,22 +38,19 @@ class DrawnGeom:
     size: Array
     colour: Array
     moves: bool
-    triangles: tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]] | None
+    triangles: Triangles | None
 
 
 class RecordedTrial:
     """A trial. A diverged trial stands still from its last finite state on.
 
     Attributes:
-      model: the model to draw.
       robot: number of the robot's body in the model.
       planar: whether the robot is seen from above, with its overlays on the floor.
       floor: height of the ground below the robot in the first frame, in metres.
       size: radius in metres of what stands for the robot at its position; see `drawn_size`.
-      end: end of the plan, in seconds.
-      times: (k,) times of the finite states.
-      states, measured: (k, n).
-      error, clearance: (k,) in metres.
+      end: of the plan, in seconds.
+      times: (k,) of the finite states, with `states`, `measured`, `error` and `clearance`.
       force: (T, 3) in N, averaged over FORCE_WINDOW.
     """
 
@@ -119,11 +115,7 @@ class RecordedTrial:
 
     def _between(self, places: Array, times: Array, at: Array | float) -> Array:
         """Points (..., 3) in the world at the times `at`, between places (k, 2 or 3) at `times`."""
-        return self.rollout.in_world(self._interpolated(places, times, at), height=self.floor)
-
-    @staticmethod
-    def _interpolated(values: Array, times: Array, at: Array | float) -> Array:
-        return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
+        return self.rollout.in_world(interpolated(places, times, at), height=self.floor)
 
     def place_in(self, data: mujoco.MjData) -> Array:
         """Place (3,) of the robot in the posed model."""
@@ -147,6 +139,11 @@ class RecordedTrial:
         if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
             return ""
         return f"collided with {run.obstacles[k]}" if run.collided[k] else run.outcome[k]
+
+
+def interpolated(points: Array, times: Array, at: Array | float) -> Array:
+    """Points (..., c) between rows of a table (k, c), which belong to increasing times (k,)."""
+    return np.stack([np.interp(at, times, column) for column in points.T], axis=-1)
 
 
 def _recent_mean(forces: Array, dt: float) -> Array:
@@ -174,13 +171,10 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     hide_hulls(model)
     robot_body(model, rollout.body)
     if rollout.balls is not None and (rollout.balls.anchors[:, 0] >= model.nbody).any():
-        raise InputError(
-            f"rollout.balls.anchors: got a body that the model does not have, want one of its {model.nbody}"
-        )
-    if model.nq != rollout.frames.shape[-1]:
-        raise InputError(
-            f"rollout.frames: got {rollout.frames.shape[-1]} numbers a frame, want {model.nq}, as the model has"
-        )
+        wanted = f"want one of its {model.nbody}"
+        raise InputError(f"rollout.balls.anchors: got a body that the model does not have, {wanted}")
+    if model.nq != (numbers := rollout.frames.shape[-1]):
+        raise InputError(f"rollout.frames: got {numbers} numbers a frame, want {model.nq}, as the model has")
     if (geoms := rollout.obstacle_geoms) is not None:
         if (geoms >= model.ngeom).any():
             raise InputError(f"rollout.obstacle_geoms: got {geoms.max()}, want numbers below {model.ngeom}")
@@ -206,7 +200,7 @@ def with_sky(xml: str) -> str:
 
 def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:
     """The geoms of a model that MuJoCo's own pictures show."""
-    found = []
+    geoms = []
     for geom in range(model.ngeom):
         colour, size = _colour(model, geom), model.geom_size[geom].copy()
         if model.geom_group[geom] >= SHOWN_GROUPS or colour[3] == 0:
@@ -222,11 +216,11 @@ def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:
         if kind == "hfield":
             triangles = _surface(model, shape)
         name, moves = model.geom(geom).name or f"geom {geom}", model.body_weldid[model.geom_bodyid[geom]] != 0
-        found.append(DrawnGeom(geom, name, kind, size, colour, bool(moves), triangles))
-    return found
+        geoms.append(DrawnGeom(geom, name, kind, size, colour, bool(moves), triangles))
+    return geoms
 
 
-def _surface(model: mujoco.MjModel, field: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+def _surface(model: mujoco.MjModel, field: int) -> Triangles:
     """Vertices (v, 3) and faces (f, 3) of the upper side of a height field."""
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     x, y, height, _ = model.hfield_size[field]
@@ -257,7 +251,7 @@ def hide_hulls(model: mujoco.MjModel) -> None:
     """Do not draw colliding meshes of bodies that have other meshes, only for drawing, in the same place."""
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < 3)].tolist())
+    drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < SHOWN_GROUPS)].tolist())
     for geom in np.flatnonzero(is_mesh & collides).tolist():
         if int(model.geom_bodyid[geom]) in drawn:
             model.geom_rgba[geom, 3] = 0
@@ -304,3 +298,15 @@ def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float
     centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
     hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
     return float(centre[2] - max(hit, 0.0))
+
+
+def quaternion_of(rotation: Array) -> Array:
+    """The quaternion (4,) of a rotation (3, 3) or (9,), scalar first."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    return quaternion
+
+
+def in_bytes(colours: npt.ArrayLike) -> list[list[int]]:
+    """Red, green and blue (k, 3) in bytes, of colours (k, 3 or 4) from numbers between 0 and 1."""
+    return np.round(255 * np.asarray(colours, dtype=np.float64)[:, :3]).astype(int).tolist()

@@ -43,7 +43,6 @@ def encoder(
       size: width and height.
       rate: frames per second.
       crf, preset: x264's settings of quality and compression.
-      metadata: text that is embedded in the file.
     """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:
@@ -92,8 +91,8 @@ def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pix
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="encoder") as executor:
         yield put
-        for one in waiting:
-            one.result()
+        for encoded in waiting:
+            encoded.result()
 
 
 FADE_SECONDS = 0.25
@@ -150,13 +149,7 @@ def render(
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another camera of the model.
       insets: more cameras, in panes next to the first. In panes of `top` and `side` robots have a green mark.
       titles: titles of the runs, in the place of robot and scene.
-      overlays: drawings over the scene. plan: the planned path. ghost: a disc or ball at the robot's planned
-        position, or its hand's. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind,
-        averaged over the last fifth of a second. measured: the last measured states, if they differ from the true
-        states. tube: the states predicted under the disturbances, within 2 standard deviations, if there is a
-        `rollout.tube` and as far as it is not too wide. cost_tube: ellipsoids of low total cost. funnel: its projection
-        onto the position, pale between its knots. caption: time, tracking error, clearance, disturbances, whether the
-        run is in the funnel.
+      overlays: what is drawn over the scene, of `view.OVERLAY_KINDS`.
       solution: the solution that was run, for `cost_tube`; one for all runs, or one for each.
       funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and compression of the video.
@@ -167,9 +160,6 @@ def render(
 
     Returns:
       The path. A notebook shows the video if the call is a cell's last expression.
-
-    Raises:
-      InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
     """
     path = _checked_path(path, ".mp4", ".gif")
     check_progress(progress)
@@ -220,8 +210,7 @@ def render_still(
 ) -> PictureFile:
     """Write a picture (png) of one moment.
 
-    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures. Everything
-    else, including exceptions, is as in `render`.
+    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures.
 
     Args:
       runs: one rollout, or several rollouts to be shown side by side.
@@ -240,9 +229,6 @@ def render_still(
 
     Returns:
       The path. A notebook shows the picture if the call is a cell's last expression.
-
-    Raises:
-      InputError: as in `render`.
     """
     path = _checked_path(path, ".png")
     options = PictureOptions(

@@ -1,4 +1,4 @@
-"""A trial as a recording for Rerun's viewer: geometry, plan, tube and numbers on one timeline, in seconds.
+"""A trial as a recording for Rerun's viewer: geometry, overlays and numbers on one timeline, in seconds.
 
 Rerun is the package `rerun-sdk`, in the extra `rerun`.
 """
@@ -10,47 +10,45 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, PLAN_RGB, TUBE, DrawnFunnel, of_funnel
-from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms
+from lqrsim.view.options import Overlay
+from lqrsim.view.overlays import Arrow, Dots, Drawable, DrawnTube, Line, MovingBody, Overlays, colour_of, common_scale
+from lqrsim.view.recorded_trial import RecordedTrial, Triangles, drawn_geoms, quaternion_of
 
 TIMELINE = "time"
-DRIVEN = (0.0, 0.45, 0.7)
+GHOST_OPACITY = 0.6  # of a ball without shading
 FLAT = 1e-4  # m, half thickness of flat shapes
-ARROW = 0.2  # length of the largest force's arrow, relative to the extent of the scene
+# The tube is shown at its time, as wide as it is, and texts are the numbers.
+OVERLAYS: tuple[Overlay, ...] = ("plan", "trace", "ghost", "measured", "forces")
+ENTITIES = {
+    "trace": ["path"], "ghost": ["planned"], "forces": ["force"],
+    "funnel": ["funnel", "certified"], "interpolated": ["funnel", "interpolated"],
+}  # fmt: skip
 
 
 def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> None:
-    """Write a trial as FILE.rrd.
-
-    Args:
-      rollout: the result of `simulate`, with frames.
-      path: path of the file.
-      trial: row of the rollout.
-      funnel: a funnel about the plan of the run.
-
-    Raises:
-      InputError: there is no such trial, nothing of it can be drawn, the funnel has another plan or no position, the
-        file cannot be written, or the package is missing.
-    """
+    """Write a trial as FILE.rrd, with a funnel about its plan. Raises InputError if the package is missing."""
     path = check_path("path", path, "the path of a file")
     rerun, recorded = _package(path), RecordedTrial(rollout, trial)
-    drawn = None if funnel is None else of_funnel(recorded, funnel)
+    shown: tuple[Overlay, ...] = OVERLAYS if funnel is None else (*OVERLAYS, "funnel")
+    steps = rollout.plan.steps
+    overlays = Overlays(recorded, shown, common_scale([recorded]), funnel=funnel, segments=steps)
     with replacing(path) as unfinished:
-        name = f"{rollout.robot} in {rollout.scene}, trial {rollout.first_trial + trial}"
         stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
         stream.save(unfinished)
-        stream.send_recording_name(name)
-        _draw_model(rerun, stream, recorded)
-        _draw_plan(rerun, stream, recorded)
-        if drawn is not None:
-            _draw_funnel(rerun, stream, drawn)
-        _draw_numbers(rerun, stream, recorded)
+        stream.send_recording_name(f"{rollout.robot} in {rollout.scene}, trial {rollout.first_trial + trial}")
+        recording = _Recording(rerun, stream, recorded)
+        recording.draw_model()
+        for drawable in overlays.drawables:
+            recording.draw(drawable)
+        recording.draw_tube()
+        recording.draw_numbers()
         stream.disconnect()
 
 
@@ -62,125 +60,133 @@ def _package(path: Path) -> Any:
         raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
 
 
-def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
-    """Draw the geoms of the model: fixed ones once, moving ones at each recorded frame."""
-    data = mujoco.MjData(recorded.model)
-    frames, places, turns = recorded.frame_times, [], []
-    for time in frames:
-        recorded.pose(data, float(time))
-        places.append(data.geom_xpos.copy())
-        turns.append(np.array([_quaternion(matrix.reshape(3, 3)) for matrix in data.geom_xmat]))
-    for geom in drawn_geoms(recorded.model):
-        entity = ["world", "model", f"{geom.number} {geom.name}"]
-        stream.log(entity, _shape(rerun, geom), static=True)
-        if geom.moves:
-            moved = [place[geom.number] for place in places], [turn[geom.number] for turn in turns]
-            columns = rerun.Transform3D.columns(translation=moved[0], quaternion=moved[1])
-            _send(rerun, stream, entity, frames, columns)
-        else:
-            pose = rerun.Transform3D(translation=places[0][geom.number], quaternion=turns[0][geom.number])
-            stream.log(entity, pose, static=True)
+class _Recording:
+    """A recording of one trial."""
+
+    def __init__(self, rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
+        self.rerun, self.stream, self.recorded = rerun, stream, recorded
+
+    def draw_model(self) -> None:
+        """Draw the geoms of the model: fixed ones once, moving ones at each recorded frame."""
+        recorded, data = self.recorded, mujoco.MjData(self.recorded.model)
+        places, turns = [], []
+        for time in recorded.frame_times:
+            recorded.pose(data, float(time))
+            places.append(data.geom_xpos.copy())
+            turns.append([_scalar_last(matrix) for matrix in data.geom_xmat])
+        for geom in drawn_geoms(recorded.model):
+            i, entity = geom.number, ["world", "model", f"{geom.number} {geom.name}"]
+            self._log(entity, self._shape(geom.kind, geom.size, geom.colour, geom.triangles))
+            if geom.moves:
+                pose = {"translation": [place[i] for place in places], "quaternion": [turn[i] for turn in turns]}
+                self._send(entity, recorded.frame_times, self.rerun.Transform3D.columns(**pose))
+            else:
+                self._log(entity, self.rerun.Transform3D(translation=places[0][i], quaternion=turns[0][i]))
+
+    def _shape(self, kind: str, size: Array, colour: npt.ArrayLike, triangles: Triangles | None = None) -> Any:
+        """Rerun's shape for a geom, in the geom's own axes."""
+        rerun, colours = self.rerun, [_bytes(colour)]
+        solid = {"colors": colours, "fill_mode": "solid"}
+        if kind == "plane":
+            return rerun.Boxes3D(half_sizes=[[*size[:2], FLAT]], centers=[[0, 0, -FLAT]], **solid)
+        if kind == "box":
+            return rerun.Boxes3D(half_sizes=[size], **solid)
+        if kind in ("sphere", "ellipsoid"):
+            return rerun.Ellipsoids3D(half_sizes=[size if kind == "ellipsoid" else [size[0]] * 3], **solid)
+        if kind == "cylinder":
+            return rerun.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **solid)
+        if kind == "capsule":  # Rerun's capsule begins at its origin
+            lower = [[0, 0, -size[1]]]
+            return rerun.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=lower, **solid)
+        assert triangles is not None
+        vertices, faces = triangles
+        return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colours[0])
+
+    def draw(self, drawable: Drawable) -> None:
+        """Draw an overlay: lines and a funnel as a whole, everything else at its times."""
+        rerun, entity = self.rerun, ["world", *ENTITIES.get(drawable.name, [drawable.name])]
+        match drawable:
+            case Line():
+                colour, thin = _bytes(drawable.rgba), 0.002 * self.recorded.model.stat.extent
+                self._log(entity, rerun.LineStrips3D([drawable.points], colors=[colour], radii=[thin]))
+            case Dots():
+                self._points(entity, drawable.times, drawable.points, drawable.rgba, drawable.half_sizes[0])
+            case MovingBody(name="ghost"):
+                colour = (*colour_of("ghost"), GHOST_OPACITY)
+                self._points(entity, drawable.times, drawable.places, colour, drawable.size[0])
+            case MovingBody():
+                self._log(entity, self._shape(drawable.kind, drawable.size, drawable.rgba))
+                times = self.recorded.frame_times
+                turns = [_scalar_last(drawable.rotation)] * len(times)
+                pose = rerun.Transform3D.columns(translation=drawable.at(times), quaternion=turns)
+                self._send(entity, times, pose)
+            case DrawnTube():
+                ellipsoids = self._ellipsoids(drawable.centres, drawable.half_axes, drawable.rotations)
+                self._log(entity, rerun.Ellipsoids3D(**ellipsoids, colors=[_bytes(drawable.rgba[:3])]))
+            case Arrow():
+                times = self.recorded.times[self.recorded.times < self.recorded.end]
+                forces = np.array([self.recorded.force_at(float(time)) for time in times])
+                arrows = rerun.Arrows3D.columns(
+                    vectors=forces * drawable.metres_per_newton,
+                    origins=self.recorded.driven(times),
+                    colors=[_bytes(drawable.rgba)] * len(times),
+                )
+                self._send(entity, times, arrows)
+
+    def draw_tube(self) -> None:
+        """Draw the ellipsoid of the predicted tube at each knot, however wide it is."""
+        run = self.recorded.rollout
+        if run.tube is not None and run.state_coordinates.position:
+            axes = run.in_world(np.eye(run.tube.shape[1])) - run.in_world(np.zeros(run.tube.shape[1]))
+            plan = self.recorded.planned(run.times)
+            half_axes, rotations = Ellipsoids(plan, axes.T @ run.tube @ axes).axes()
+            ellipsoids = self._ellipsoids(plan, np.maximum(half_axes, FLAT), rotations)
+            columns = self.rerun.Ellipsoids3D.columns(**ellipsoids, colors=[_bytes(colour_of("tube"))] * len(plan))
+            self._send(["world", "tube"], run.times, columns)
+
+    def draw_numbers(self) -> None:
+        """Draw states, controls, tracking error, clearance and chance of collision over time."""
+        recorded, run, trial = self.recorded, self.recorded.rollout, self.recorded.trial
+        known = len(recorded.times)
+        numbers = {("error", f"tracking error, {run.tracking_unit}"): recorded.error}
+        if np.isfinite(recorded.clearance).all():
+            numbers["clearance", "clearance, m"] = recorded.clearance
+        if run.collision_chance is not None:
+            numbers["chance", "chance of collision"] = run.collision_chance[:known]
+        for i, label in enumerate(run.state_coordinates.labels):
+            numbers["states", label] = recorded.states[:, i]
+            numbers["plan", label] = run.plan.states[:known, i]
+        for i, label in enumerate(run.control_coordinates.labels):
+            numbers["commanded", label] = run.commanded[trial, : known - 1, i]
+            numbers["applied", label] = run.applied[trial, : known - 1, i]
+        for entity, values in numbers.items():
+            finite = np.isfinite(values)
+            if finite.any():
+                times = recorded.times[: len(values)][finite]
+                self._send(["numbers", *entity], times, self.rerun.Scalars.columns(scalars=values[finite]))
+
+    def _points(self, entity: list[str], times: Array, points: Array, colour: npt.ArrayLike, radius: float) -> None:
+        count = len(points)
+        columns = self.rerun.Points3D.columns(positions=points, colors=[_bytes(colour)] * count, radii=[radius] * count)
+        self._send(entity, times, columns)
+
+    @staticmethod
+    def _ellipsoids(centres: Array, half_axes: Array, rotations: Array) -> dict[str, Any]:
+        quaternions = [_scalar_last(rotation) for rotation in rotations]
+        return {"centers": centres, "half_sizes": half_axes, "quaternions": quaternions}
+
+    def _log(self, entity: list[str], shape: Any) -> None:
+        self.stream.log(entity, shape, static=True)
+
+    def _send(self, entity: list[str], times: Array, columns: Any) -> None:
+        path, index = self.rerun.new_entity_path(entity), self.rerun.TimeColumn(TIMELINE, duration=times.tolist())
+        self.rerun.send_columns(path, [index], columns, recording=self.stream)
 
 
-def _shape(rerun: Any, geom: DrawnGeom) -> Any:
-    """Rerun's shape for a geom, in the geom's own axes."""
-    size, kind, colours = geom.size, geom.kind, [_bytes(geom.colour)]
-    solid = {"colors": colours, "fill_mode": "solid"}
-    if kind == "plane":
-        return rerun.Boxes3D(half_sizes=[[*size[:2], FLAT]], centers=[[0, 0, -FLAT]], **solid)
-    if kind == "box":
-        return rerun.Boxes3D(half_sizes=[size], **solid)
-    if kind in ("sphere", "ellipsoid"):
-        return rerun.Ellipsoids3D(half_sizes=[size if kind == "ellipsoid" else [size[0]] * 3], **solid)
-    if kind == "cylinder":
-        return rerun.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **solid)
-    if kind == "capsule":  # Rerun's capsule begins at its origin
-        lower = [[0, 0, -size[1]]]
-        return rerun.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=lower, **solid)
-    assert geom.triangles is not None
-    vertices, faces = geom.triangles
-    return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colours[0])
-
-
-def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
-    """Draw plan and path as lines; and over time the planned position, the tube and the force."""
-    run = recorded.rollout
-    plan, driven = recorded.planned(run.times), recorded.driven(recorded.times)
-    thin = 0.002 * recorded.model.stat.extent
-    for name, line, colour in (("plan", plan, PLAN_RGB), ("path", driven, DRIVEN)):
-        shape = rerun.LineStrips3D([line], colors=[_bytes(np.array(colour))], radii=[thin])
-        stream.log(["world", name], shape, static=True)
-    count = len(plan)
-    ball = rerun.Points3D.columns(
-        positions=plan, colors=[_bytes(np.array([*PLAN_RGB, 0.6]))] * count, radii=[run.radius] * count
-    )
-    _send(rerun, stream, ["world", "planned"], run.times, ball)
-    if run.tube is not None and run.state_coordinates.position:
-        axes = run.in_world(np.eye(run.tube.shape[1])) - run.in_world(np.zeros(run.tube.shape[1]))
-        half_axes, turns = Ellipsoids(plan, axes.T @ run.tube @ axes).axes()
-        tube = rerun.Ellipsoids3D.columns(
-            half_sizes=np.maximum(half_axes, FLAT),
-            centers=plan,
-            quaternions=[_quaternion(turn) for turn in turns],
-            colors=[_bytes(np.array(TUBE))] * count,
-        )
-        _send(rerun, stream, ["world", "tube"], run.times, tube)
-    if (largest := float(np.linalg.norm(recorded.force, axis=1).max())) > 0:
-        times = recorded.times[recorded.times < run.times[-1]]
-        forces = np.array([recorded.force_at(float(time)) for time in times])
-        arrows = rerun.Arrows3D.columns(
-            vectors=forces * ARROW * recorded.model.stat.extent / largest,
-            origins=recorded.driven(times),
-            colors=[_bytes(np.array(FORCE))] * len(times),
-        )
-        _send(rerun, stream, ["world", "force"], times, arrows)
-
-
-def _draw_funnel(rerun: Any, stream: Any, funnel: DrawnFunnel) -> None:
-    """Draw the certified and the interpolated ellipsoids, at all times."""
-    for name, tube, colour in (("certified", funnel.certified, FUNNEL), ("interpolated", funnel.between, BETWEEN)):
-        if tube is not None:
-            centres, half_axes, turns = tube.in_world
-            quaternions = [_quaternion(turn) for turn in turns]
-            shape = rerun.Ellipsoids3D(
-                half_sizes=half_axes, centers=centres, quaternions=quaternions, colors=[_bytes(np.array(colour))]
-            )
-            stream.log(["world", "funnel", name], shape, static=True)
-
-
-def _draw_numbers(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
-    """Draw states, controls, tracking error, clearance and chance of collision over time."""
-    run, trial, begun = recorded.rollout, recorded.trial, len(recorded.times)
-    numbers = {("error", f"tracking error, {run.tracking_unit}"): recorded.error}
-    if np.isfinite(recorded.clearance).all():
-        numbers["clearance", "clearance, m"] = recorded.clearance
-    if run.collision_chance is not None:
-        numbers["chance", "chance of collision"] = run.collision_chance[:begun]
-    for which, label in enumerate(run.state_coordinates.labels):
-        numbers["states", label] = recorded.states[:, which]
-        numbers["plan", label] = run.plan.states[:begun, which]
-    for which, label in enumerate(run.control_coordinates.labels):
-        numbers["commanded", label] = run.commanded[trial, : begun - 1, which]
-        numbers["applied", label] = run.applied[trial, : begun - 1, which]
-    for path, values in numbers.items():
-        known = np.isfinite(values)
-        times = recorded.times[: len(values)][known]
-        if known.any():
-            _send(rerun, stream, ["numbers", *path], times, rerun.Scalars.columns(scalars=values[known]))
-
-
-def _send(rerun: Any, stream: Any, entity: list[str], times: Array, columns: Any) -> None:
-    path = rerun.new_entity_path(entity)
-    rerun.send_columns(path, [rerun.TimeColumn(TIMELINE, duration=times.tolist())], columns, recording=stream)
-
-
-def _bytes(colour: Array) -> list[int]:
-    """A colour in bytes, from numbers between 0 and 1."""
+def _bytes(colour: npt.ArrayLike) -> list[int]:
     return np.round(255 * np.clip(colour, 0, 1)).astype(int).tolist()
 
 
-def _quaternion(matrix: Array) -> Array:
-    """The quaternion of a rotation (3, 3), scalar last, as in Rerun."""
-    found = np.empty(4)
-    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
-    return np.roll(found, -1)
+def _scalar_last(rotation: Array) -> Array:
+    """The quaternion of a rotation as Rerun wants it."""
+    return np.roll(quaternion_of(rotation), -1)

@@ -83,9 +83,6 @@ def figure(
     Args:
       size: inches wide and high. By default `style` gives the width, `arrange` the height, and the layout keeps titles,
         ticks and labels apart.
-
-    Raises:
-      InputError: a path has another suffix, there is no such style, or a file cannot be written.
     """
     places = [check_path("path", path) for path in paths]
     for place in places:

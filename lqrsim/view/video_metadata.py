@@ -28,10 +28,7 @@ Positive = Annotated[float, Bounds(above=0.0)]
 class Pane:
     """A part of the picture that shows one trial, in pixels from the upper left corner.
 
-    Attributes:
-      run: number of the rollout among the rollouts of the metadata.
-      trial: row of the rollout.
-      camera: the calibrated camera; None for other cameras.
+    It shows a row of one of the rollouts of the metadata, with a camera if that is calibrated.
     """
 
     left: int
@@ -52,13 +49,9 @@ class VideoMetadata:
 
     Attributes:
       runs: digests of the rollouts.
-      markers: radius in metres of each robot's mark in panes with a camera; see `overlays.py`.
-      rate: frames per second.
+      markers: radius in metres of each robot's mark in panes with a camera; see `geoms.py`.
+      rate: frames per second, `frames` in all.
       speed: seconds of the run per second of the video.
-      frames: number of frames.
-
-    Raises:
-      InputError: a field is out of range, or the fields do not fit together.
     """
 
     runs: tuple[Line, ...]
@@ -95,7 +88,7 @@ class VideoMetadata:
             rate = Fraction(parts["rate"])
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
             raise InputError(f"video metadata: got {excerpt(text)}, which is damaged ({error})") from None
-        tree = {name: one for name, one in parts.items() if name not in ("format", "version")}
+        tree = {name: part for name, part in parts.items() if name not in ("format", "version")}
         return record_from(cls, tree | {"rate": rate}, "metadata")
 
     def times(self) -> np.ndarray:

@@ -31,6 +31,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
+from lqrsim.view.geoms import appending_to
 from lqrsim.view.recorded_trial import model_of
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
@@ -62,12 +63,12 @@ class MovableGoal:
             )
         self._dynamics, self._cost = problem.dynamics, problem.final_cost
         references = references_of(self._cost, self._dynamics)
-        found = [(term, one) for term, one in references if one.weight[self._position].any()]
-        if len(found) != 1:
+        of_position = [(term, reference) for term, reference in references if reference.weight[self._position].any()]
+        if len(of_position) != 1:
             raise InputError(
-                f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move its goal"
+                f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one to move its goal"
             )
-        ((self._drawing, self._reference),) = found
+        ((self._drawing, self._reference),) = of_position
         self.place = self._reference.about[self._position]
 
     def cost_at(self, place: Array) -> Cost:
@@ -102,7 +103,6 @@ class ViewedReplanner(Controller):
         self.live, self.plant, self.viewer, self.goal = live, plant, viewer, goal
 
     def start(self, trials: int) -> ControllerRun:
-        """The run of the single robot."""
         return _ViewedRun(self)
 
     @property
@@ -118,43 +118,38 @@ class ViewedReplanner(Controller):
 class _ViewedRun(ControllerRun):
     """A run, which begins with the goal and the plan of the problem."""
 
-    def __init__(self, of: ViewedReplanner) -> None:
-        self._live, self._plant, self._viewer, self._goal = of.live, of.plant, of.viewer, of.goal
-        self._place = np.zeros(0) if of.goal is None else of.goal.place  # place of the goal in the present plan
-        if of.goal is not None:
-            of.viewer.move_goal(of.goal.place)
-        self._show(of.live.active)
+    def __init__(self, controller: ViewedReplanner) -> None:
+        self._controller, goal = controller, controller.goal
+        self._planned_goal = np.zeros(0) if goal is None else goal.place
+        if goal is not None:
+            controller.viewer.move_goal(goal.place)
+        self._show(controller.live.active)
 
     def control(self, step: int, measured: Array) -> Array:
-        live, t = self._live, step * self._live.problem.dt
-        self._take_goal()
-        before = live.active
+        live, viewer, goal = self._controller.live, self._controller.viewer, self._controller.goal
+        t, before = step * live.problem.dt, live.active
+        if goal is not None and not np.array_equal(viewer.goal, self._planned_goal):  # the person has moved it
+            self._planned_goal = viewer.goal
+            live.change(final_cost=goal.cost_at(viewer.goal))
         command = live.step(measured[0], t)
         if live.active is not before:
             self._show(live.active)
-        self._viewer.remark = caption(live, t)
+        viewer.remark = caption(live, t)
         return command[None]
 
     def summary(self) -> str:
-        return self._live.summary()
-
-    def _take_goal(self) -> None:
-        """Plan for the goal at the place to which the person has moved it."""
-        if self._goal is None or np.array_equal(self._viewer.goal, self._place):
-            return
-        self._place = self._viewer.goal
-        self._live.change(final_cost=self._goal.cost_at(self._place))
+        return self._controller.live.summary()
 
     def _show(self, active: ActivePlan) -> None:
         plan = active.plan.trajectory
-        balls = self._plant.record_of_balls(plan.states, plan.states[None])
-        self._viewer.follow(plan, balls, begins=active.first * plan.dt)
+        balls = self._controller.plant.record_of_balls(plan.states, plan.states[None])
+        self._controller.viewer.follow(plan, balls, begins=active.first * plan.dt)
 
 
 def caption(live: LiveReplanner, t: float) -> str:
     """The plan in force and its age, and statistics of the solves, as lines."""
     begun, log = live.active.first * live.problem.dt, live.log
-    took, kept = [1e3 * one.seconds for one in log.records[-RECENT:]], log.kept
+    took, kept = [1e3 * record.seconds for record in log.records[-RECENT:]], log.kept
     if not took:
         solves = "no solve yet"
     else:
@@ -242,14 +237,9 @@ class Window(Viewer):
 
     def show(self, time: float, qpos: Array) -> Array:
         place, scene = super().show(time, qpos), self._viewer.user_scn
-
-        def new() -> mujoco.MjvGeom:
-            scene.ngeom += 1
-            return scene.geoms[scene.ngeom - 1]
-
         with self._viewer.lock():
             scene.ngeom = 0
-            self.draw_overlays(new)
+            self.draw_overlays(appending_to(scene))
         self._viewer.set_texts((None, None, self.caption, None))
         return place
 
@@ -264,18 +254,20 @@ def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     model = model_of(rollout, trial)
     if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
         raise InputError(f"rollout: got trial {trial} without a finite state, want one that can be shown")
-    where = {"space": rollout.state_coordinates, "body": rollout.body, "radius": rollout.radius}
-    return {"model": model, "plan": rollout.plan, "balls": rollout.balls, **where}
+    return {
+        "model": model, "plan": rollout.plan, "space": rollout.state_coordinates, "body": rollout.body,
+        "radius": rollout.radius, "balls": rollout.balls,
+    }  # fmt: skip
 
 
 def arguments_for_plant(plant: Plant, solution: Solution, goal: MovableGoal | None = None) -> dict[str, Any]:
     """Arguments of a Viewer for a live run, and for moving its goal."""
-    robot = plant.robot
-    where = {"space": robot.dynamics.state_coordinates, "body": robot.body, "radius": robot.radius}
-    states = solution.trajectory.states
-    balls = plant.record_of_balls(states, states[None])
+    robot, plan = plant.robot, solution.trajectory
     model, name = (plant.model, None) if goal is None else model_with_goal(plant, goal)
-    return {"model": model, "goal": name, "plan": solution.trajectory, "balls": balls, **where}
+    return {
+        "model": model, "goal": name, "plan": plan, "space": robot.dynamics.state_coordinates, "body": robot.body,
+        "radius": robot.radius, "balls": plant.record_of_balls(plan.states, plan.states[None]),
+    }  # fmt: skip
 
 
 class _UserForces(Disturbance):

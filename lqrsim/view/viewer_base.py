@@ -2,22 +2,20 @@
 
 import abc
 import copy
-import itertools
 import time as clock
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.view.overlays import PLAN_RGB, decorate
+from lqrsim.view import geoms
+from lqrsim.view.overlays import Line, MovingBody, colour_of
 from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
-PLANNED_RGBA = (*PLAN_RGB, 0.25)
+GHOST_OPACITY = 0.25
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # number of segments of the plan; the trace has twice as many
 LIFT = 0.008  # m, height of lines above the floor
@@ -47,21 +45,16 @@ class Viewer(abc.ABC):
     """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
 
     Args:
-      model: the model to be shown.
-      plan: plan of the run.
       space: coordinates of the plan's states.
       body: name of the robot's body in the model.
-      radius: radius of the robot, in metres.
-      balls: the balls with their planned positions, for a robot without a position.
+      balls: with their planned positions, for a robot without a position.
       goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
       push: velocity that a key adds, in m/s.
-      speed: speed of the time shown; 1 is real time.
-      seconds: time after which the viewer closes; never by default.
+      speed: of the time shown; 1 is real time.
+      seconds: after which the viewer closes; never by default.
 
     Attributes:
-      data: the state that is shown.
-      caption: the state as lines of text.
-      remark: further lines of the caption.
+      data: the state that is shown, and its `caption` in lines, the last of which are the `remark`.
       wrench: force and torque (6,) of a drag.
       holds_goal: whether mouse and keys move the goal instead of the robot.
     """
@@ -197,19 +190,20 @@ class Viewer(abc.ABC):
         """The planned place now, (3,)."""
         return self._on_floor([np.interp(self._time, self._times, column) for column in self._places.T])
 
-    def draw_overlays(self, new: Callable[[], mujoco.MjvGeom]) -> None:
+    def draw_overlays(self, new: geoms.NewGeom) -> None:
         """Draw the plan, the trace and the planned place; `new` returns a new geom."""
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
-        plan = [self._on_floor(self._places[knot]) for knot in knots]
-        width = 0.002 * float(self.model.stat.extent)
-        for points, thick, colour in ((plan, 0.6 * width, (*PLAN_RGB, 1.0)), (self._trace, width, TRACE_RGBA)):
-            for ends in itertools.pairwise(points):
-                geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
-                mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
+        plan = np.array([self._on_floor(self._places[knot]) for knot in knots])
+        width, colour, flat = 0.002 * float(self.model.stat.extent), colour_of("plan"), self.space.from_above
         radius = self.radius if self._balls is None else float(self._balls.radii[-1])
-        flat = self.space.from_above
-        shape = (Geom.mjGEOM_CYLINDER, [radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [radius] * 3)
-        decorate(new(), *shape, self.planned_position(), PLANNED_RGBA)
+        kind, size = "cylinder" if flat else "sphere", np.array([radius, LIFT, 0.0])
+        place, now = self.planned_position()[None], np.zeros(1)
+        for drawable in (
+            Line("plan", (*colour, 1.0), "", plan, (0.6 * width, 0.6 * width)),
+            Line("trace", TRACE_RGBA, "", np.array(self._trace), (width, width)),
+            MovingBody("ghost", (*colour, GHOST_OPACITY), "", kind, size, np.eye(3), now, place),
+        ):
+            geoms.draw(drawable, self._time, new, emission=0.0)
 
     def aim_camera(self, camera: mujoco.MjvCamera) -> None:
         """Aim a free camera as the scene's `overview` camera, if it has one."""

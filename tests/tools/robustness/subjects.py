@@ -73,6 +73,8 @@ def public() -> Iterator[tuple[str, Any]]:
                 one = getattr(item, key)
                 if inspect.isfunction(one) and one.__module__.startswith(item.__name__) and key[0] != "_":
                     yield f"{name}.{key}", one
+        elif not callable(item):  # a table
+            continue
         elif not inspect.isclass(item):
             yield name, item
         elif not issubclass(item, Exception | enum.Enum):
