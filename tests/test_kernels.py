@@ -1059,6 +1059,10 @@ class TestParts:
             rows = clear.bind(CART).rows
             of_constraint(WithinPeriods(clear, np.ones((3, rows)), np.full(rows, 1e-3)).bind(CART))
 
+    def test_constraints_at_knots(self) -> None:
+        near = ls.SymbolicConstraint(lambda x, u, p: p.r - x[0] ** 2, parameters={"r": [0.3, 0.5]}, at=[0, 1])
+        of_constraint(near.bind(CART))
+
     @staticmethod
     def steps(dynamics: ls.Dynamics, x: Array, u: Array, dt: float) -> None:
         n, m = len(x), len(u)
