@@ -1450,6 +1450,13 @@ class TestPlanMethods:
         bent = convex.copy()
         bent[0, :3, :3] -= 1e6 * np.eye(3)
         assert direction(bent) == 4  # nor has the start
+        stages.jump([2])  # where the last state is free again
+        assert direction(convex) == -1
+        bent = convex.copy()
+        bent[2, 2, 2] -= 1e6
+        assert direction(bent) == 2  # a jump without a least
+        replay(source, SIZES, "look", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
 
 
 def test_no_kernel_is_left_out() -> None:
