@@ -397,3 +397,87 @@ def test_a_gymnasium_environment_has_the_duration_that_was_found(tmp_path: Path)
         )
         ended, steps = terminated or truncated, steps + 1
     assert steps == solution.trajectory.steps
+
+
+def near(x: Any, u: Any, p: Any) -> Any:
+    return p.radius**2 - (x[0] - p.x) ** 2
+
+
+def by_waypoints(places: list[float], knots: list[int], end: float, **options: Any) -> ls.Problem:
+    """A cart that passes places, within a centimetre, on its way to where it stops."""
+    passed = ls.SymbolicConstraint(near, parameters={"x": places, "radius": 0.01}, at=knots, name="waypoint")
+    return dataclasses.replace(
+        problem(way=end, steps=40, weight=1e-5), dt=0.2, constraints=[ls.GoalState([end, 0.0]), passed],
+        **{"segments": knots} | options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("places", "knots", "end"),
+    [([2.0], [20], -1.0), ([2.0], [6], -1.0), ([2.0, -1.0], [10, 20], 0.5), *rarely(([1.0], [30], -2.0))],
+)
+def test_segments_take_the_times_that_they_need(places: list[float], knots: list[int], end: float) -> None:
+    """There and back: at each waypoint the cart turns a centimetre before it, so segments last 2 sqrt(way) each.
+
+    That the turns and the switches between them are at knots costs some thousandths, and half a step for each turn.
+    """
+    solution = ls.smooth(by_waypoints(places, knots, end))
+    assert solution.status is Status.CONVERGED, solution.detail
+    turns = np.array([0.0, *(place - 0.01 * np.sign(place) for place in places), end])
+    seconds = 2 * np.sqrt(np.abs(np.diff(turns)))
+    assert seconds.sum() * (1 - 1e-6) <= solution.trajectory.horizon <= 1.005 * seconds.sum()
+    settled = by_waypoints(places, knots, end).settled(solution)
+    assert settled.duration is None
+    assert settled.dt == pytest.approx(solution.trajectory.dt)
+    ends = np.cumsum(seconds)[:-1]
+    np.testing.assert_allclose(np.array(settled.segments) * settled.dt, ends, rtol=0, atol=settled.dt)
+    # The waypoints moved along: the plan keeps the settled problem, and is its optimum.
+    passed = solution.trajectory.states[list(settled.segments), 0]
+    np.testing.assert_allclose(passed, turns[1:-1], rtol=0, atol=1e-5)
+    assert settled.digest == solution.problem_digest
+    again = ls.smooth(settled, start=solution)
+    assert again.status is Status.CONVERGED
+    assert again.cost == pytest.approx(solution.cost, rel=1e-6)
+
+
+def test_rows_by_knot_move_with_segments() -> None:
+    """Each knot has the row of its own segment, and ends of segments keep theirs."""
+    lows = np.full(41, -np.inf)
+    lows[20] = 1.5  # a gate at the end of the first segment
+    rows = np.column_stack([np.arange(41.0), np.zeros(41)])
+    stated = by_waypoints([2.0], [20], -1.0)
+    stage = ls.ControlCost([1e-5]) + ls.QuadraticCost([1e-9, 0.0], about=rows)
+    stated = dataclasses.replace(
+        stated, stage_cost=stage, constraints=[*stated.constraints, ls.StateBounds(x=(lows, 9))]
+    )
+    moved = stated._with_segments([8])
+    _, waypoint, gate = moved.constraints
+    assert moved.segments == waypoint.at == (8,)  # pyright: ignore[reportAttributeAccessIssue]
+    ((low, _),) = gate.state_bounds(stated.dynamics).values()
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(low)), [8])
+    about = moved.stage_cost.terms[1].about[:, 0]  # pyright: ignore[reportAttributeAccessIssue]
+    assert about[[0, 8, 40]].tolist() == [0.0, 20.0, 40.0]
+    assert (np.diff(about) >= 0).all()
+    assert (about[1:8] < 20).all()
+    assert (about[9:40] > 20).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"segments": [20, 10]}, "knots in order"),
+        ({"segments": [1]}, "2 steps"),
+        ({"segments": [39]}, "2 steps"),
+        ({"segments": [2.5]}, "whole numbers"),
+        ({"between_knots": True}, "between_knots"),
+    ],
+)
+def test_segments_that_make_no_sense_are_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ls.InputError, match=said):
+        by_waypoints([2.0], [20], -1.0, **changes)
+
+
+def test_a_plan_of_other_segments_does_not_settle_a_problem() -> None:
+    solution = ls.smooth(problem())
+    with pytest.raises(ls.InputError, match="segments"):
+        by_waypoints([2.0], [20], -1.0).settled(solution)

@@ -61,6 +61,7 @@ FLOORS_WITHIN = {
         ("collision_shape",),
         ("costs",),
         ("constraints",),
+        ("at_knots",),
         (
             "clearance",
             "control_rate",

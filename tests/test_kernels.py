@@ -1059,6 +1059,10 @@ class TestParts:
             rows = clear.bind(CART).rows
             of_constraint(WithinPeriods(clear, np.ones((3, rows)), np.full(rows, 1e-3)).bind(CART))
 
+    def test_constraints_at_knots(self) -> None:
+        near = ls.SymbolicConstraint(lambda x, u, p: p.r - x[0] ** 2, parameters={"r": [0.3, 0.5]}, at=[0, 1])
+        of_constraint(near.bind(CART))
+
     @staticmethod
     def steps(dynamics: ls.Dynamics, x: Array, u: Array, dt: float) -> None:
         n, m = len(x), len(u)
@@ -1446,6 +1450,13 @@ class TestPlanMethods:
         bent = convex.copy()
         bent[0, :3, :3] -= 1e6 * np.eye(3)
         assert direction(bent) == 4  # nor has the start
+        stages.jump([2])  # where the last state is free again
+        assert direction(convex) == -1
+        bent = convex.copy()
+        bent[2, 2, 2] -= 1e6
+        assert direction(bent) == 2  # a jump without a least
+        replay(source, SIZES, "look", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
 
 
 def test_no_kernel_is_left_out() -> None:

@@ -12,6 +12,7 @@ from whole_problems.claims import contradictions
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
+from lqrsim.problem.plain_term import PlainTerm
 from lqrsim.results.solution_parts import Status
 
 anything: Any = ls  # whose types nobody checks
@@ -404,6 +405,28 @@ def test_goals_and_bounds_by_unit_are_those_by_name(seed: int) -> None:
         of(ls.StateBounds({"rad": (0.0, 1.0)}))
 
 
+def test_knots_have_parameters_of_their_own() -> None:
+    """A floor under x at three knots: values, slopes and names are those of a constraint at all of them."""
+    knots, floors = [2, 5, 9], [0.1, 0.3, 0.2]
+    some = ls.SymbolicConstraint(lambda x, u, p: x[0] - p.floor, parameters={"floor": floors}, at=knots, name="floor")
+    stated = problem(some, weight=1.0)
+    (term,) = stated.constraint_terms
+    plain, z = PlainTerm(term, 2, 1), np.array([0.7, -0.2, 0.4])
+    for knot in range(stated.steps + 1):
+        if knot in knots:
+            assert plain.value(z, 0, knot) == pytest.approx(0.7 - floors[knots.index(knot)], rel=1e-15)
+        else:
+            assert plain.value(z, 0, knot) == np.inf
+    bare = ls.smooth(dataclasses.replace(stated, constraints=[]))
+    kept = ls.smooth(stated)
+    assert kept.success
+    assert (bare.trajectory.states[knots, 0] < np.array(floors)).any()
+    assert (kept.trajectory.states[knots, 0] >= np.array(floors) - 1e-6).all()
+    # The rest of the problem has the rest of the knots, each two steps earlier.
+    later = stated.from_state([0.0, 0.0], after=3).constraints[0]
+    assert repr(later).startswith("SymbolicConstraint(at=(2, 6), ")
+
+
 def test_kinds_and_steps_are_part_of_the_digest() -> None:
     kinds = [{}, {"equality": True}, {"at": "final"}, {"equality": True, "at": "final"}]
     cases = [problem(ls.SymbolicConstraint(line, parameters={"slope": 0.1}, **kind)) for kind in kinds]
@@ -422,6 +445,13 @@ def test_kinds_and_steps_are_part_of_the_digest() -> None:
          "got p0 as entry 0, want it to depend on x or u"),
         (lambda: ls.SymbolicConstraint(line, at="start"),
          "SymbolicConstraint: at: got 'start', want one of: all, final"),
+        (lambda: ls.SymbolicConstraint(line, at=[3, 2]),
+         "SymbolicConstraint: at: got [3, 2], want 'all' or 'final', or whole numbers in order, the indices of knots"),
+        (lambda: problem(ls.SymbolicConstraint(line, parameters={"slope": 1.0}, at=[10_000])),
+         "SymbolicConstraint: at: got knot 10000, want knots up to"),
+        (lambda: ls.SymbolicConstraint(line, parameters={"slope": [1.0, 2.0]}, at=[3]),
+         "parameters: slope: got shape (2,), want (1,)"),
+        (lambda: ls.SymbolicConstraint(line, at=[3], equality=True), "equality: got True at some knots"),
         (lambda: anything.SymbolicConstraint(line, equality="yes"), "SymbolicConstraint: equality: got 'yes'"),
         (lambda: problem(ls.GoalState([1, 2, 3])), "GoalState: goal: got 3 numbers, want 2, one for each of x, v"),
         (lambda: ls.GoalState(), "GoalState: got nothing, want a number by name of a state, as GoalState(x=...)"),

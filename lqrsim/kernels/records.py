@@ -261,6 +261,8 @@ class PlanStages(NamedTuple):
 
     Attributes:
       steps: T. soft: 1 if there is an initial cost. free: (N,) 0 for the states that the start fixes, else 1.
+      jumps: (T+1,) 1 at the knots at which the last state is free again, as the start is: it may jump there. At the
+        start, whether there are any. reset: (T+1, N+1) the law of its change there.
       reach: (N,) distances from the start to the goal. state_size, control_size: (N,) and (M,) typical sizes.
       projected: (1,) 1 if the projected Hessians are those of the last plan.
       keeps: (1,) 1 if models of a plan keep the derivatives of the dynamics that are there.
@@ -272,6 +274,8 @@ class PlanStages(NamedTuple):
     steps: int
     soft: int
     free: Arrays
+    jumps: Arrays
+    reset: Arrays
     reach: Arrays
     state_size: Arrays
     control_size: Arrays

@@ -64,6 +64,7 @@ def look(stages, plan, costates, least):
         total += cost_model(t, stages, plan)
     if stages.keeps[0] == 0:
         all_steps_second_order(stages.steps, plan, stages.model, costates, out.arrived, out.jacobian, out.hessian)
+        cut_at_jumps(stages, plan, out.arrived, out.jacobian)
     for t in range(stages.steps, -1, -1):
         add_curvatures(t, stages, plan, least)
     if stages.soft == 1:
@@ -81,6 +82,7 @@ def look_with_own_costates(stages, plan, costates):
         if t < stages.steps and stages.keeps[0] == 0:
             x, u = plan.states[t], plan.controls[t]
             step_second_order(x, u, stages.model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+            cut_at_jump(t, stages, plan, out.arrived, out.jacobian[t])
         add_curvatures(t, stages, plan, 0.0)
         if t > 0:
             lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
@@ -204,7 +206,22 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
 def trial(stages, plan, arrived):
     """Write the state after each step of a plan, (T, N), and return the plan's cost."""
     advance_all(stages.steps, plan, stages.model, arrived)
+    cut_at_jumps(stages, plan, arrived, stages.models.jacobian)
     return cost_of_plan(stages, plan)
+
+
+def cut_at_jumps(stages, plan, arrived, jacobian):
+    """As `cut_at_jump`, at all knots."""
+    if stages.jumps[0] != 0:
+        for t in range(stages.steps):
+            cut_at_jump(t, stages, plan, arrived, jacobian[t])
+
+
+def cut_at_jump(t, stages, plan, arrived, jacobian):
+    """If the last state jumps after a step, it does not depend on the step, and leaves no gap."""
+    if stages.jumps[t + 1] != 0:
+        arrived[t, N - 1] = plan.states[t + 1, N - 1]
+        fill(jacobian[N - 1], W, 0.0)
 
 
 def cost_of_plan(stages, plan):
@@ -339,9 +356,10 @@ def measure(stages, plan, numbers, gaps):
     """Measure the optimality of the plan of the models, whose rows have these values; write its gaps (T, N).
 
     Returns:
-      The largest derivative of the Lagrangian in a control or a free start, times its size; the largest violation of
-      an inequality, negative if all are satisfied; the largest violation of an equality; the largest gap, relative to
-      the state's size; and the largest product of a multiplier and the value of its inequality, if that has no price.
+      The largest derivative of the Lagrangian in a control, a free start or a jump, times its size; the largest
+      violation of an inequality, negative if all are satisfied; the largest violation of an equality; the largest gap,
+      relative to the state's size; and the largest product of a multiplier and the value of its inequality, if that has
+      no price.
     """
     slope, after, rows = stack(W), stack(N), stages.rows
     steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
@@ -351,6 +369,8 @@ def measure(stages, plan, numbers, gaps):
         if t < stages.steps:
             for i in range(M):
                 steepest = larger(steepest, abs(slope[N + i]) * stages.control_size[i])
+            if t > 0 and stages.jumps[t] != 0:
+                steepest = larger(steepest, abs(after[N - 1]) * stages.state_size[N - 1])
             for i in range(N):
                 gaps[t, i] = stages.models.arrived[t, i] - plan.states[t + 1, i]
                 widest = larger(widest, abs(gaps[t, i]) / stages.state_size[i])
@@ -399,6 +419,8 @@ def direction(stages, plan, gaps, share, weight, base, curves, forces):
             copy(slope, N, to_go.gradient[steps])
             copy_matrix(stage, N, N, to_go.hessian[steps])
         elif not riccati_step(t, stage, slope, models.jacobian[t], gaps[t], stages.policy, to_go):
+            return t
+        if t > 0 and stages.jumps[t] != 0 and not jump_law(to_go.hessian[t], to_go.gradient[t], stages.reset[t]):
             return t
     return -1 if forward_sweep(stages, gaps) else steps + 1
 
@@ -507,10 +529,38 @@ def forward_sweep(stages, gaps):
             for j in range(M):
                 total += jacobian[t, i, N + j] * changes.controls[t, j]
             changes.states[t + 1, i] = total
+        if stages.jumps[t + 1] != 0:
+            law, total = stages.reset[t + 1], stages.reset[t + 1, N]
+            for i in range(N - 1):
+                total += law[i] * changes.states[t + 1, i]
+            changes.states[t + 1, N - 1] = total
     for t in range(stages.steps + 1):
         for i in range(N):
             for j in range(N):
                 to_go.gradient[t, i] += to_go.hessian[t, i, j] * changes.states[t, j]
+    return True
+
+
+def jump_law(hessian, gradient, law):
+    """Write the best change of the last state, (N+1,) of the others and 1; reduce the cost-to-go to that of these.
+
+    Returns:
+      Whether there is a best one.
+    """
+    last = N - 1
+    curve = hessian[last, last]
+    if not curve > 0:
+        return False
+    for i in range(last):
+        law[i] = -hessian[last, i] / curve
+    law[last], law[N] = 0.0, -gradient[last] / curve
+    for i in range(last):
+        gradient[i] += law[i] * gradient[last]
+        for j in range(last):
+            hessian[i, j] += law[i] * hessian[last, j]
+    gradient[last] = 0.0
+    for i in range(N):
+        hessian[i, last], hessian[last, i] = 0.0, 0.0
     return True
 
 
@@ -566,7 +616,7 @@ def least_curvatures(stages, curves, held, least):
       Whether the reduced Hessian is positive definite.
     """
     S, stage, none, steps, models = stack(N, N), stack(W, W), zeros(W), stages.steps, stages.models
-    slope = zeros(W)
+    slope, law = zeros(W), stack(N + 1)
     fill(least, M, inf)
     for t in range(steps, -1, -1):
         copy_matrix(models.hessian[t], W, W, stage)
@@ -581,6 +631,8 @@ def least_curvatures(stages, curves, held, least):
                     stage[N + i, j], stage[j, N + i] = 0.0, 0.0
                 stage[N + i, N + i] = inf
         if not reduce_stage(stage, least, S):
+            return False
+        if t > 0 and stages.jumps[t] != 0 and not jump_law(S, none, law):
             return False
     for i in range(N):
         for j in range(N):

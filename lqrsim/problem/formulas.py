@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.sources import source_of
@@ -19,12 +20,24 @@ from lqrsim.codegen.user_functions import (
     name_of,
     with_derivatives,
 )
-from lqrsim.errors import Array, InputError, check_flag, check_name, check_text
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_flag,
+    check_kind,
+    check_name,
+    check_shape,
+    check_text,
+    excerpt,
+    numbers_of,
+)
 from lqrsim.kernels import differences, user_functions
+from lqrsim.problem.at_knots import at_knots
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 
+WANTED = "one of SymPy symbols"  # for a numba function in place of a formula
 MOST_LETTERS = 60  # of an expression that stands for a name: half a line
 
 
@@ -139,13 +152,21 @@ class SymbolicConstraint(OfFormula, Constraint):
     constraint on the state alone acts at the last knot, too. It does not act at a start that is given exactly, because
     that cannot change.
 
+    An inequality may act at some knots alone, with parameters of their own: a waypoint, or a gate.
+
+        def near(x, u, p):  # within 0.3 m of the waypoints (1, 2) at knot 20 and (3, 2) at knot 40
+            return p.radius**2 - (x.x - p.x) ** 2 - (x.y - p.y) ** 2
+
+        ls.SymbolicConstraint(near, parameters={"x": [1.0, 3.0], "y": 2.0, "radius": 0.3}, at=[20, 40])
+
     Args:
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
         must be nonnegative. Either all of them depend on u, or none does. All are solved to the same tolerance, so
         choose units in which values of about 1 matter.
-      parameters: name -> value, as in `Dynamics`.
+      parameters: name -> value, as in `Dynamics`. With knots, a value may be (K,) numbers, one for each.
       equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
-      at: "all" steps, or only the "final" step, at which the expressions must not depend on u.
+      at: "all" steps; or only the "final" step, at which the expressions must not depend on u; or the indices (K,) of
+        knots, in order. Those move with time when a `Replanner` plans again, as rows of a `StateBounds`.
       name: the name in messages and in `Problem.violations`; by default that of the function, or its expression if it
         is a lambda.
     """
@@ -154,14 +175,46 @@ class SymbolicConstraint(OfFormula, Constraint):
         self,
         function: Callable[[Any, Any, Any], Any],
         *,
-        parameters: Mapping[str, float] | None = None,
+        parameters: Mapping[str, Any] | None = None,
         equality: bool = False,
-        at: str = "all",
+        at: str | npt.ArrayLike = "all",
         name: str | None = None,
     ) -> None:
-        self._set_formula(function, parameters, name, "one of SymPy symbols")
         self.equality = check_flag("SymbolicConstraint: equality", equality)
-        self.at = check_name("SymbolicConstraint: at", at, STEPS)
+        self.at = check_name("SymbolicConstraint: at", at, STEPS) if isinstance(at, str) else _knots(at)
+        self._table = np.zeros((0, 0))  # (K, P) of the knots
+        if self.by_knot:
+            if self.equality:
+                raise InputError("SymbolicConstraint: equality: got True at some knots, want False, or at='all'")
+            check_kind("parameters", parameters, (Mapping, type(None)), "a dictionary of name: value")
+            want = "a number, or one for each of its knots"
+            columns = {key: numbers_of(f"parameters: {key}", one, want) for key, one in (parameters or {}).items()}
+            for key, column in columns.items():
+                check_shape(f"parameters: {key}", column, (len(self.at),) if column.ndim else ())
+            self._set_formula(function, {key: float(one.ravel()[0]) for key, one in columns.items()}, name, WANTED)
+            rows = [np.broadcast_to(one, len(self.at)) for one in columns.values()]
+            self._table = np.array(rows, dtype=np.float64).reshape(len(rows), len(self.at)).T
+        else:
+            self._set_formula(function, parameters, name, WANTED)
+
+    @property
+    def by_knot(self) -> bool:
+        return not isinstance(self.at, str)
+
+    def _stated(self) -> Mapping[str, object]:
+        columns = dict(zip(self.parameters, self._table.T, strict=True)) if self.by_knot else self.parameters
+        return {**super()._stated(), "parameters": columns}
+
+    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
+        # As for any array of rows: at knots from the first to the last of all, which row holds at each, or none.
+        assert not isinstance(self.at, str)
+        rows = np.full(max(self.at, default=-1) + 2, -1.0)  # a row that is repeated says that none does
+        rows[list(self.at)] = np.arange(len(self.at))
+        found = cut(rows)
+        other = copy.copy(self)
+        other.at = tuple(np.flatnonzero(found >= 0).tolist())
+        other._table = self._table[found[found >= 0].astype(int)]
+        return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
@@ -186,7 +239,7 @@ class SymbolicConstraint(OfFormula, Constraint):
         names, texts = ([f"{one}{part}" for part in parts] for one in (name, self.name))
         if name == "<lambda>":
             names = texts = made["texts"]
-        return ConstraintTerm(
+        term = ConstraintTerm(
             source=made["source"],
             data=self._data,
             rows=rows,
@@ -196,6 +249,13 @@ class SymbolicConstraint(OfFormula, Constraint):
             equality=self.equality,
             final_only=self.at == "final",
         )
+        return term if isinstance(self.at, str) else at_knots(term, np.array(self.at, dtype=np.intp), self._table)
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
+        if not isinstance(self.at, str) and self.at and self.at[-1] >= len(times):
+            got, want = f"knot {self.at[-1]}", f"knots up to {len(times) - 1}, the number of steps"
+            raise InputError(f"SymbolicConstraint: at: got {got}, want {want}")
+        return self.bind(dynamics)
 
     def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
         traced, x, u = symbolic.trace(self.function, states, controls, list(self.parameters))
@@ -292,6 +352,15 @@ class FunctionCost(OfFunction, Cost):
             uses_control=any(axis >= n for axis in axes),
             functions=functions,
         )
+
+
+def _knots(at: npt.ArrayLike) -> tuple[int, ...]:
+    """The indices of knots. Raises InputError unless they are whole numbers in order, from 0 on."""
+    want = f"{' or '.join(map(repr, STEPS))}, or whole numbers in order, the indices of knots"
+    knots = numbers_of("SymbolicConstraint: at", at, want)
+    if knots.ndim != 1 or not knots.size or (knots != np.floor(knots)).any() or (np.diff(knots, prepend=-1) <= 0).any():
+        raise InputError(f"SymbolicConstraint: at: got {excerpt(at)}, want {want}")
+    return tuple(knots.astype(int).tolist())
 
 
 def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:

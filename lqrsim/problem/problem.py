@@ -35,7 +35,7 @@ from lqrsim.problem.constraints import (
     names_of,
 )
 from lqrsim.problem.control_rate import ControlRate, RateLimits
-from lqrsim.problem.costs import Cost, CostTerm, in_system, terms_of
+from lqrsim.problem.costs import Cost, CostSum, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.plain_term import violated
@@ -44,6 +44,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
 ACCURATE = 1e-11  # smallest accuracy of steps; errors below are rounding
@@ -129,6 +130,10 @@ class Problem(OneVersion):
         the same number of steps, and its own dt. The stage cost still counts once per step, whatever dt is. None for
         the fixed duration steps * dt.
       time_weight: cost per second of a free duration. The cost of a solution does not include it.
+      segments: knots that divide a plan into segments, such as those of waypoints. With a free duration, that of each
+        segment is free, too: whatever has numbers by knot moves with these knots. The steps of a solution are equally
+        long; `settled` has its knots. The steps of each segment last as those of a plan between the shortest and the
+        longest duration.
       accuracy: largest error of a plan's steps, as `BetweenKnots.step_error`: `smooth` then takes as many Runge-Kutta
         steps in a period as that needs. By default it takes one.
       between_knots: whether inequalities are to hold between the knots, too; by default they hold at the knots. The
@@ -153,6 +158,7 @@ class Problem(OneVersion):
     risk: float = 0.0
     duration: tuple[float, float] | None = None
     time_weight: float = 0.0
+    segments: Sequence[int] = ()
     control_rate: ControlRate | None = None
     accuracy: float | None = None
     between_knots: bool = False
@@ -246,9 +252,11 @@ class Problem(OneVersion):
         other = self._with(initial=start, control_rate=rate, _terms=self._terms | {"initial": (term,)})
         if not after:
             return other
+        segments = tuple(knot - after for knot in self.segments if knot > after)
         left, begin = tuple(one.ahead(after) for one in self.constraints), self.begin + after * self.dt
         stage = self.stage_cost.ahead(after)
-        return other._with(steps=self.steps - after, begin=begin, constraints=left, stage_cost=stage)._bound_anew()
+        left_over = {"constraints": left, "stage_cost": stage, "segments": segments}
+        return other._with(steps=self.steps - after, begin=begin, **left_over)._bound_anew()
 
     def _rate_after(self, previous: npt.ArrayLike | None) -> ControlRate | None:
         """The `control_rate` after a command (m,), or None for one that is free. Raises InputError as `from_state`."""
@@ -312,6 +320,50 @@ class Problem(OneVersion):
             later = tuple(one.ahead(steps, horizon="moving") for one in self.constraints)
             other = other._with(stage_cost=self.stage_cost.ahead(steps, horizon="moving"), constraints=later)
         return other._bound_anew() if self.moving else other
+
+    def settled(self, plan: Solution) -> "Problem":
+        """The problem with the duration of a plan: of fixed steps, and with its segments where they are in the plan.
+
+        Args:
+          plan: a solution of the problem.
+
+        Raises:
+          InputError: the plan has another number of steps, or is not of this problem's segments.
+        """
+        check_kind("plan", plan, Solution, "a Solution of the problem")
+        knots = plan.options.get("segments", self.segments)
+        if plan.trajectory.steps != self.steps or not isinstance(knots, Sequence) or len(knots) != len(self.segments):
+            got = f"{plan.trajectory.steps} steps, segments at {brief(knots)}"
+            want = f"a solution of the problem: {self.steps} steps, segments at {brief(self.segments)} before the solve"
+            raise InputError(f"plan: got {got}, want {want}")
+        moved = self if tuple(knots) == self.segments else self._with_segments(knots)
+        return moved._of_duration(plan.trajectory.horizon)
+
+    def _of_duration(self, seconds: float) -> "Problem":
+        """The problem with a fixed duration."""
+        return replace(self, dt=seconds / self.steps, duration=None, time_weight=0.0)
+
+    def _with_segments(self, knots: Sequence[int]) -> "Problem":
+        """The problem with its segments at other knots, and with rows by knot moved along.
+
+        A row of a knot at which a segment ends stays that of such a knot; those between are the nearest.
+        """
+        old, new = (np.array([0, *one, self.steps]) for one in (self.segments, knots))
+        rows = np.rint(np.interp(np.arange(self.steps + 1), new, old)).astype(int)
+        segment = np.clip(np.searchsorted(new, np.arange(self.steps + 1), side="right") - 1, 0, len(knots))
+        inside = ~np.isin(np.arange(self.steps + 1), new)
+        rows[inside] = np.clip(rows, old[segment] + 1, old[segment + 1] - 1)[inside]
+
+        def cut(table: Array) -> Array:
+            return table[np.minimum(rows, len(table) - 1)]
+
+        def moved(one: Any) -> Any:
+            return one._with_rows(cut) if one.by_knot else one
+
+        return replace(
+            self, segments=tuple(knots), constraints=[moved(one) for one in self.constraints],
+            stage_cost=CostSum(tuple(moved(one) for one in terms_of(self.stage_cost))),
+        )  # fmt: skip
 
     def _bound_anew(self) -> "Problem":
         """The same problem, bound anew wherever it depends on the steps or on the time at which it begins."""
@@ -471,6 +523,7 @@ class Problem(OneVersion):
             "constraints": "; ".join(map(repr, self.constraints)),
             "noise": "" if self.noise is None else f"{self.noise!r}, risk {self.risk:g}",
             "cost of time": f"{self.time_weight:g} a second" if self.time_weight else "",
+            "segments": f"end at knots {', '.join(map(str, self.segments))}" if self.segments else "",
         }  # fmt: skip
 
     @property
@@ -499,7 +552,7 @@ class Problem(OneVersion):
             parts += [*self._noise_term.digested, repr(self.risk)]
             functions += self._noise_term.functions
         if self.duration is not None:
-            parts.append(repr((self.duration, self.time_weight)))
+            parts.append(repr((self.duration, self.time_weight, *((self.segments,) if self.segments else ()))))
         if (rate := self.control_rate) is not None:
             parts.append(repr([None if one is None else np.asarray(one).tolist() for one in vars(rate).values()]))
         if self.accuracy is not None or self.between_knots:
@@ -509,6 +562,14 @@ class Problem(OneVersion):
     def _check_duration(self) -> None:
         """Raises InputError if the duration is not as described, or must not be free for this kind of problem."""
         keep(self, time_weight=check_number("time_weight", self.time_weight, at_least=0.0))
+        knots = check_items("segments", self.segments, (int, np.integer), "knots, which are whole numbers")
+        keep(self, segments=tuple(map(int, knots)))
+        if any(late - early < 2 for early, late in itertools.pairwise((0, *knots, self.steps)) if knots):
+            want = f"knots in order, with 2 steps in each segment of the {self.steps} at least"
+            raise InputError(f"segments: got {brief(self.segments)}, want {want}")
+        if self.segments and self.duration is not None and (self.accuracy is not None or self.between_knots):
+            want = "one of the two; those for problem.settled(solution)"
+            raise InputError(f"segments: got {brief(self.segments)} with accuracy or between_knots, want {want}")
         if self.duration is None:
             if self.time_weight:
                 raise InputError(f"time_weight: got {self.time_weight:g} without a duration, want duration=(low, high)")

@@ -145,9 +145,7 @@ class Scenario(OneVersion):
         check_kind("plan", plan, Solution, "a Solution of the scenario")
         if self.problem.duration is None:
             return self
-        dt = plan.trajectory.dt
-        problem = replace(self.problem, dt=dt, duration=None, time_weight=0.0)
-        return replace(self, problem=problem, fit_timestep=True)
+        return replace(self, problem=self.problem.settled(plan), fit_timestep=True)
 
 
 def names() -> list[str]:

@@ -3,10 +3,14 @@
 The number of steps is fixed and their length varies: the dynamics are scaled by duration / stated duration, so that a
 Runge-Kutta step over `dt` becomes a step over `share * dt`. The interior point finds states, controls and duration at
 once. With the duration found, the problem is an ordinary one, and the plan is already at its optimum.
+
+Where segments of the plan have free durations, too, that state may jump between them. The steps of the plan that is
+found last differently, segment by segment. As many equal steps take its place, with the ends of the segments at the
+nearest knots, and the duration of the whole is found from there.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +41,8 @@ SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 # Durations of the sketches, relative to the stated one; the largest number of iterations of a sketch, its tolerance,
 # that of constraints in their units, and that of what is worth going on from, violations and gaps.
 SKETCHED, SKETCH, ROUGH, KEPT, WORTH = (1.0, 2.0), 100, 1e-2, 1e-4, 1e-2
+# Tolerance of the search for durations of segments: their ends go to whole knots, one in some hundred.
+NEAR_SEGMENTS = 1e-4
 FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
 
 
@@ -176,6 +182,8 @@ class Search:
     def _solved(self, fixed: Problem, settings: SmootherSettings) -> Solution:
         """Solve with a fixed duration."""
         solution = self._solve(fixed, settings)
+        if fixed.segments:
+            solution = replace(solution, options=dict(solution.options) | {"segments": fixed.segments})
         self._total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
         return solution
 
@@ -184,7 +192,7 @@ class Search:
         problem, plan, price = self._problem, solution.trajectory, self._settings.price
         missed, paid = 0.0 if solution.success else solution.violation, 0.0
         if np.isfinite(price):
-            stages = Stages(settled(problem, plan.horizon))
+            stages = Stages(problem.settled(solution))
             paid = _paid(stages, Motion(in_c_order(plan.states), in_c_order(plan.controls)), price)
         return missed, solution.cost + problem.time_weight * plan.horizon + paid
 
@@ -258,11 +266,35 @@ def find_duration(
     the budget, which may end the search earlier. `price` is that of violations, which the cost of the result includes.
     """
     assert problem.duration is not None
+    low, high = problem.duration
+    if problem.segments:
+        problem, begin = _with_found_segments(problem, begin, violation, most, budget, price)
+        most = budget.left
+    n = len(problem.dynamics.state_coordinates)
+    stages, prices, found = _searched(problem, begin, (), tolerance, violation, most, budget, price)
+    cost = found.measures.cost + _paid(stages, found.plan, prices)
+    duration = float(np.clip(found.plan.states[0, n], low, high))
+    # Remove everything that belongs to the duration.
+    rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]
+    found = replace(
+        found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
+        gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1],
+        measures=found.measures._replace(cost=cost),
+        sizes=found.sizes._replace(rows=rows),
+    )  # fmt: skip
+    return settled(problem, duration), found
+
+
+def _searched(
+    problem: Problem, begin: Trajectory, segments: Sequence[int], tolerance: float, violation: float, most: int,
+    budget: Budget, price: float,
+) -> tuple[Stages, Array, Found]:  # fmt: skip
+    """The optimum near a plan with its duration as a state, which jumps where segments end; and the price of rows."""
     n = len(problem.dynamics.state_coordinates)
     with budget.stop.not_counting():  # compiling
-        freed = with_duration(problem)
-        stages = Stages(freed)
+        stages = Stages(with_duration(problem, by_segment=bool(segments)))
     stages.free[n] = 1.0
+    stages.jump(segments)
     laps = Laps(budget)
 
     def watch(measures: Measures, seconds: float) -> bool:
@@ -276,26 +308,46 @@ def find_duration(
     found = InteriorPoint(stages, plan, price=prices).run(
         tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch, hurried=budget.hurried
     )
-    cost = found.measures.cost + _paid(stages, found.plan, prices)
-    duration = float(np.clip(found.plan.states[0, n], *problem.duration))
-    # Remove everything that belongs to the duration.
-    rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]
-    found = replace(
-        found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
-        gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1],
-        measures=found.measures._replace(cost=cost),
-        sizes=found.sizes._replace(rows=rows),
-    )  # fmt: skip
-    return settled(problem, duration), found
+    return stages, prices, found
+
+
+def _with_found_segments(
+    problem: Problem, begin: Trajectory, violation: float, most: int, budget: Budget, price: float
+) -> tuple[Problem, Trajectory]:
+    """The problem with its segments at the knots where they end in time, and a plan with these, in equal steps.
+
+    Both stay as they are if no durations of the segments are found.
+    """
+    _, _, found = _searched(problem, begin, problem.segments, NEAR_SEGMENTS, violation, most, budget, price)
+    if not found.solved:
+        return problem, begin
+    steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])
+    ends = np.cumsum([0.0, *found.plan.states[:-1, -1] / steps])  # times of the knots
+    new = np.rint(ends[old] / ends[-1] * steps).astype(int)
+    for k in range(1, len(new)):
+        new[k] = max(new[k], new[k - 1] + 2)  # `Problem` wants two steps in a segment
+    new[-1] = steps
+    for k in range(len(new) - 2, 0, -1):
+        new[k] = min(new[k], new[k + 1] - 2)
+    knots = np.arange(steps + 1)
+    at = np.interp(knots, new, old)
+
+    def there(table: Array) -> Array:
+        return np.column_stack([np.interp(at, knots, column) for column in table.T])
+
+    # Means of controls, not samples: what they drive, such as rates of rotation, then ends where the states are.
+    driven = np.vstack([np.zeros(found.plan.controls.shape[1]), np.cumsum(found.plan.controls, axis=0)])
+    states, controls = there(found.plan.states[:, :-1]), np.diff(there(driven), axis=0) / np.diff(at)[:, None]
+    return problem._with_segments(new[1:-1].tolist()), Trajectory(states, controls, float(ends[-1]) / steps)
 
 
 def settled(problem: Problem, duration: float) -> Problem:
     """The problem with a fixed duration, in seconds."""
-    return replace(problem, dt=duration / problem.steps, duration=None, time_weight=0.0)
+    return problem._of_duration(duration)
 
 
-def with_duration(problem: Problem) -> Problem:
-    """The problem with its duration as the last state.
+def with_duration(problem: Problem, *, by_segment: bool = False) -> Problem:
+    """The problem with its duration as the last state; or with that of a plan of steps as long as the segment's.
 
     Raises:
       InputError: a part of the problem cannot be stated with one more state.
@@ -308,14 +360,17 @@ def with_duration(problem: Problem) -> Problem:
         initial = FixedState(np.append(initial.numbers, stated))
     else:
         initial = initial.with_added_state(dynamics)
-    priced = SymbolicCost(lambda x, u, p: p.weight * x[n], parameters={"weight": problem.time_weight}, convex=True)
+    weight = problem.time_weight / (problem.steps if by_segment else 1)
+    priced = SymbolicCost(lambda x, u, p: p.weight * x[n], parameters={"weight": weight}, convex=True)
     bounds = SymbolicConstraint(
-        lambda x, u, p: [x[n] - p.low, p.high - x[n]], parameters={"low": low, "high": high}, at="final"
-    )
+        lambda x, u, p: [x[n] - p.low, p.high - x[n]], parameters={"low": low, "high": high},
+        at="all" if by_segment else "final",
+    )  # fmt: skip
+    stage_cost, final_cost = (one.with_added_state(dynamics) for one in (problem.stage_cost, problem.final_cost))
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
-        stage_cost=problem.stage_cost.with_added_state(dynamics),
-        final_cost=problem.final_cost.with_added_state(dynamics) + priced, control_limits=problem.control_limits,
+        stage_cost=stage_cost + priced if by_segment else stage_cost,
+        final_cost=final_cost if by_segment else final_cost + priced, control_limits=problem.control_limits,
         constraints=(*(one.with_added_state(dynamics) for one in problem.constraints), bounds), begin=problem.begin,
     )  # fmt: skip
 

@@ -85,7 +85,8 @@ class Stages:
             zeros((steps + 1, n + m, n + m)),
         )  # fmt: skip
         self.about = PlanStages(
-            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), zeros(1), 0, zeros(1), unread,
+            steps, 0, zeros(n), zeros(steps + 1), zeros((steps + 1, n + 1)), zeros(n), np.ones(n), np.ones(m), zeros(1),
+            zeros(1), 0, zeros(1), unread,
             tuple(zeros((steps + 1) * count) for count in counts),
             StageRows(
                 rows, np.full((rows, 5), np.inf), np.cumsum([0, *counts])[:-1].astype(np.float64),
@@ -125,6 +126,7 @@ class Stages:
         )
         self.about.slow[...], self.about.keeps[...] = 0.0, 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
+        self.about.jumps[...] = 0.0
         if problem.goal is not None and problem.start is not None:
             self.about.reach[...] = np.abs(np.nan_to_num(problem.goal - problem.start))
         limit = self.owners == -1
@@ -148,6 +150,10 @@ class Stages:
     def free(self) -> Array:
         """(n,) 1 for the states of the start that are free, else 0."""
         return self.about.free
+
+    def jump(self, knots: Sequence[int]) -> None:
+        """Let the last state jump at some knots, each after the first."""
+        self.about.jumps[[0, *knots]] = 1.0 if knots else 0.0
 
     @classmethod
     def lent(cls, problem: Problem) -> "Stages":
