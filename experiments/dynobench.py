@@ -2,8 +2,8 @@
 
     python experiments/dynobench.py                              # all, an hour at most on one processor
     python experiments/dynobench.py --only quad2d acrobot        # those whose name has one of these in it
-    python experiments/dynobench.py --statements knots           # one of the four below
-    python experiments/dynobench.py --variants 3                 # variants of those with obstacles, in place of them
+    python experiments/dynobench.py --statements knots           # one of those below
+    python experiments/dynobench.py --variants 3 --statements knots outside   # variants of those with obstacles
     python experiments/dynobench.py --quick                      # two problems
 
 Robots with wheels, quadrotors, a pole on a quadrotor and an acrobot go from rest to rest among boxes. Each problem is
@@ -14,9 +14,10 @@ stated for `ls.smooth(problem)` alone, with a free duration in 100 steps:
   exact    with `accuracy=` and `between_knots=True`.
   euler    as dynobench has it, a map of Euler steps of 0.01 or 0.1 s, with 3 cm of clearance: the fewest steps that
            converge, from the plan of `clear` and at most a few counts.
+  outside  as `knots`, by a search that knows the robots (`kinodynamic/outside.py`), for comparison; not by default.
 
-What is said is judged by `kinodynamic/check.py`, which has nothing of lqrsim: the first three in exact time and between
-the knots, the last by dynobench's own conditions. Published is the least time of a feasible plan that comes with
+What is said is judged by `kinodynamic/check.py`, which has nothing of lqrsim: `euler` by dynobench's own conditions,
+the others in exact time and between the knots. Published is the least time of a feasible plan that comes with
 dynobench. A plan that is CONVERGED as `exact` or `euler` and does not pass is a failure.
 """
 
@@ -32,7 +33,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from kinodynamic import check
+from kinodynamic import check, outside
 from kinodynamic.data import CASES, Case
 from kinodynamic.statements import KEPT, by_euler_steps, in_least_time
 from kinodynamic.variants import drawn
@@ -41,10 +42,12 @@ from runner import Kept, Result, Settings, opening, progress, run, table
 import lqrsim as ls
 
 Row = dict[str, Any]
-Statement = Literal["knots", "clear", "exact", "euler"]
+Statement = Literal["knots", "clear", "exact", "euler", "outside"]
 
 OPTIONS: Mapping[str, Mapping[str, Any]] = {"knots": {}, "clear": {"margin": KEPT}, "exact": {"right": True}}
+USUAL: tuple[Statement, ...] = ("knots", "clear", "exact", "euler")
 QUICK = ("quad2d_v0/empty_0", "unicycle1_v0/parallelpark_0")
+NOTHING: Row = {"status": "NO_START", "time": None, "seconds": 0.0, "detail": ""}
 COUNTS = 8  # of steps that are tried for a plan of Euler steps
 SPARED = 0.02  # share of the steps by which their count is first changed
 
@@ -53,7 +56,7 @@ SPARED = 0.02  # share of the steps by which their count is first changed
 class Config(Settings):
     only: tuple[str, ...] = ()
     """Problems whose name has one of these in it; by default all."""
-    statements: tuple[Statement, ...] = get_args(Statement)
+    statements: tuple[Statement, ...] = USUAL
     """Those of the list above."""
     variants: int = 0
     """How many variants of each problem with obstacles, in place of the problems."""
@@ -91,7 +94,7 @@ def _solved(config: Config, cases: Sequence[Case]) -> Iterator[Row]:
         yield from pool.map(one, cases)
 
 
-def solve(case: Case, *, statements: Sequence[Statement] = get_args(Statement), time_limit: float = 60.0) -> Row:
+def solve(case: Case, *, statements: Sequence[Statement] = USUAL, time_limit: float = 60.0) -> Row:
     """What became of a problem in these statements."""
     row: Row = {"name": case.name, "published": case.published}
     plan: ls.Solution | None = None
@@ -100,55 +103,53 @@ def solve(case: Case, *, statements: Sequence[Statement] = get_args(Statement), 
             problem = in_least_time(case, **options)
             began = time.process_time()
             found = ls.smooth(problem, time_limit=time_limit, threads=1)
-            row[name] = _told(found, time.process_time() - began)
-            if found.success:
-                row[name]["check"] = check.exactly(case, found.trajectory.controls, found.trajectory.dt)
+            row[name] = _told(case, found, time.process_time() - began)
             plan = found if name == "clear" else plan
     if "euler" in statements:
         assert plan is not None
         row["euler"] = _fewest_steps(case, plan, time_limit)
+    if "outside" in statements:
+        began = time.process_time()
+        by_hand = outside.found(case)
+        seconds = time.process_time() - began
+        row["outside"] = NOTHING | {"seconds": seconds} if by_hand is None else _told(case, by_hand, seconds)
     return row
 
 
-def _told(found: ls.Solution, seconds: float) -> Row:
-    return {
-        "status": found.status.name, "time": found.trajectory.horizon if found.success else None, "seconds": seconds,
-        "detail": found.detail,
-    }  # fmt: skip
+def _told(case: Case, found: ls.Solution, seconds: float, *, euler: bool = False) -> Row:
+    told = {"status": found.status.name, "time": None, "seconds": seconds, "detail": found.detail}
+    if not found.success:
+        return told
+    plan = found.trajectory
+    judged = check.by_euler(case, plan.states, plan.controls) if euler else check.exactly(case, plan.controls, plan.dt)
+    return told | {"time": plan.horizon, "check": judged}
 
 
 def _fewest_steps(case: Case, plan: ls.Solution, time_limit: float) -> Row:
     """The fewest Euler steps in which a plan was found, from one with a free duration; counts by bisection."""
     if not plan.success:
-        return {"status": "NO_START", "time": None, "seconds": 0.0, "detail": "no plan with 3 cm of clearance"}
+        return NOTHING
     began, limit = time.process_time(), time.monotonic() + time_limit
     steps = math.ceil(plan.trajectory.horizon / case.model.period - 1e-9)
-    stride, few, best, told = max(1, round(SPARED * steps)), 0, None, None
+    # `few` is the largest count that failed.
+    stride, few, best, last = max(1, round(SPARED * steps)), 0, None, plan
     for tried in range(COUNTS):
         left = limit - time.monotonic()
-        if left <= 0:
+        if left <= 0 or (best and best.trajectory.steps - few <= 1):
             break
         problem, start = by_euler_steps(case, plan.trajectory, steps)
-        found = ls.smooth(problem, start=start, time_limit=left, threads=1)
-        told = told if best else _told(found, 0.0)
-        if found.success:
-            best, told = found, _told(found, 0.0)
+        last = ls.smooth(problem, start=start, time_limit=left, threads=1)
+        if last.success:
+            best = last
         else:
-            few = max(few, steps)  # the largest count that failed
+            few = max(few, steps)
         if best is None:
             steps += stride * 2**tried
         elif few:
-            if best.trajectory.steps - few <= 1:
-                break
             steps = (best.trajectory.steps + few) // 2
         else:
-            steps = best.trajectory.steps - stride * 2**tried
-    assert told is not None
-    told["seconds"] = time.process_time() - began
-    if best is not None:
-        states = best.trajectory.states
-        told["check"] = check.by_euler(case, states, best.trajectory.controls)
-    return told
+            steps = max(1, steps - stride * 2**tried)
+    return _told(case, best or last, time.process_time() - began, euler=True)
 
 
 def passed(name: str, found: Row) -> Sequence[str] | None:
@@ -194,14 +195,19 @@ def _cells(name: str, row: Row) -> list[str]:
 def _summary(name: str, rows: Sequence[Row]) -> str:
     found = [row[name] for row in rows]
     solved = [row for row in rows if "check" in row[name]]
+    possible = [row for row in rows if "check" in row.get("outside", {})]
     # A plan in whole Euler steps may not be faster by a share of a step.
     ahead = sum(row["published"] is not None and row[name]["time"] <= row["published"] + 1e-9 for row in solved)
     right = sum(not passed(name, row[name]) for row in solved)
     seconds = [one["seconds"] for one in found]
-    return (
-        f"{name}: CONVERGED {len(solved)} of {len(rows)}, at or below the published {ahead}, {right} pass the check;"
-        f" processor {statistics.median(seconds):.2g} s in the median, {sum(seconds):.3g} s in all"
+    text = (
+        f"{name}: CONVERGED {len(solved)} of {len(rows)}, {ahead} of them at or below the published, {right} pass the"
+        f" check; processor {statistics.median(seconds):.2g} s in the median, {sum(seconds):.3g} s in all"
     )
+    if possible and name != "outside":
+        both = sum("check" in row[name] for row in possible)
+        text += f"; CONVERGED in {both} of the {len(possible)} that the search from outside solves"
+    return text
 
 
 if __name__ == "__main__":
