@@ -31,7 +31,7 @@ def test_there_are_43() -> None:
     assert all(case.published is not None for case in CASES.values())
 
 
-@pytest.mark.parametrize("robot", [one for one in MODELS if one not in ("unicycle1_v1", "unicycle1_v2")])
+@pytest.mark.parametrize("robot", [one for one in MODELS if one.endswith("v0")] + rarely("quadrotor_v1"))
 def test_rates_and_steps_are_those_of_the_check(robot: str) -> None:
     """To 1e-12 of the largest entry: the formulas differ, so what remains is rounding."""
     case, model, dynamics = BY_ROBOT[robot], MODELS[robot], statements.dynamics(robot)
@@ -47,7 +47,7 @@ def test_rates_and_steps_are_those_of_the_check(robot: str) -> None:
         np.testing.assert_allclose(step, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize("name", ["car1_v0/kink_0", "quad2dpole_v0/window", "acrobot_v0/swing_up_obs_hard"])
+@pytest.mark.parametrize("name", ["acrobot_v0/swing_up_obs_hard", *rarely("car1_v0/kink_0", "quad2dpole_v0/window")])
 def test_boxes_of_the_statement_overlap_as_those_of_the_check(name: str) -> None:
     """The depths are equal to rounding; of boxes that are apart the formula is a lower bound of the distance."""
     case, rng = CASES[name], np.random.default_rng(1)
@@ -81,7 +81,7 @@ def test_boxes_are_as_far_apart_as_a_minimiser_finds_them() -> None:
 
 def test_a_plan_is_right_in_exact_time_and_by_euler_steps() -> None:
     plan = ls.smooth(statements.in_least_time(EMPTY, right=True), threads=1).trajectory
-    assert plan.horizon <= EMPTY.published
+    assert plan.horizon <= 0.96  # the published
     assert not check.failures(check.exactly(EMPTY, plan.controls, plan.dt), check.RIGHT)
     problem, start = statements.by_euler_steps(EMPTY, plan, 96)  # the published time, in its steps of 0.01 s
     found = ls.smooth(problem, start=start, threads=1)
