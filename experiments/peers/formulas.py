@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
+from lqrsim.codegen.symbolic import Vector
 from lqrsim.errors import Array
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, terms_of
@@ -48,7 +49,8 @@ def formulas(problem: ls.Problem) -> Formulas:
     values = given(len(dynamics.parameters))
 
     def rate(x: Any) -> Any:
-        return ca.vertcat(*evaluate(dynamics.f, tuple(dynamics.parameters), x, u, values, dynamics.constants))
+        names = tuple(dynamics.parameters)
+        return ca.vertcat(*evaluate(_by_name(problem, dynamics.f), names, x, u, values, dynamics.constants))
 
     h = problem.dt if problem.duration is None else duration / problem.steps
     first = rate(x)
@@ -136,7 +138,8 @@ def _cost(problem: ls.Problem, cost: Cost, x: Any, u: Any, given: _Given) -> Any
     if isinstance(cost, ls.ControlCost):
         return quadratic(cost.weight, u - given(len(cost.about)))
     if isinstance(cost, ls.SymbolicCost):
-        return evaluate(cost.function, tuple(cost.parameters), x, u, given(len(cost.parameters)))[0]
+        function = _by_name(problem, cost.function)
+        return evaluate(function, tuple(cost.parameters), x, u, given(len(cost.parameters)))[0]
     if isinstance(cost, ls.ObstacleCost) and cost.balls is None:
         away = _from_obstacles(problem, cost.world, x) - cost.radius
         return cost.weight * ca.sum1(ca.exp(-cost.sharpness * away))
@@ -152,7 +155,8 @@ def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, 
         return _Rows(x[places] - given(len(places)), equality=True, at_end=True)
     if isinstance(constraint, ls.SymbolicConstraint):
         numbers = given(len(constraint.parameters))
-        values = ca.vertcat(*evaluate(constraint.function, tuple(constraint.parameters), x, u, numbers))
+        function = _by_name(problem, constraint.function)
+        values = ca.vertcat(*evaluate(function, tuple(constraint.parameters), x, u, numbers))
         with_control = bool(ca.depends_on(values, u))
         return _Rows(values, constraint.equality, with_control, constraint.at == "final")
     if isinstance(constraint, ls.Clearance) and isinstance(constraint.margin, float):
@@ -207,6 +211,17 @@ def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
             for side, bound in zip((low, high), problem.duration, strict=True)
         )
     return low, high
+
+
+def _by_name(problem: ls.Problem, function: Any) -> Any:
+    """The formula with states and controls that it may also read by their names."""
+    dynamics = problem.dynamics
+    names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+
+    def named(x: Any, u: Any, p: Any) -> Any:
+        return function(Vector(x, names[0]), Vector(u, names[1]), p)
+
+    return named
 
 
 def evaluate(
