@@ -255,3 +255,27 @@ def test_nothing_is_compiled_in_mid_solve() -> None:
     assert "interior point" in {iteration.method for iteration in solution.iterations}
     assert "damped" in {iteration.method for iteration in bare.iterations}
     assert compiled_module.compilations[before:] == []
+
+
+@pytest.mark.parametrize("weight", [1.0, 1e-4])
+def test_a_cost_of_the_end_alone_is_certified(weight: float) -> None:
+    """Catalyst mixing, whose best control is singular for a while: Jackson's closed form is a bang, an arc, a bang.
+
+    Nothing in this cost is curved, so its size is what the slopes are compared with. COPS 3 publishes .0480556 for 100
+    steps of the trapezoidal rule. A step of Runge-Kutta, as here, differs from that by less than 1e-6.
+    """
+
+    def mixing(x: Any, u: Any, p: Any) -> list[Any]:
+        a, b = x
+        return [u[0] * (10 * b - a), u[0] * (a - 10 * b) - (1 - u[0]) * b]
+
+    dynamics = ls.Dynamics(mixing, states={"a": "", "b": ""}, controls={"u": ""}, control_limits=(0.0, 1.0))
+    left = ls.SymbolicCost(lambda x, u, p: p.weight * (x.a + x.b - 1), parameters={"weight": weight})
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.01, steps=100, initial=ls.FixedState([1.0, 0.0]),
+        stage_cost=ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0]), final_cost=left,
+    )  # fmt: skip
+    solution = ls.smooth(problem)
+    assert solution.status is Status.CONVERGED
+    assert solution.cost == pytest.approx(-0.0480556 * weight, rel=2e-5)
+    assert solution.certificate.optimality < 1e-8

@@ -43,7 +43,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
       own: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
         them to `to_go`. The Hessians of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
-      found: row of CERTIFICATE, written.
+      found: row of CERTIFICATE, written; before, `typical` may have the least typical cost where nothing is curved.
         scale: size of the curved part of the cost without cancellation; rounding errors are relative to it.
         typical: the cost of changing each state and control by its range along the plan, or a control by its size.
         dynamics_residual: the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1.
@@ -121,8 +121,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
     for i in range(N):
         if not residual[i] <= worst * size[i]:
             worst = residual[i] / size[i]
-    if uncurved > 0:
-        decrease += uncurved / (2 * WEIGHT * typical)
+    if uncurved > 0:  # where nothing is curved, as with a cost of the final state alone, the cost itself is typical
+        decrease += uncurved / (2 * WEIGHT * max(typical, abs(cost), found.typical))
     found.cost, found.scale, found.typical, found.dynamics_residual = cost, scale, typical, worst
     found.policy_residual, found.beyond_limits, found.decrease = off_policy, limits, decrease
 

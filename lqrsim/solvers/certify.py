@@ -54,7 +54,8 @@ def certified(
       tolerance: tolerance of the optimality; None if only the cost was tested.
       least: the least cost to which the optimality is relative, as that of time where the duration was free.
     """
-    numbers = np.zeros(1, CERTIFICATE)
+    numbers, own = np.zeros(1, CERTIFICATE), np.zeros(1, CERTIFICATE)
+    numbers["typical"] = own["typical"] = least
     to_go = no_value(states)
     if value is not None:
         to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
@@ -68,7 +69,6 @@ def certified(
         return certificate, ""
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
-        own = np.zeros(1, CERTIFICATE)
         work(declarations.EVALUATE, no_value(states), own)
         optimality = certificate_of(problem, own[0], states, violation=violation, least=least).optimality
         certificate = replace(certificate, optimality=optimality)
