@@ -145,7 +145,7 @@ class Constraint(ProblemPart[ConstraintTerm]):
         """
         return {}
 
-    def turning_states(self, dynamics: Dynamics) -> Set[int]:
+    def _turning_states(self, dynamics: Dynamics) -> Set[int]:
         """The indices of the states whose final value it requires only up to whole turns.
 
         Args:

@@ -51,13 +51,13 @@ class GoalState(Constraint):
             raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {each}")
         return dict(enumerate(goal.tolist()))
 
-    def turning_states(self, dynamics: Dynamics) -> Set[int]:
+    def _turning_states(self, dynamics: Dynamics) -> Set[int]:
         angles = () if self.count_turns else dynamics.state_coordinates.angles
         return self.final_states(dynamics).keys() & angles
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        turning = self.turning_states(dynamics)
+        turning = self._turning_states(dynamics)
         rows = list(self.final_states(dynamics).items())
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
         periods = [2 * np.pi if i in turning else 0.0 for i, _ in rows]

@@ -98,7 +98,7 @@ def _whole_turns(problem: Problem, headings: Headings, goal: Array) -> Iterator[
     Headings turn together.
     """
     dynamics, names = problem.dynamics, problem.dynamics.state_coordinates.names
-    free = sorted({i for one in problem.constraints for i in one.turning_states(dynamics)})
+    free = sorted({i for one in problem.constraints for i in one._turning_states(dynamics)})
     bounds = [one.state_bounds(dynamics) for one in problem.constraints]
     groups = [free] if headings.angles else [*([i] for i in free), *([free] if len(free) > 1 else [])]
     for group, (word, turn) in itertools.product(groups, (("more", 2 * np.pi), ("less", -2 * np.pi))):
