@@ -76,7 +76,7 @@ class Case:
             weight, running = 1 / steps if self.mean else dt, self.running
             stage = ls.SymbolicCost(lambda x, u, p: p.weight * running(x, u, p), parameters={"weight": weight})
         end = nothing if self.end is None else ls.SymbolicCost(self.end)
-        goal = [ls.GoalState(**self.goal)] if self.goal else []
+        goal = [ls.GoalState(self.goal)] if self.goal else []
         return ls.Problem(
             dynamics=dynamics, dt=dt, steps=steps, initial=ls.FixedState(list(self.start.values())), stage_cost=stage,
             final_cost=end, control_limits=dict(self.controls), duration=self.free, time_weight=self.price,
