@@ -235,17 +235,17 @@ class Search:
 
 def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop) -> tuple[Found, int]:
     """What a few iterations of the interior point make of a way, and their number."""
-    stages, count = Stages.lent(problem), 0
+    stages, budget = Stages.lent(problem), Budget(SKETCH, stop)
+    laps = Laps(budget)
 
     def watch(measures: Measures, seconds: float) -> bool:
-        nonlocal count
-        count += 1
+        measures.record(laps, seconds=seconds)
         return stop.due
 
     point = InteriorPoint(stages, Motion(*map(in_c_order, (way.states, way.controls))), room=MUCH.room, price=price)
     found = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=watch)
     stages.give_back()
-    return found, count
+    return found, len(budget.log)
 
 
 def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
