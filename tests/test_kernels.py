@@ -21,7 +21,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_plans import linear
-from sampling import examples, rarely
+from sampling import examples, is_short, rarely
 
 import lqrsim as ls
 from lqrsim import kernels
@@ -115,6 +115,9 @@ ADDRESSES: dict[str, int] = {}  # by that hash: much of what problems differ in,
 LOADED: list[Loaded] = []  # kept alive
 PLAIN: dict[Any, Callable[..., Any]] = {}  # kernels as plain Python, and whom their calls are told to
 CALLERS: list[Callable[..., Any]] = []
+# Optimizing takes half the time of this file, and what is looked for is in the IR. The long run asks it of optimized
+# code, as `test_language.py` always does.
+LEVEL = 0 if is_short() else 3
 EACH = 1  # calls of a kernel that are compared, of each entry
 COMPARED: Counter[str] = Counter()  # by module and name
 # An array that is returned only kernels can take: it is written out.
@@ -296,7 +299,7 @@ def entries(calls: list[Recorded]) -> list[Entry]:
         laid_out = tuple(StructArray(kind.fields) if isinstance(kind, Struct) else kind for kind in one.types)
         MADE[keys[-1]] = laid_out, digest, returns
     if new:
-        LOADED.append(Loaded(object_code(together.text), tuple(together.libraries)))
+        LOADED.append(Loaded(object_code(together.text, LEVEL), tuple(together.libraries)))
         ADDRESSES.update({digest: LOADED[-1].address(symbol) for digest, symbol in new.items()})
     return [Entry(types, ADDRESSES[digest], returns) for types, digest, returns in map(MADE.__getitem__, keys)]
 

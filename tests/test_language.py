@@ -129,6 +129,17 @@ def f(x, y):
         assert_same(run(text, "f", x, y), in_python(text)(x, y))
 
 
+def test_exact_functions_lose_no_rounding_error() -> None:
+    """That of a sum, which LLVM may otherwise find to be 0."""
+    text = """\
+@exact
+def f(x, y):
+    total = x + y
+    return (x - total) + y
+"""
+    assert run(text, "f", 1.0, 1e-17) == 1e-17
+
+
 def test_and_and_or_stop_where_it_is_decided() -> None:
     """What would count is not called."""
     text = """\

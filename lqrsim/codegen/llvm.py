@@ -27,18 +27,18 @@ def _binding() -> Any:
     return llvm
 
 
-def _machine() -> Any:
+def _machine(level: int = 3) -> Any:
     llvm = _binding()
     _, name, features = instruction_set()
     target = llvm.Target.from_default_triple()
     return target.create_target_machine(
-        cpu=name, features=features, opt=3, jit=True, reloc="default", codemodel="jitdefault"
+        cpu=name, features=features, opt=level, jit=True, reloc="default", codemodel="jitdefault"
     )
 
 
-def object_code(text: str) -> bytes:
-    """Compile IR to an object file."""
-    return _emitted(_binding().parse_assembly(text))
+def object_code(text: str, level: int = 3) -> bytes:
+    """Compile IR to an object file, optimized as by -O0 to -O3."""
+    return _emitted(_binding().parse_assembly(text), level)
 
 
 def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[str]]:
@@ -65,11 +65,11 @@ def are_there(names: list[str]) -> bool:
     return all(llvm.address_of_symbol(name) for name in names)
 
 
-def _emitted(module: Any) -> bytes:
-    llvm, machine = _binding(), _machine()
+def _emitted(module: Any, level: int = 3) -> bytes:
+    llvm, machine = _binding(), _machine(level)
     module.triple, module.data_layout = llvm.get_process_triple(), str(machine.target_data)
     module.verify()
-    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options = llvm.create_pipeline_tuning_options(speed_level=level)
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = True
     passes = llvm.create_pass_builder(machine, options)
     passes.getModulePassManager().run(module, passes)

@@ -6,6 +6,11 @@ import pytest
 from hypothesis import settings
 
 
+def is_short() -> bool:
+    """Whether long tests are left out, and families are drawn less often."""
+    return examples(100) < 100
+
+
 def examples(count: int) -> int:
     """So many; where long tests are left out, a fifth of them, but not fewer than three."""
     return max(min(count, 3), -(-count * settings().max_examples // 100))  # of hypothesis' own 100
