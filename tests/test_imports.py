@@ -81,7 +81,7 @@ FLOORS_WITHIN = {
         ("curvature",),
         ("engine", "interior_point", "parallel"),
         ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
-        ("control_rates", "interior_run", "restoration", "risk", "ways"),
+        ("control_rates", "interior_run", "restoration", "risk", "tree", "ways"),
         ("between_knots", "constrained", "free_duration", "reach"),
         ("strategy",),
     ),
