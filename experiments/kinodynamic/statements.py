@@ -251,7 +251,8 @@ def in_least_time(case: Case, *, margin: float = 0.0, right: bool = False) -> ls
     """
     return ls.Problem(
         dynamics=dynamics(case.robot), dt=case.model.guess / STEPS, steps=STEPS, initial=ls.FixedState(case.start),
-        stage_cost=_effort(case.model), final_cost=ls.QuadraticCost(np.ones(len(case.goal)), about=case.goal),
+        # The goal has no weights: they would count whole turns of angles, which the goal itself does not.
+        stage_cost=_effort(case.model), final_cost=ls.QuadraticCost(np.zeros(len(case.goal)), about=case.goal),
         constraints=[ls.GoalState(case.goal), *_constraints(case, margin)], duration=DURATIONS, time_weight=1.0,
         accuracy=ACCURACY if right else None, between_knots=right,
     )  # fmt: skip
