@@ -140,9 +140,10 @@ def main(config: Config) -> Result:
         rows.append({"case": case.name, "search": name} | row)
     result = opening(config) | {"rows": rows}
     drawn = [case for case in cases if case.name in {"quad2d_v0/quad_bugtrap", *(f"{one}/maze_0" for one in robots)}]
-    with figure(config, result, "tree", (4.5 * len(drawn), 4.6)) as canvas:
+    with figure(config, result, "tree", (4.5 * len(drawn), 5.4)) as canvas:
         for axes, case in zip(canvas.subplots(1, len(drawn), squeeze=False)[0], drawn, strict=True):
             draw(axes, case, [row for row in rows if row["case"] == case.name])
+        canvas.set_layout_engine("tight")
     return result
 
 
@@ -191,7 +192,8 @@ def draw(axes: Axes, case: Case, rows: Sequence[Result]) -> None:
     axes.plot(*case.start[:2], "ko")
     axes.plot(*case.goal[:2], "k*", markersize=10)
     axes.set(xlim=(0, SIDE), ylim=(0, SIDE), aspect="equal", title=case.name, xlabel="x (m)", ylabel="y (m)")
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14))
+    if any(row["path"] is not None for row in rows):
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, -0.14))
 
 
 if __name__ == "__main__":

@@ -29,11 +29,11 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
-EXTENSIONS = 4000  # of a pair of trees; of bugtraps, which take a few hundred, another pair then solves more than these
+EXTENSIONS = 4000  # of a pair of trees: some 3 s in a bugtrap, so that a time limit has room for several pairs
 LONGEST = (12, 25)  # steps of an extension, for seeds in turn: unicycles leave traps with 12, and quadrotors with 25
 ARRIVALS = 5  # steps at which an extension may arrive at its target, evenly spread
 ITERATIONS = 3  # of smoothing for an extension; with six, no more problems are solved
-NEAR = 0.1  # how far an extension may end from its target, at a cost of 1/2, relative to the ranges of states
+NEAR = 0.1  # how far an extension may end from its target, at a cost of 1/2, relative to half the ranges
 TOWARDS = 0.1  # share of the targets that are the other tree's root
 HELD_BACK = 0.5  # share that is kept of an extension that ends in a violation: nodes beside walls lead nowhere
 WORN = 3.0  # cost that is added to a node from which an extension failed, as that of so many steps
@@ -44,10 +44,11 @@ TOLERANCE = 1e-6  # of violations, that of a solve
 def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Stop | None = None) -> Trajectory | None:
     """A way from start to goal through trees, in steps of the problem's dt; None if none was found.
 
-    Its states follow the dynamics, those of the second part to the accuracy of Runge-Kutta steps backwards, but for one
-    step, between the trees, of at most `NEAR` of the ranges. At the knots and between them, constraints on states alone
-    hold. It takes as many steps as it takes; `in_steps_of` turns it into a start for the problem. The same seed leads
-    to the same way; other seeds lead to others.
+    Its states follow the dynamics, those of the second part to the accuracy of Runge-Kutta steps backwards, but for a
+    jump between the trees: in the root mean square of the states, it is below `NEAR` of half their ranges.
+    Inequalities of states alone hold at the knots and in the middles between them. It takes as many steps as it takes;
+    `in_steps_of` turns it into a start for the problem. The same seed leads to the same way; other seeds lead to
+    others.
 
     Args:
       problem: one with a start and a goal, whose dynamics run backwards and whose constraints stand still. States
