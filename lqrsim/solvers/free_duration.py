@@ -26,7 +26,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Callback, Laps, Stop
-from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.initial_guess import InitialGuess, resampled
 from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
 from lqrsim.solvers.interior_run import MUCH
 from lqrsim.solvers.settings import SmootherSettings
@@ -57,14 +57,14 @@ def solve_for_duration(
     the best duration nearby. `solve` is for problems with a fixed duration, within the time of `stop`; for `attentive`
     see `Budget`.
     """
-    search = Search(problem, settings, solve, attentive, callback, stop)
+    search = DurationSearch(problem, settings, solve, attentive, callback, stop)
     if begin is None and settings.start is None and settings.safeguard:
         search.follow_ways()
     search.go_on_from(begin)
     return stop.finish(search.solution())
 
 
-class Search:
+class DurationSearch:
     """A search for the best duration, from one plan after another.
 
     Attributes:
@@ -97,7 +97,7 @@ class Search:
             fixed = settled(problem, duration)
             with stop.reporting("smooth", self._attentive), stop.heeding():
                 found, iterations = sketch(fixed, way.over(fixed), self._settings.price, stop)
-                name, plan = f"{way.name}, {duration:g} s", Trajectory(found.plan.states, found.plan.controls, fixed.dt)
+                name, plan = f"{way.name}, {duration:g} s", found.trajectory(fixed.dt)
                 if found.measures.violation < WORTH and found.measures.gap < WORTH:
                     sketches.append((name, plan))
                 else:
@@ -112,7 +112,7 @@ class Search:
             _, ordinary, found = self._find(plan, Budget(self._settings.max_iterations, stop))
             status = Status.CONVERGED if found.solved else Status.STALLED
             cost = found.measures.cost if np.isfinite(found.measures.cost) else np.inf
-            end = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+            end = found.trajectory(ordinary.dt)
             self.candidates.append(Candidate(name, cost, self._total - before, status, end))
 
     def go_on_from(self, begin: Solution | None) -> None:
@@ -122,14 +122,14 @@ class Search:
         must do, for the others take long and are for problems of which no plan is known.
         """
         problem, settings = self._problem, self._settings
-        ways, before = self.best, self._total
-        if ways is not None:
+        by_ways, before = self.best, self._total
+        if by_ways is not None:
             settings = replace(settings, safeguard=False)
         first = begin or self._solved(settled(problem, problem.steps * problem.dt), settings)
         self._fixed.append(first)
         shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
         tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-        if ways is None or first.success:
+        if by_ways is None or first.success:
             self._settle(first.trajectory, settings)
         while self.best is not None and shorter and not self._budget.over:
             shorter, plan = shorter - 1, self.best[0]
@@ -138,32 +138,31 @@ class Search:
                 break
         if self.candidates:
             status, cost, plan = first.status, self._rank(first)[1], first.trajectory
-            if self.best is not ways and self.best is not None:
+            if self.best is not by_ways and self.best is not None:
                 ordinary, found = self.best
                 status, cost = Status.CONVERGED, found.measures.cost
-                plan = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+                plan = found.trajectory(ordinary.dt)
             name = f"the nominal control, {first.trajectory.horizon:g} s"
             self.candidates.append(Candidate(name, cost, self._total - before, status, plan))
 
-    def _settle(self, begin: Trajectory, settings: SmootherSettings) -> bool:
-        """Find the best duration near a plan's; return whether it is the cheapest so far.
+    def _settle(self, begin: Trajectory, settings: SmootherSettings) -> None:
+        """Find the best duration near a plan's.
 
         A search that ends elsewhere may only have ended far from the constraints. It goes on from a plan of the
         duration at which it ended, as long as such plans become cheaper.
         """
         while not self._budget.over:
-            cheaper, ordinary, found = self._find(begin, self._budget)
+            _, ordinary, found = self._find(begin, self._budget)
             if found.solved or not np.isfinite(found.plan.states).all() or self._stop.due:
-                return cheaper
-            start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+                return
+            start = found.trajectory(ordinary.dt)
             again = self._solved(ordinary, replace(settings, start=start, starts=None))
             least = min(self._rank(one) for one in self._fixed)
             self._fixed.append(again)
             missed, cost = self._rank(again)
             if not again.success or not (missed, cost + FELL * abs(cost)) < least:
-                return False
+                return
             begin = again.trajectory
-        return False
 
     def _find(self, begin: Trajectory, budget: Budget) -> tuple[bool, Problem, Found]:
         """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
@@ -329,16 +328,9 @@ def _with_found_segments(
     new[-1] = steps
     for k in range(len(new) - 2, 0, -1):
         new[k] = min(new[k], new[k + 1] - 2)
-    knots = np.arange(steps + 1)
-    at = np.interp(knots, new, old)
-
-    def there(table: Array) -> Array:
-        return np.column_stack([np.interp(at, knots, column) for column in table.T])
-
-    # Means of controls, not samples: what they drive, such as rates of rotation, then ends where the states are.
-    driven = np.vstack([np.zeros(found.plan.controls.shape[1]), np.cumsum(found.plan.controls, axis=0)])
-    states, controls = there(found.plan.states[:, :-1]), np.diff(there(driven), axis=0) / np.diff(at)[:, None]
-    return problem._with_segments(new[1:-1].tolist()), Trajectory(states, controls, float(ends[-1]) / steps)
+    at = np.interp(np.arange(steps + 1), new, old)
+    plan = resampled(found.plan.states[:, :-1], found.plan.controls, at)
+    return problem._with_segments(new[1:-1].tolist()), Trajectory(*plan, float(ends[-1]) / steps)
 
 
 def settled(problem: Problem, duration: float) -> Problem:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.plan import Plan
@@ -179,6 +180,20 @@ class InitialGuess:
         known = [one.values for one in self.multipliers]
         values = known or [np.zeros((problem.steps + 1, term.rows)) for term in problem.constraint_terms]
         return replace(self, multipliers=tuple(Multipliers(one, penalty) for one in values))
+
+
+def resampled(states: Array, controls: Array, at: Array) -> Motion:
+    """A plan of other knots: states (T+1, n) at knots `at` (K+1,), which may be between its own, and controls (K, m).
+
+    Means of controls, not samples: what they drive, such as rates of rotation, then ends where the states are.
+    """
+    knots = np.arange(len(states))
+
+    def there(table: Array) -> Array:
+        return np.column_stack([np.interp(at, knots, column) for column in table.T])
+
+    applied = np.vstack([np.zeros(controls.shape[1]), np.cumsum(controls, axis=0)])
+    return Motion(there(states), np.diff(there(applied), axis=0) / np.diff(at)[:, None])
 
 
 def is_function(start: object) -> TypeGuard[Callable[[Problem], Beginning]]:

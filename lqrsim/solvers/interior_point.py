@@ -15,6 +15,7 @@ from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, SETTLE, S
 from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.budget import ATTENTION, Laps
 from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import Sizes, Stages
@@ -65,6 +66,10 @@ class Found:
     flat: bool
     sizes: Sizes
     scale: float
+
+    def trajectory(self, dt: float) -> Trajectory:
+        """The plan in steps of dt seconds."""
+        return Trajectory(self.plan.states, self.plan.controls, dt)
 
 
 class InteriorPoint:

@@ -25,7 +25,7 @@ from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.initial_guess import InitialGuess, resampled
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
@@ -85,13 +85,10 @@ def in_steps_of(problem: Problem, way: Trajectory) -> Trajectory:
 
     With a free duration it takes as long as before, as far as that is allowed; else it is stretched to the horizon.
     """
-    steps, last = problem.steps, len(way.controls)
-    knots, at = np.arange(last + 1), np.linspace(0, last, steps + 1)
-    states = np.column_stack([np.interp(at, knots, one) for one in way.states.T])
-    applied = np.vstack([np.zeros(way.controls.shape[1]), np.cumsum(way.controls, axis=0)])
-    means = steps / last * np.diff([np.interp(at, knots, one) for one in applied.T]).T
+    steps = problem.steps
+    plan = resampled(way.states, way.controls, np.linspace(0, len(way.controls), steps + 1))
     duration = problem.dt * steps if problem.duration is None else float(np.clip(way.horizon, *problem.duration))
-    return Trajectory(states, means, duration / steps)
+    return Trajectory(*plan, duration / steps)
 
 
 class Reach(NamedTuple):
