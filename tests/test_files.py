@@ -26,9 +26,9 @@ from scipy import stats
 from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
+from lqrsim.annotations import declared
 from lqrsim.cli import main
 from lqrsim.results.archive import replacing
-from lqrsim.results.fields import declared
 
 fuzzer: ModuleType = importlib.import_module("robustness.files")
 same = fuzzer.same

@@ -16,6 +16,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 # From the ground up: a floor imports only from floors below it; see `FLOORS_WITHIN` for the rooms that have several.
 FLOORS = (
     ("errors", "machine", "process", "versions"),
+    ("annotations",),
     ("kernels",),
     ("rotations", "capsules"),
     ("scenes",),
@@ -42,7 +43,7 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("fields", "coordinates", "solution_parts", "value_functions"),
+        ("coordinates", "solution_parts", "value_functions"),
         ("archive", "goal", "notebook", "policy"),
         ("plan",),
         ("solution",),

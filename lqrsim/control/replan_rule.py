@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from lqrsim.annotations import LINE, Line, checked
 from lqrsim.errors import (
     Array,
     InputError,
@@ -24,7 +25,6 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
-from lqrsim.results.fields import LINE, Line, check_fields
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.solution_parts import HORIZONS
@@ -72,6 +72,7 @@ class SolveRequest:
     previous: Array | None = None
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class ReplanRecord:
     """The record of one solve.
@@ -100,7 +101,6 @@ class ReplanRecord:
     reason: Annotated[str, 10 * LINE]
 
     def __post_init__(self) -> None:
-        check_fields(self)
         for name in ("step", "trial", "iterations"):
             check_count(f"ReplanRecord: {name}", getattr(self, name), at_least=0)
 

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from lqrsim.annotations import Share, checked, repr_of
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import ControllerLike, Feedback
 from lqrsim.control.linear_loop import LinearLoop
@@ -23,7 +24,6 @@ from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import SHARE, check_fields, repr_of
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -34,6 +34,7 @@ NUMBERS, FEWEST, MOST = 15_000_000, 4000, 20_000
 STRAY = 6.0  # largest standard deviations of the position, over directions and knots
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tube:
     """Predicted distribution of the closed loop about its plan.
@@ -68,15 +69,12 @@ class Tube:
     command: Annotated[Array, "T m"]
     saturation: Annotated[Array, "T m"]
     step_chance: Annotated[Array, "T+1"]
-    linear_chance: Annotated[float, SHARE]
-    collision_chance: Annotated[float, SHARE]
+    linear_chance: Share
+    collision_chance: Share
     samples: int = 0
-    strays: Annotated[float, SHARE] | None = None
+    strays: Share | None = None
 
     __repr__ = repr_of
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @cached_property
     def position_covariance(self) -> Array:

@@ -9,13 +9,13 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from lqrsim.annotations import Line, checked
 from lqrsim.codegen.user_functions import Term, UserFunction, first_numbers
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.plain_term import PlainTerm
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.fields import Line, check_fields
 
 STEP = 6e-6  # step of difference quotients, relative to numbers above 1
 
@@ -88,6 +88,7 @@ def evaluate(term: CostTerm, x: Array, u: Array) -> tuple[float, Array, Array]:
     return PlainTerm(term, len(x), len(u)).cost(np.concatenate([x, u]))
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class DerivativeCheck:
     """The largest deviation of derivatives from central differences.
@@ -113,9 +114,6 @@ class DerivativeCheck:
     state: Annotated[Array, "n"]
     control: Annotated[Array, "m"]
     tolerance: float
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def good(self) -> bool:

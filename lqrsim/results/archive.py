@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import check_string
 from lqrsim.errors import InputError, check_path, excerpt, printable
-from lqrsim.results.fields import check_string
 
 
 def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:

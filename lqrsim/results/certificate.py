@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+from lqrsim.annotations import LINE, SHARE, Bounds, Chance, Line, Positive, Share, checked
 from lqrsim.errors import Array, InputError
-from lqrsim.results.fields import LINE, SHARE, Bounds, Line, check_fields
 from lqrsim.results.solution import Solution
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FailureCertificate:
     """The probability that a policy fails, as measured by multilevel splitting, and a description of the measurement.
@@ -40,19 +41,19 @@ class FailureCertificate:
     solution: Solution
     scenario: Annotated[str, 10 * LINE]
     sweep: Line
-    strength: Annotated[float, Bounds(above=0.0)]
+    strength: Positive
     policy: Line
     design_disturbances: Line | None
     failure: Line
-    goal_radius: Annotated[float, Bounds(above=0.0)] | None
-    goal_tolerance: Annotated[float, Bounds(above=0.0)] | None
+    goal_radius: Positive | None
+    goal_tolerance: Positive | None
     disturbances: tuple[Line, ...]
     model: Line
     policy_digest: Line
-    probability: Annotated[float, SHARE]
-    low: Annotated[float, SHARE]
-    high: Annotated[float, SHARE]
-    confidence: Annotated[float, Bounds(above=0.0, below=1.0)]
+    probability: Share
+    low: Share
+    high: Share
+    confidence: Chance
     repetitions: Annotated[Array, "R", SHARE]
     particles: int
     seed: int
@@ -60,7 +61,6 @@ class FailureCertificate:
     keep: Annotated[float, Bounds(at_least=0.0, at_most=0.5)] = 0.1
 
     def __post_init__(self) -> None:
-        check_fields(self)
         if not self.low <= self.probability <= self.high:
             wanted = f"a number from {self.low:g} to {self.high:g}, its interval"
             raise InputError(f"FailureCertificate: probability: got {self.probability:g}, want {wanted}")

@@ -15,10 +15,10 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Line, checked
 from lqrsim.errors import Array, InputError, check_flag, check_name, check_path, check_text, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Line, check_fields
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.save_load import hash_of
@@ -43,6 +43,7 @@ NUMBERS, GAINS = ("float", "double"), ("full", "int16")
 DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class ExportedC:
     """The result of `export_c`.
@@ -61,9 +62,6 @@ class ExportedC:
     table_bytes: int
     rounding: Annotated[tuple[float, ...], "m"]
     controls: Annotated[tuple[Line, ...], "m"]
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def summary(self) -> str:
         """A summary of the files and of the largest errors of the commands."""

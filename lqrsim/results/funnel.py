@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Chance, Line, Positive, checked
 from lqrsim.errors import (
     Array,
     InputError,
@@ -22,7 +23,6 @@ from lqrsim.errors import (
 )
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
 
@@ -30,6 +30,7 @@ FAMILIES = ("cost_to_go", "tube", "given")
 FLAT = 1e-13  # smallest eigenvalue of a shape scaled to a unit diagonal, below which the ellipsoid is flat
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Funnel:
     """Ellipsoids about a plan, at some knots, from which runs succeed at a stated rate.
@@ -79,18 +80,17 @@ class Funnel:
     trials: Annotated[npt.NDArray[np.int64], "k"]
     successes: Annotated[npt.NDArray[np.int64], "k"]
     reasons: Annotated[tuple[Line, ...], "k"]
-    rate: Annotated[float, Bounds(above=0.0, below=1.0)]
-    confidence: Annotated[float, Bounds(above=0.0, below=1.0)]
+    rate: Chance
+    confidence: Chance
     simulated: int
     policy_digest: Line
-    goal_radius: Annotated[float, Bounds(above=0.0)]
+    goal_radius: Positive
     disturbances: tuple[Line, ...]
     seed: int
     options: Mapping[str, object] = field(default_factory=dict)
     versions: Mapping[str, Line] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_fields(self)
         check_name("Funnel: family", self.family, FAMILIES)
         if not self.plan.finite:
             raise InputError("Funnel: plan: got NaN or infinity, want finite states and controls")

@@ -10,12 +10,13 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_number, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, check_fields, repr_of
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OutputFeedbackPolicy:
     """Output feedback about a plan, from measurements to controls. Its entire state is one vector z.
@@ -58,7 +59,7 @@ class OutputFeedbackPolicy:
     input: Annotated[Array, "T Z m", Bounds()]
     drift: Annotated[Array, "T Z", Bounds()]
     nominal: Annotated[Array, "T Z", Bounds()]
-    dt: Annotated[float, Bounds(above=0.0)]
+    dt: Positive
     state_coordinates: Annotated[Coordinates, "n"]
     control_coordinates: Annotated[Coordinates, "m"]
     measured_coordinates: Annotated[Coordinates, "Y"]
@@ -66,11 +67,11 @@ class OutputFeedbackPolicy:
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        sizes = check_fields(self)
-        if not sizes["T"] or sizes["Z"] < sizes["n"]:
+        states = len(self.state_coordinates)
+        if not self.steps or self.nominal.shape[1] < states:
             raise InputError(
                 f"OutputFeedbackPolicy: nominal: got shape {self.nominal.shape}, want at least one row, of"
-                f" {sizes['n']} states or more"
+                f" {states} states or more"
             )
 
     @property

@@ -7,14 +7,15 @@ from typing import Annotated, Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import LINE, Positive, checked
 from lqrsim.errors import Array, InputError, check_count, check_name, check_shape
-from lqrsim.results.fields import LINE, Bounds, check_fields
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import HORIZONS, Multipliers, Status, Trajectory, left_after
 from lqrsim.results.value_functions import Quadratic
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
     """A plan with its feedback law, and everything with which a later solve can begin.
@@ -40,11 +41,10 @@ class Plan:
     cost_to_go: Quadratic | None
     multipliers: tuple[Multipliers, ...] = ()
     goal: Annotated[Array, "n"] | None = None
-    goal_radius: Annotated[float, Bounds(above=0.0)] | None = None
+    goal_radius: Positive | None = None
 
     def __post_init__(self) -> None:
         who = type(self).__name__
-        check_fields(self)
         if self.cost_to_go is not None:
             check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
         _ = self.target  # raises an exception if the goal is invalid
@@ -105,6 +105,7 @@ class Plan:
         return {}
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replan(Plan):
     """The result of a prepared solver: a plan from a given state, no worse than the rollout of the initial law.

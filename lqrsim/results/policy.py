@@ -11,13 +11,14 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_count, check_flag, check_name, check_number, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, check_fields, repr_of
 from lqrsim.results.solution_parts import HORIZONS, left_after
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AffinePolicy:
     """The feedback law `u_t = gain_t x + offset_t`, with everything that a robot needs to run it.
@@ -36,14 +37,14 @@ class AffinePolicy:
     gain: Annotated[Array, "T m n"]
     offset: Annotated[Array, "T m"]
     nominal: Annotated[Array, "T n"]
-    dt: Annotated[float, Bounds(above=0.0)]
+    dt: Positive
     state_coordinates: Annotated[Coordinates, "n"]
     control_coordinates: Annotated[Coordinates, "m"]
 
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        if not check_fields(self)["T"]:
+        if not self.steps:
             raise InputError("AffinePolicy: got no law, want one for each step, at least one")
 
     @property

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Line, NonNegative, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_count, check_symmetric, excerpt, vectors_of
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
 from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_error, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
@@ -26,6 +26,7 @@ WARNINGS = (
 )  # fmt: skip
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BallRecord:
     """Positions of a robot's balls in its runs and in the plan, for pictures.
@@ -48,7 +49,7 @@ class BallRecord:
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        if not check_fields(self)["B"]:
+        if not len(self.radii):
             raise InputError("BallRecord: radii: got none, want at least one ball")
 
     @property
@@ -60,6 +61,7 @@ class BallRecord:
         return int(body), np.array(place)
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingObstacles:
     """The obstacles of a run that MuJoCo does not have, for pictures.
@@ -84,9 +86,6 @@ class MovingObstacles:
 
     __repr__ = repr_of
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
     def at(self, time: float) -> Array:
         """Their positions (O, 3) in metres.
 
@@ -96,6 +95,7 @@ class MovingObstacles:
         return self.positions + time * self.velocities
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rollout:
     """Closed-loop runs of one controller in MuJoCo, with all data for drawing them.
@@ -163,8 +163,8 @@ class Rollout:
     state_coordinates: Annotated[Coordinates, "n"]
     control_coordinates: Annotated[Coordinates, "m"]
     goal: Annotated[Array, "n"] | None
-    goal_radius: Annotated[float, Bounds(above=0.0)]
-    radius: Annotated[float, Bounds(at_least=0.0)]
+    goal_radius: Positive
+    radius: NonNegative
     states: Annotated[Array, "K T+1 n"]
     measured: Annotated[Array, "K T+1 n"]
     commanded: Annotated[Array, "K T m"]
@@ -199,8 +199,7 @@ class Rollout:
         return vars(self) | {"controller_run": None}
 
     def __post_init__(self) -> None:
-        sizes = check_fields(self)
-        if not sizes["K"]:
+        if not self.trials:
             raise InputError("Rollout: states: got no trial, want at least one")
         if not self.plan.finite:
             raise InputError("Rollout: plan: got NaN or infinity, want finite states and controls")

@@ -13,6 +13,7 @@ from typing import Any, TypeVar, get_args, get_origin, overload
 
 import numpy as np
 
+from lqrsim.annotations import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
 from lqrsim.results.archive import (
     Arrays,
@@ -27,7 +28,6 @@ from lqrsim.results.archive import (
 )
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy

@@ -7,15 +7,16 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import LINE, Line, checked
 from lqrsim.errors import Array, InputError, check_shape
 from lqrsim.results import notebook
-from lqrsim.results.fields import LINE, Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import BetweenKnots, Candidate, Certificate, Curvature, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution(Plan):
     """A locally optimal feedback policy, and how it was found.

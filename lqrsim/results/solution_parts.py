@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Line, NonNegative, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_count
-from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
 
 # The end of a "moving" horizon moves along with the robot; the end of a "shrinking" horizon stays.
 HORIZONS = ("moving", "shrinking")
@@ -23,6 +23,7 @@ def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
     return np.concatenate([rest, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else rest
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """States and the controls held between them.
@@ -39,12 +40,12 @@ class Trajectory:
 
     states: Annotated[Array, "T+1 n"]
     controls: Annotated[Array, "T m"]
-    dt: Annotated[float, Bounds(above=0.0)]
+    dt: Positive
 
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        sizes = check_fields(self)
+        sizes = {"T": self.steps, "n": self.states.shape[1], "m": self.controls.shape[1]}
         if not min(sizes.values()):
             raise InputError(f"Trajectory: got {sizes}, want at least one step, state and control")
 
@@ -163,6 +164,7 @@ _STATUS_TEXT = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class Iteration:
     """One line of the log.
@@ -201,9 +203,6 @@ class Iteration:
     seconds: float
     method: Line
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
     HEADER = (
         f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'violation':>10} {'ms':>8}"
         "  method"
@@ -226,6 +225,7 @@ class Iteration:
         )
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class ContactCertificate:
     """The costs around a plan that keeps to its contact modes, from rollouts of its policy with other offsets.
@@ -248,9 +248,6 @@ class ContactCertificate:
     radius: float
     samples: int
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
     def __str__(self) -> str:
         sides = f", across each the cheapest is {-self.across:+.1e}" if np.isfinite(self.across) else ""
         return (
@@ -259,6 +256,7 @@ class ContactCertificate:
         )
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Certificate:
     """Measures of a plan, recomputed from the problem after the solve by code that the solvers do not use.
@@ -293,10 +291,8 @@ class Certificate:
     contacts: ContactCertificate | None = None
     curvature: Curvature = Curvature.NOT_CHECKED
 
-    def __post_init__(self) -> None:
-        check_fields(self)
 
-
+@checked
 @dataclass(frozen=True, eq=False)
 class Multipliers:
     """The multipliers of a constraint, one for each row at each step; zero where an inequality is inactive.
@@ -307,14 +303,12 @@ class Multipliers:
     """
 
     values: Annotated[Array, "T+1 _"]
-    penalty: Annotated[float, Bounds(at_least=0.0)]
+    penalty: NonNegative
 
     __repr__ = repr_of
 
-    def __post_init__(self) -> None:
-        check_fields(self)
 
-
+@checked
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """One of several starts that a search tried; or a plan for softer contacts, from which the next plan begins.
@@ -336,7 +330,6 @@ class Candidate:
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        check_fields(self)
         if np.isnan(self.cost):
             raise InputError("Candidate: cost: got nan, want a number, infinite where there is none")
 

@@ -8,14 +8,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import checked, repr_of
 from lqrsim.errors import Array, InputError, check_kind, check_shape, vectors_of
-from lqrsim.results.fields import check_fields, repr_of
-
-
-def _check(value: object) -> None:
-    """Check the fields of a quadratic function. Raises InputError if they do not fit, or if there are no states."""
-    if not check_fields(value)["n"]:
-        raise InputError(f"{type(value).__name__}: got no state, want at least one")
 
 
 @contextlib.contextmanager
@@ -27,6 +21,7 @@ def _invertible(what: str) -> Iterator[None]:
         raise InputError(f"{what}: got a singular matrix ({error}), want an invertible one") from None
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Quadratic:
     """A quadratic function of the state, or one for each knot: `1/2 x'Hx + x'g + const`.
@@ -46,7 +41,8 @@ class Quadratic:
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        _check(self)
+        if not self.gradient.shape[-1]:
+            raise InputError("Quadratic: got no state, want at least one")
 
     def __add__(self, other: "Quadratic") -> "Quadratic":
         check_kind("other", other, Quadratic, "a Quadratic")
@@ -81,6 +77,7 @@ class Quadratic:
         return self(self.minimizer())
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Moments:
     """Quadratic functions of the state by moments, one for each knot: `1/2 (x - mean)' covariance^-1 (x - mean) +
@@ -102,7 +99,8 @@ class Moments:
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        _check(self)
+        if not self.mean.shape[-1]:
+            raise InputError("Moments: got no state, want at least one")
 
     def quadratic(self) -> Quadratic:
         """The same functions in coefficients. Raises InputError for a singular covariance."""
@@ -121,6 +119,7 @@ class Moments:
         return np.asarray(self.constant)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class TotalCost:
     """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, for each knot. Paper: Eq. (20).
@@ -136,7 +135,6 @@ class TotalCost:
     __repr__ = repr_of
 
     def __post_init__(self) -> None:
-        check_fields(self)
         come = self.cost_to_come.gradient if isinstance(self.cost_to_come, Quadratic) else self.cost_to_come.mean
         check_shape("TotalCost: cost_to_come", come, self.cost_to_go.gradient.shape)
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from lqrsim.annotations import Count, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
-from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.plan import Plan
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.mujoco_log import unlogged
@@ -29,6 +29,7 @@ SLIGHT = 0.1  # what a state or control that does not change counts as changing,
 LINE = 20  # points of the line from a start to a goal
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class PlantCheck:
     """The differences between a robot's dynamics and MuJoCo, or another simulator, over one control period.
@@ -54,20 +55,19 @@ class PlantCheck:
     units: Annotated[tuple[Line, ...], "n"]
     errors: Annotated[Array, "n"]
     changes: Annotated[Array, "n"]
-    period: Annotated[float, Bounds(above=0.0)]
+    period: Positive
     state: Annotated[Array, "n"]
     control: Annotated[Array, "m"]
     simulated: Annotated[Array, "n"]
     predicted: Annotated[Array, "n"]
-    tolerance: Annotated[float, Bounds(above=0.0)]
-    samples: int
+    tolerance: Positive
+    samples: Count
     contacts: tuple[tuple[str, str, int], ...] = ()
     simulator: Line = "MuJoCo"
 
     def __post_init__(self) -> None:
-        if not check_fields(self)["n"]:
+        if not self.names:
             raise InputError("PlantCheck: names: got none, want at least one state")
-        check_count("PlantCheck: samples", self.samples)
         for *_, count in self.contacts:
             check_count("PlantCheck: contacts: count", count, at_most=self.samples)
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.annotations import LINE
 from lqrsim.errors import Array, printable
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
-from lqrsim.results.fields import LINE
 from lqrsim.results.goal import Target, departure
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution

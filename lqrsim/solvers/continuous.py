@@ -7,12 +7,13 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PPoly
 
+from lqrsim.annotations import Positive, checked
 from lqrsim.codegen.user_functions import UserFunction, interrupt_of, raised_by
 from lqrsim.errors import (
     Array,
@@ -29,7 +30,6 @@ from lqrsim.problem.costs import terms_of
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.initial_guess import InitialPrior
@@ -48,6 +48,7 @@ from lqrsim.solvers.riccati_ode import (
 )
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContinuousSolution:
     """A policy and the value functions as functions of time, in seconds from 0 to the horizon.
@@ -63,13 +64,12 @@ class ContinuousSolution:
 
     status: Status
     detail: str
-    horizon: Annotated[float, Bounds(above=0.0)]
+    horizon: Positive
     iterations: tuple[Iteration, ...] = ()
     _backward: Pass | None = field(repr=False, compare=False)
     _forward: Pass | None = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        check_fields(self)
         for name in ("_backward", "_forward"):
             check_kind(f"ContinuousSolution: {name}", getattr(self, name), (Pass, type(None)), "a Pass or None")
 

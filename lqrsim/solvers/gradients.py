@@ -17,11 +17,11 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Line, checked
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_flag, check_function, check_kind
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Curvature, Status
 from lqrsim.solvers.curvature import AT_ZERO, HELD
@@ -39,6 +39,7 @@ NEAR = 1e-3
 SWEEPS = 3  # that hold the rows; each leaves about 1 / HELD of the error of the one before
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Gradients:
     """Gradients of an optimum in P parameters; see `gradients`.
@@ -58,9 +59,6 @@ class Gradients:
     changing: tuple[Line, ...]
     states: Annotated[Array, "T+1 n P", Bounds()] | None = None
     controls: Annotated[Array, "T m P", Bounds()] | None = None
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def gradients(

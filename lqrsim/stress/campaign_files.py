@@ -26,9 +26,9 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lqrsim.annotations import Line, checked
 from lqrsim.errors import InputError, excerpt
 from lqrsim.results.archive import Other, blamed, canonical, parse, replacing, sha256
-from lqrsim.results.fields import Line, check_fields
 from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import Campaign, Cell, Shard
 
@@ -158,6 +158,7 @@ GIVEN = "solution.npz"  # the solution that was given instead of solving; the ma
 _LARGEST = 1 << 26  # bytes, largest manifest
 
 
+@checked
 @dataclass(frozen=True)
 class _Manifest:
     """The fields of the manifest; `Campaign` checks the campaign's fields."""
@@ -179,9 +180,6 @@ class _Manifest:
     left_out: Line
     remarks: tuple[Line, ...]
     sha256: Line
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def write_manifest(folder: Path, contents: dict[str, Any]) -> None:

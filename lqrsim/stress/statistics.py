@@ -7,12 +7,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_array, check_count, check_function, check_number, check_seed, excerpt
-from lqrsim.results.fields import check_fields
 
 CONFIDENCE = 0.95
 
 
+@checked
 @dataclass(frozen=True)
 class Estimate:
     """A number with its confidence interval."""
@@ -21,9 +22,6 @@ class Estimate:
     low: float
     high: float
     confidence: float = CONFIDENCE
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def __format__(self, spec: str) -> str:
         return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"

@@ -6,8 +6,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import LINE, Line, checked
 from lqrsim.errors import Array, InputError
-from lqrsim.results.fields import LINE, Line, check_fields
 
 FEW_FRAMES = 4  # up to this number, each wrong frame is named
 
@@ -107,6 +107,7 @@ SCALE = 0.002  # largest error of the scale
 VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
 
+@checked
 @dataclass(frozen=True)
 class Criterion:
     """One test of a verification.
@@ -123,10 +124,8 @@ class Criterion:
     passed: bool | None
     detail: Line
 
-    def __post_init__(self) -> None:
-        check_fields(self)
 
-
+@checked
 @dataclass(frozen=True, eq=False)
 class Verification:
     """Positions of a run from pixels, in N frames with d coordinates, and the tests that they passed.
@@ -160,7 +159,7 @@ class Verification:
     likely: Annotated[str, 10 * LINE]
 
     def __post_init__(self) -> None:
-        if not check_fields(self)["N"]:
+        if not len(self.times):
             raise InputError("Verification: times: got none, want one for each frame")
 
     @property

@@ -7,24 +7,24 @@ ball, at any distance and anywhere in the picture. The position of a camera alon
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Finite, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_name
-from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
 from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial
 
-_Number = Annotated[float, Bounds()]
+_Number = Finite
 Vector = tuple[_Number, _Number, _Number]
 
 NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so a wide range loses no precision
 
 
+@checked
 @dataclass(frozen=True)
 class Camera:
     """An orthographic view of the world. Pixels are (column, row) from the upper left corner, centres at halves.
@@ -39,10 +39,9 @@ class Camera:
     position: Vector
     forward: Vector
     up: Vector
-    height: Annotated[float, Bounds(above=0.0)]
+    height: Positive
 
     def __post_init__(self) -> None:
-        check_fields(self)
         directions = np.array([self.forward, self.up])
         if not np.allclose(directions @ directions.T, np.eye(2), rtol=0, atol=1e-6):
             raise InputError(f"camera: got forward and up {directions.tolist()}, want orthogonal unit vectors")

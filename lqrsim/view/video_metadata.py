@@ -4,15 +4,15 @@ import json
 import os
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import av
 import numpy as np
 from av.error import FFmpegError
 
+from lqrsim.annotations import Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, excerpt
 from lqrsim.results.archive import excerpt_of, sha256
-from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import record_from, tree_of
 from lqrsim.view.cameras import Camera
@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from av.container import OutputContainer
 
 FORMAT, VERSION = "lqrsim footage", 1
-Positive = Annotated[float, Bounds(above=0.0)]
+Positive = Positive
 
 
+@checked
 @dataclass(frozen=True)
 class Pane:
     """A part of the picture that shows one trial, in pixels from the upper left corner.
@@ -39,10 +40,8 @@ class Pane:
     trial: int = 0
     camera: Camera | None = None
 
-    def __post_init__(self) -> None:
-        check_fields(self)
 
-
+@checked
 @dataclass(frozen=True)
 class VideoMetadata:
     """The content of a video. Frame k shows a run `k / rate * speed` seconds after its start.
@@ -62,7 +61,6 @@ class VideoMetadata:
     panes: tuple[Pane, ...]
 
     def __post_init__(self) -> None:
-        check_fields(self)
         check_count("VideoMetadata: frames", self.frames)
         fits = self.rate > 0 and len(self.markers) == len(self.runs)
         if not (fits and all(pane.run < len(self.runs) for pane in self.panes)):

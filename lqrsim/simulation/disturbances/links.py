@@ -7,9 +7,9 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Share, checked
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_count, check_number, keep
-from lqrsim.results.fields import SHARE, Bounds, check_fields
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, times, uniform
 from lqrsim.simulation.plant import Plant
@@ -87,6 +87,7 @@ class MeasurementLatency(Late):
         return Effect(measure=measure)
 
 
+@checked
 @dataclass(frozen=True)
 class GilbertElliott:
     """A link with losses in bursts. It has a good and a bad state, and begins with their stationary distribution.
@@ -98,13 +99,10 @@ class GilbertElliott:
       lost_when_bad: fraction that is lost while bad.
     """
 
-    to_bad: Annotated[float, SHARE]
+    to_bad: Share
     to_good: Annotated[float, Bounds(above=0.0, at_most=1.0)]  # or a bad link stays bad forever
-    lost_when_good: Annotated[float, SHARE] = 0.0
-    lost_when_bad: Annotated[float, SHARE] = 1.0
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    lost_when_good: Share = 0.0
+    lost_when_bad: Share = 1.0
 
     @property
     def bad(self) -> float:

@@ -1,46 +1,56 @@
-"""Checks of a record's fields by their annotations, when a record is made and when a file is read.
+"""What records and functions take, said by annotations alone: `checked` holds constructors and calls to them.
 
+    @checked
     @dataclass(frozen=True)
     class Trajectory:
         states: Annotated[Array, "T+1 n"]
         controls: Annotated[Array, "T m"]
-        dt: Annotated[float, Bounds(above=0.0)]
+        dt: Positive
 
-        def __post_init__(self) -> None:
-            check_fields(self)
+    @checked
+    def simulate(plant: Plant, *, trials: Count = 1, seed: Seed = 0): ...
 
 A letter is a size, the same throughout a record and the records in it. `...` means any number of dimensions, `_` any
 size. The letter of a tuple, or of `Coordinates`, is its length.
+
+A class, `bool`, a `Literal` and a function need no more than themselves, and a function is tried with as many arguments
+as it is annotated with. `Want` is the end of a message where the type does not say it. What else an annotation may be,
+such as `ArrayLike`, is left to the function.
 """
 
 import enum
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
-from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import (
+    LARGEST_COUNT,
     InputError,
     brief,
     check_count,
+    check_flag,
+    check_function,
     check_items,
     check_kind,
+    check_name,
     check_number,
+    check_text,
     excerpt,
-    keep,
     numbers_of,
     real,
 )
 
 Sizes = dict[str, int]
+T = TypeVar("T")
 
 LINE = 1000  # characters of a name or another line
-Line = Annotated[str, LINE]  # one printable line
-LARGEST_COUNT = 2**128 - 1  # the largest seed
+LARGEST_SEED = 2**128 - 1
 
 
 class Bounds(NamedTuple):
@@ -52,7 +62,22 @@ class Bounds(NamedTuple):
     below: float | None = None
 
 
+class Want(NamedTuple):
+    """The end of a message, after "want", in place of the name of the type."""
+
+    text: str
+
+
+Line = Annotated[str, LINE]  # one printable line
+Finite = Annotated[float, Bounds()]
+Positive = Annotated[float, Bounds(above=0.0)]
+NonNegative = Annotated[float, Bounds(at_least=0.0)]
 SHARE = Bounds(at_least=0.0, at_most=1.0)
+Share = Annotated[float, SHARE]
+Chance = Annotated[float, Bounds(above=0.0, below=1.0)]  # of what is neither impossible nor certain
+Count = Annotated[int, Bounds(at_least=1, at_most=LARGEST_COUNT)]
+Index = Annotated[int, Bounds(at_least=0, at_most=LARGEST_COUNT)]
+Seed = Annotated[int, Bounds(at_least=0, at_most=LARGEST_SEED)]
 
 
 def repr_of(self: Any) -> str:
@@ -62,14 +87,15 @@ def repr_of(self: Any) -> str:
 
 
 class Declared(NamedTuple):
-    """The content of a field's annotation.
+    """The content of an annotation.
 
     Attributes:
       kinds: the allowed types, as `typing` names them.
       dtype: type of an array, float64 or int64; None if it is no array.
       letters: the shape of an array, or the length of something else; empty if not given.
       longest: characters of a text that is one printable line; None for any text.
-      optional: whether the field may be None.
+      want: the end of messages; empty for the name of the type.
+      optional: whether the value may be None.
     """
 
     kinds: tuple[Any, ...]
@@ -77,33 +103,67 @@ class Declared(NamedTuple):
     letters: str
     bounds: Bounds | None
     longest: int | None
+    want: str
     optional: bool
 
 
-def check_fields(record: Any) -> Sizes:
-    """Check the fields of a record and convert them as annotated: arrays to float64, sequences to tuples.
+def checked(thing: T) -> T:
+    """Decorator of a function or of a dataclass: check arguments by their annotations, and convert them.
 
-    Returns:
-      The sizes, by letter.
-
-    Raises:
-      InputError: a field is of another kind, range or size.
+    Numbers become Python's, for NumPy's are other types for the compiler, and JSON has no form for them; arrays become
+    float64 and sequences tuples. Defaults are not checked. Messages name an argument, and before it the class if it is
+    made, unless the class has another `_prefix`.
     """
-    sizes: Sizes = {}
-    who = type(record).__name__
-    for name, said in _in_order(type(record)):
-        value = getattr(record, name)
-        kept = _checked(f"{who}: {name}", value, said, sizes)
-        if kept is not value:
-            keep(record, **{name: kept})
-    return sizes
+    if isinstance(thing, type):
+        thing.__init__ = _checking(thing.__init__, lambda: _of_fields(thing))
+        return thing
+    function: Any = thing
+    return _checking(function, lambda: {name: declared(hint) for name, hint in _hints(function)})
+
+
+def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
+    code = function.__code__
+    positions = {name: place for place, name in enumerate(code.co_varnames[: code.co_argcount])}
+    makes = function.__name__ == "__init__"
+
+    @cache  # at the first call, for annotations may name what is defined further down
+    def wanted() -> list[tuple[str, int, Declared]]:
+        said = sorted((item for item in declare().items() if _is_known(item[1])), key=_order)
+        return [(name, positions.get(name, len(positions)), one) for name, one in said]
+
+    @functools.wraps(function)
+    def call(*given: Any, **named: Any) -> Any:
+        who = ""
+        if makes:
+            kind = type(given[0])
+            who = getattr(kind, "_prefix", f"{kind.__name__}: ")
+        placed, sizes = list(given), Sizes()
+        for name, place, said in wanted():
+            if name in named:
+                named[name] = _checked(who + name, named[name], said, sizes)
+            elif place < len(placed):
+                placed[place] = _checked(who + name, placed[place], said, sizes)
+        return function(*placed, **named)
+
+    return call
+
+
+def _hints(function: Any) -> list[tuple[str, Any]]:
+    hints = get_type_hints(function, include_extras=True)
+    return [(name, hint) for name, hint in hints.items() if name != "return"]
 
 
 @cache
 def declarations(kind: type) -> dict[str, Declared]:
     """The declaration of each field of a record, except fields that are no part of its value (`compare=False`)."""
+    of_value = {field.name for field in fields(kind) if field.compare}
+    return {name: said for name, said in _of_fields(kind).items() if name in of_value}
+
+
+@cache
+def _of_fields(kind: type) -> dict[str, Declared]:
     hints = get_type_hints(kind, include_extras=True)
-    return {field.name: declared(hints[field.name]) for field in fields(kind) if field.compare}
+    return {field.name: declared(hints[field.name]) for field in fields(kind)}
 
 
 @cache
@@ -127,24 +187,40 @@ def declared(annotation: Any) -> Declared:
     dtype = None
     if get_origin(kinds[0]) in (np.ndarray, npt.NDArray):  # the latter from NumPy 2.5 on, with Python 3.12
         dtype = np.int64 if "int64" in str(kinds[0]) else np.float64
-    return Declared(kinds, dtype, first(str) or "", first(Bounds), first(int), optional)
+    want = first(Want)
+    return Declared(kinds, dtype, first(str) or "", first(Bounds), first(int), want.text if want else "", optional)
 
 
-@cache
-def _in_order(kind: type) -> list[tuple[str, Declared]]:
+def _is_known(said: Declared) -> bool:
+    """Whether the annotation says what to check; what it does not say, a function checks itself."""
+    kind, origin = said.kinds[0], get_origin(said.kinds[0])
+    if said.dtype is not None:
+        return bool(said.letters)
+    if len(said.kinds) > 1:
+        # One of several classes of the package; of others only where the message says more than their names.
+        return all(_is_class(one) and (said.want or one.__module__.startswith("lqrsim")) for one in said.kinds)
+    if origin in _COLLECTIONS:
+        return origin is tuple or bool(said.want)
+    return origin in (Callable, Mapping, Literal) or (_is_class(kind) and kind is not object)
+
+
+_COLLECTIONS = (tuple, Sequence, Iterable)
+
+
+def _is_class(kind: Any) -> bool:
+    return isinstance(kind, type) and kind is not Any and get_origin(kind) is None
+
+
+def _order(item: tuple[str, Declared]) -> int:
     """Sort key: records first, which define sizes, then arrays, then optional records and tuples of a length."""
-
-    def order(item: tuple[str, Declared]) -> int:
-        said = item[1]
-        last = said.letters if get_origin(said.kinds[0]) is tuple else said.optional and is_dataclass(said.kinds[0])
-        return 2 if last else int(said.dtype is not None)
-
-    return sorted(declarations(kind).items(), key=order)
+    said = item[1]
+    last = said.letters if get_origin(said.kinds[0]) is tuple else said.optional and is_dataclass(said.kinds[0])
+    return 2 if last else int(said.dtype is not None)
 
 
 def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
     """The value as declared. Raises InputError for other values."""
-    kind, bounds = said.kinds[0], said.bounds
+    kind, bounds, want = said.kinds[0], said.bounds, said.want
     if value is None and said.optional:
         return None
     if said.dtype is not None:
@@ -152,37 +228,62 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
     if kind is float:
         return _number(field, value) if bounds is None else check_number(field, value, **bounds._asdict())
     if kind is int:
-        return check_count(field, value, at_least=0, at_most=LARGEST_COUNT)
+        _, least, most, _ = bounds or (None, 0, LARGEST_SEED, None)
+        return check_count(field, value, at_least=int(least or 0), at_most=int(most or LARGEST_COUNT))
+    if kind is bool:
+        return check_flag(field, value)
     if kind is str:
+        if want:
+            return check_text(field, value, want, at_most=said.longest or 200)
         return check_string(field, value, said.longest)
-    if kind is object:
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return check_name(field, value, inside)
+    if origin is Callable:
+        count = None if inside[0] is Ellipsis else len(inside[0])
+        check_function(field, value, want or f"a function of {count} arguments", arguments=count, optional=False)
         return value
-    origin = get_origin(kind)
-    if origin is tuple:
-        items = check_items(field, value, object, "a tuple")
-        if said.letters:
-            _check_length(field, len(items), said.letters, sizes)
-        inner = get_args(kind)
-        each = inner[:1] * len(items) if inner[-1] is Ellipsis else inner
-        if len(each) != len(items):
-            raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
-        pairs = enumerate(zip(items, each, strict=True))
-        return tuple(_checked(f"{field}[{i}]", item, declared(one), sizes) for i, (item, one) in pairs)
-    if origin is not None:  # a Mapping
-        value = check_kind(field, value, Mapping, "a dictionary by name")
-        inner = declared(get_args(kind)[1])
+    if origin in _COLLECTIONS:
+        return _items(field, value, said, sizes)
+    if origin is Mapping:
+        value = check_kind(field, value, Mapping, want or "a dictionary by name")
+        inner = declared(inside[1])
         names = {name: check_string(f"{field}: a name", name, LINE) for name in value}
+        if not _is_known(inner):
+            return dict(value)
         return {name: _checked(f"{field}.{name}", value[name], inner, sizes) for name in names}
-    names = [one.__name__ for one in said.kinds]
-    want = " or ".join(f"{'an' if name[0] in 'AEIOU' else 'a'} {name}" for name in names)
-    if issubclass(kind, enum.Enum):
-        want += f", one of {', '.join(kind.__members__)}"
-    value = check_kind(field, value, said.kinds, want)
+    value = check_kind(field, value, said.kinds, want or _names(said))
     if said.letters:
         _check_length(field, len(value), said.letters, sizes)
-    elif is_dataclass(value):
+    elif is_dataclass(value) and sizes:
         _share_sizes(field, value, sizes)
     return value
+
+
+def _names(said: Declared) -> str:
+    """The names of classes as the end of a message, and how to get an object of theirs if the class has `_such_as`."""
+    names = [kind.__name__ for kind in said.kinds]
+    want = " or ".join(f"{'an' if name[0] in 'AEIOU' else 'a'} {name}" for name in names)
+    kind = said.kinds[0]
+    if issubclass(kind, enum.Enum):
+        return f"{want}, one of {', '.join(kind.__members__)}"
+    want += f", such as {example}" if (example := getattr(kind, "_such_as", "")) else ""
+    return want + (", or None" if said.optional else "")
+
+
+def _items(field: str, value: Any, said: Declared, sizes: Sizes) -> tuple[Any, ...]:
+    """A collection as a tuple, of which each item is as declared."""
+    inner = get_args(said.kinds[0])
+    if said.want and not get_origin(inner[0]) and _is_class(inner[0]):
+        return check_items(field, value, inner[0], said.want, at_most=said.longest or 1_000_000)
+    items = check_items(field, value, object, said.want or "a tuple")
+    if said.letters:
+        _check_length(field, len(items), said.letters, sizes)
+    each = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
+    if len(each) != len(items):
+        raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
+    pairs = enumerate(zip(items, map(declared, each), strict=True))
+    return tuple(_checked(f"{field}[{i}]", item, one, sizes) if _is_known(one) else item for i, (item, one) in pairs)
 
 
 def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
