@@ -20,7 +20,8 @@ such as `ArrayLike`, is left to the function.
 
 import enum
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -68,6 +69,13 @@ class Want(NamedTuple):
     text: str
 
 
+class OneOf:
+    """The texts that an argument may be, where they are the names of something and no `Literal` has them."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        self.names = names
+
+
 Line = Annotated[str, LINE]  # one printable line
 Finite = Annotated[float, Bounds()]
 Positive = Annotated[float, Bounds(above=0.0)]
@@ -78,6 +86,8 @@ Chance = Annotated[float, Bounds(above=0.0, below=1.0)]  # of what is neither im
 Count = Annotated[int, Bounds(at_least=1, at_most=LARGEST_COUNT)]
 Index = Annotated[int, Bounds(at_least=0, at_most=LARGEST_COUNT)]
 Seed = Annotated[int, Bounds(at_least=0, at_most=LARGEST_SEED)]
+Progress = Annotated[Callable[[int, int], object], Want("a function progress(done, total)")]
+TextProgress = Annotated[Callable[[int, int, str], object], Want("a function progress(done, total, text)")]
 
 
 def repr_of(self: Any) -> str:
@@ -95,6 +105,7 @@ class Declared(NamedTuple):
       letters: the shape of an array, or the length of something else; empty if not given.
       longest: characters of a text that is one printable line; None for any text.
       want: the end of messages; empty for the name of the type.
+      names: the texts that it may be; empty for any.
       optional: whether the value may be None.
     """
 
@@ -104,7 +115,13 @@ class Declared(NamedTuple):
     bounds: Bounds | None
     longest: int | None
     want: str
+    names: Collection[str]
     optional: bool
+
+    @property
+    def plain(self) -> bool:
+        """Whether there is no more than a type."""
+        return not (self.letters or self.bounds or self.longest or self.want or self.names)
 
 
 def checked(thing: T) -> T:
@@ -118,7 +135,7 @@ def checked(thing: T) -> T:
         thing.__init__ = _checking(thing.__init__, lambda: _of_fields(thing))
         return thing
     function: Any = thing
-    return _checking(function, lambda: {name: declared(hint) for name, hint in _hints(function)})
+    return _checking(function, lambda: _of_parameters(function))
 
 
 def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
@@ -127,9 +144,10 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
     makes = function.__name__ == "__init__"
 
     @cache  # at the first call, for annotations may name what is defined further down
-    def wanted() -> list[tuple[str, int, Declared]]:
+    def wanted() -> tuple[list[tuple[str, int, Declared]], bool]:
         said = sorted((item for item in declare().items() if _is_known(item[1])), key=_order)
-        return [(name, positions.get(name, len(positions)), one) for name, one in said]
+        places = [(name, positions.get(name, sys.maxsize), one) for name, one in said]
+        return places, any(one.letters for _, one in said)
 
     @functools.wraps(function)
     def call(*given: Any, **named: Any) -> Any:
@@ -137,8 +155,9 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
         if makes:
             kind = type(given[0])
             who = getattr(kind, "_prefix", f"{kind.__name__}: ")
-        placed, sizes = list(given), Sizes()
-        for name, place, said in wanted():
+        placed, (places, sized) = list(given), wanted()
+        sizes = Sizes() if sized else None
+        for name, place, said in places:
             if name in named:
                 named[name] = _checked(who + name, named[name], said, sizes)
             elif place < len(placed):
@@ -148,9 +167,15 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
     return call
 
 
-def _hints(function: Any) -> list[tuple[str, Any]]:
+def _of_parameters(function: Any) -> dict[str, Declared]:
+    """The declarations of parameters. A plain number, text or dictionary says too little: the function decides."""
     hints = get_type_hints(function, include_extras=True)
-    return [(name, hint) for name, hint in hints.items() if name != "return"]
+    said = {name: declared(hint) for name, hint in hints.items() if name != "return"}
+    return {
+        name: one
+        for name, one in said.items()
+        if not (one.plain and (get_origin(one.kinds[0]) or one.kinds[0]) in _PLAIN)
+    }
 
 
 @cache
@@ -187,8 +212,11 @@ def declared(annotation: Any) -> Declared:
     dtype = None
     if get_origin(kinds[0]) in (np.ndarray, npt.NDArray):  # the latter from NumPy 2.5 on, with Python 3.12
         dtype = np.int64 if "int64" in str(kinds[0]) else np.float64
-    want = first(Want)
-    return Declared(kinds, dtype, first(str) or "", first(Bounds), first(int), want.text if want else "", optional)
+    letters, want, names = first(str) or "", first(Want), first(OneOf)
+    if get_origin(kinds[0]) is Literal:
+        names = OneOf(get_args(kinds[0]))
+    wanted, allowed = want.text if want else "", names.names if names else ()
+    return Declared(kinds, dtype, letters, first(Bounds), first(int), wanted, allowed, optional)
 
 
 def _is_known(said: Declared) -> bool:
@@ -201,10 +229,13 @@ def _is_known(said: Declared) -> bool:
         return all(_is_class(one) and (said.want or one.__module__.startswith("lqrsim")) for one in said.kinds)
     if origin in _COLLECTIONS:
         return origin is tuple or bool(said.want)
-    return origin in (Callable, Mapping, Literal) or (_is_class(kind) and kind is not object)
+    if origin is Callable:
+        return bool(said.want)
+    return origin in (Mapping, Literal) or (_is_class(kind) and kind is not object)
 
 
 _COLLECTIONS = (tuple, Sequence, Iterable)
+_PLAIN = (float, int, str, tuple, Mapping)
 
 
 def _is_class(kind: Any) -> bool:
@@ -218,12 +249,12 @@ def _order(item: tuple[str, Declared]) -> int:
     return 2 if last else int(said.dtype is not None)
 
 
-def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
-    """The value as declared. Raises InputError for other values."""
+def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any:
+    """The value as declared, with sizes that agree if any are declared. Raises InputError for other values."""
     kind, bounds, want = said.kinds[0], said.bounds, said.want
     if value is None and said.optional:
         return None
-    if said.dtype is not None:
+    if said.dtype is not None and sizes is not None:
         return _array(field, value, said, sizes)
     if kind is float:
         return _number(field, value) if bounds is None else check_number(field, value, **bounds._asdict())
@@ -232,13 +263,13 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
         return check_count(field, value, at_least=int(least or 0), at_most=int(most or LARGEST_COUNT))
     if kind is bool:
         return check_flag(field, value)
+    if said.names:
+        return check_name(field, value, said.names)
     if kind is str:
         if want:
             return check_text(field, value, want, at_most=said.longest or 200)
         return check_string(field, value, said.longest)
     origin, inside = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return check_name(field, value, inside)
     if origin is Callable:
         count = None if inside[0] is Ellipsis else len(inside[0])
         check_function(field, value, want or f"a function of {count} arguments", arguments=count, optional=False)
@@ -253,37 +284,38 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
             return dict(value)
         return {name: _checked(f"{field}.{name}", value[name], inner, sizes) for name in names}
     value = check_kind(field, value, said.kinds, want or _names(said))
-    if said.letters:
-        _check_length(field, len(value), said.letters, sizes)
-    elif is_dataclass(value) and sizes:
-        _share_sizes(field, value, sizes)
+    if sizes is not None:
+        if said.letters:
+            _check_length(field, len(value), said.letters, sizes)
+        elif is_dataclass(value):
+            _share_sizes(field, value, sizes)
     return value
 
 
 def _names(said: Declared) -> str:
-    """The names of classes as the end of a message, and how to get an object of theirs if the class has `_such_as`."""
-    names = [kind.__name__ for kind in said.kinds]
-    want = " or ".join(f"{'an' if name[0] in 'AEIOU' else 'a'} {name}" for name in names)
-    kind = said.kinds[0]
-    if issubclass(kind, enum.Enum):
+    """The end of a message about classes: `_want` of each, with how to get an object, or its name."""
+    names = {kind: f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}" for kind in said.kinds}
+    told = [getattr(kind, "_want", name) for kind, name in names.items()]
+    want = (", or " if told != [*names.values()] else " or ").join(told)
+    if issubclass(kind := said.kinds[0], enum.Enum):
         return f"{want}, one of {', '.join(kind.__members__)}"
-    want += f", such as {example}" if (example := getattr(kind, "_such_as", "")) else ""
-    return want + (", or None" if said.optional else "")
+    return f"{want}, or None" if said.optional else want
 
 
-def _items(field: str, value: Any, said: Declared, sizes: Sizes) -> tuple[Any, ...]:
+def _items(field: str, value: Any, said: Declared, sizes: Sizes | None) -> tuple[Any, ...]:
     """A collection as a tuple, of which each item is as declared."""
     inner = get_args(said.kinds[0])
-    if said.want and not get_origin(inner[0]) and _is_class(inner[0]):
+    if said.want and _is_class(inner[0]) and inner[0] not in _PLAIN:
         return check_items(field, value, inner[0], said.want, at_most=said.longest or 1_000_000)
     items = check_items(field, value, object, said.want or "a tuple")
-    if said.letters:
+    if said.letters and sizes is not None:
         _check_length(field, len(items), said.letters, sizes)
     each = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
     if len(each) != len(items):
         raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
-    pairs = enumerate(zip(items, map(declared, each), strict=True))
-    return tuple(_checked(f"{field}[{i}]", item, one, sizes) if _is_known(one) else item for i, (item, one) in pairs)
+    names = (field if said.want else f"{field}[{i}]" for i in range(len(items)))
+    each = zip(names, items, map(declared, each), strict=True)
+    return tuple(_checked(name, item, one, sizes) if _is_known(one) else item for name, item, one in each)
 
 
 def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:

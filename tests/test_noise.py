@@ -259,7 +259,7 @@ def test_a_file_says_what_the_noise_was(tmp_path):
             lambda: ls.lq.smooth_continuous(problem_of(draw(np.random.default_rng(0)), fixed=False)),
             "^noise: got a problem with noise, which is per control period",
         ),
-        (lambda: ls.sample_costs(of(None), None), "^problem: got a problem without noise, want"),  # pyright: ignore[reportArgumentType]
+        (lambda: ls.sample_costs(of(None), ls.smooth(of(None))), "^problem: got a problem without noise, want"),
     ],
 )
 def test_what_is_refused(make, message):
