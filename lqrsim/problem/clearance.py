@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import NonNegative, checked
 from lqrsim.errors import Array, InputError, check_array, check_number, real
 from lqrsim.kernels.declarations import ROW, N, stack
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
@@ -36,11 +37,12 @@ class Clearance(KeepsClear, Constraint):
         Those of knots move with time when a `Replanner` plans again, as a reference does; see `QuadraticCost`.
     """
 
+    @checked
     def __init__(
         self,
         world: World,
         *,
-        radius: float | None = None,
+        radius: NonNegative | None = None,
         balls: CollisionSpheres | None = None,
         geoms: CollisionGeoms | None = None,
         margin: float | npt.ArrayLike = 0.0,

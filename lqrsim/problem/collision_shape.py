@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lqrsim.codegen.distances import distances_with_normals, signed_distance, signed_distance_displaced
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
-from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
+from lqrsim.errors import Array, InputError
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, evaluate, evaluate_slopes
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
@@ -286,19 +286,12 @@ class KeepsClear:
     def _set_shape(
         self, world: World, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None
     ) -> None:
-        who = type(self).__name__
-        if not isinstance(world, World):
-            raise InputError(f"{who}: world: got {excerpt(world)}, want a World, such as scene.world")
-        check_kind(f"{who}: balls", balls, (CollisionSpheres, type(None)), "CollisionSpheres(places, radii)")
-        check_kind(f"{who}: geoms", geoms, (CollisionGeoms, type(None)), "those of a robot from an MJCF, robot.geoms")
         shape: dict[str, Any] = {"radius": radius, "balls": balls, "geoms": geoms}
         self.shape = {name: one for name, one in shape.items() if one is not None}
         if len(self.shape) != 1:
             got = " and ".join(self.shape) or "none of radius, balls and geoms"
             wanted = "one of them: radius=robot.radius, balls=robot.balls or geoms=robot.geoms"
-            raise InputError(f"{who}: got {got}, want {wanted}")
-        if radius is not None:
-            self.shape["radius"] = check_number(f"{who}: radius", radius, at_least=0.0)
+            raise InputError(f"{type(self).__name__}: got {got}, want {wanted}")
         self.world, self.balls, self.geoms = world, balls, geoms
         largest = geoms.size if geoms is not None else 0.0 if balls is None else float(balls.radii.max())
         self.radius: float = self.shape.get("radius", largest)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Index, checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of
@@ -29,12 +30,8 @@ from lqrsim.errors import (
     InputError,
     brief,
     check_array,
-    check_count,
-    check_flag,
     check_items,
-    check_kind,
     excerpt,
-    keep,
     vectors_of,
 )
 from lqrsim.kernels import differences, sphere_centers, user_functions
@@ -43,6 +40,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class SphereCenters(Term):
     """Positions of balls, for one system: the source to compile, and its data.
@@ -57,19 +55,12 @@ class SphereCenters(Term):
         in space.
     """
 
-    depends_on: tuple[int, ...]
+    depends_on: tuple[Index, ...]
     in_plane: bool = False
 
     @property
     def _defines(self) -> Mapping[str, int]:
         return {"places": 3, "places_jacobian": 4}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        wanted = "a tuple of indices of states"
-        given = check_items("SphereCenters: depends_on", self.depends_on, (int, np.integer), wanted)
-        keep(self, depends_on=tuple(check_count("SphereCenters: depends_on", i, at_least=0) for i in given))
-        keep(self, in_plane=check_flag("SphereCenters: in_plane", self.in_plane))
 
     def world_seen(self, world: World, space: Coordinates) -> World:
         """The obstacles in the coordinates of the places.
@@ -269,6 +260,7 @@ class CollisionSpheres:
             has = "a position in space" if space.position else "no position"
             raise InputError(f"{self.name}: got points of 2 coordinates for dynamics with {has}, want 3")
 
+    @checked
     def centres(self, dynamics: Dynamics, states: npt.ArrayLike) -> Array:
         """The centre of each ball, (..., K, 3), at states (..., n), in the world, in metres.
 
@@ -278,7 +270,6 @@ class CollisionSpheres:
           dynamics: dynamics of the system whose states move the balls.
           states: (..., n).
         """
-        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         places = self.bind(dynamics)
         found = evaluate(places, len(self), states)

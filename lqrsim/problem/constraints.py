@@ -7,22 +7,19 @@ kernel, and write `bind`.
 import functools
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 
+from lqrsim.annotations import Index, Want, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import Term
 from lqrsim.errors import (
     Array,
     InputError,
-    check_count,
-    check_flag,
-    check_function,
     check_items,
     check_kind,
     excerpt,
-    keep,
 )
 from lqrsim.kernels import residual_constraint
 from lqrsim.problem.costs import ProblemPart
@@ -36,6 +33,7 @@ Side = float | Array  # a bound, or one for each knot, (K,)
 _Value = TypeVar("_Value")
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class ConstraintTerm(Term):
     """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
@@ -62,17 +60,17 @@ class ConstraintTerm(Term):
         at a price: after a push, no plan may satisfy it.
     """
 
-    rows: int
-    describe: Callable[[int], str]
+    rows: Index
+    describe: Annotated[Callable[[int], str], Want("a function of a row")]
     uses_control: bool = False
     equality: bool = False
     final_only: bool = False
-    shared: int = 0
+    shared: Index = 0
     convex: bool = False
     ranges: Array | None = None
     linear: bool = False
     yields: bool = False
-    names: tuple[str, ...] = ()
+    names: Annotated[tuple[str, ...], Want("a tuple with a name of each row")] = ()
 
     @property
     def _defines(self) -> Mapping[str, int]:
@@ -85,18 +83,12 @@ class ConstraintTerm(Term):
         return [*super().digested, *set_of_values]
 
     def __post_init__(self) -> None:
-        keep(self, rows=check_count("ConstraintTerm: rows", self.rows, at_least=0))
-        check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
-        keep(self, names=check_items("ConstraintTerm: names", self.names, str, "a tuple with a name of each row"))
         if self.names and len(self.names) != self.rows:
             raise InputError(
                 f"ConstraintTerm: names: got {len(self.names)}, want none, or one for each of {self.rows} rows"
             )
-        for name in ("uses_control", "equality", "final_only", "convex", "linear", "yields"):
-            keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")
-        keep(self, shared=check_count("ConstraintTerm: shared", self.shared, at_least=0))
         super().__post_init__()
 
     @classmethod

@@ -12,19 +12,21 @@ from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
 import numpy as np
 
+from lqrsim.annotations import Index, checked
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import Term
-from lqrsim.errors import Array, InputError, brief, check_count, check_flag, check_items, check_name, excerpt, keep
+from lqrsim.errors import Array, InputError, brief, check_count, excerpt
 from lqrsim.kernels import residual_cost
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
-from lqrsim.results.solution_parts import HORIZONS, left_after
+from lqrsim.results.solution_parts import Horizon, left_after
 
 if TYPE_CHECKING:
     from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class CostTerm(Term):
     """A cost term, for one system: the source to compile, and the numbers that it reads.
@@ -42,7 +44,7 @@ class CostTerm(Term):
         compare the Hessian with differences.
     """
 
-    nonconvex_in: tuple[int, ...] | None = None
+    nonconvex_in: tuple[Index, ...] | None = None
     uses_control: bool = False
     factor: int | None = None
     exact_hessian: bool = True
@@ -53,15 +55,8 @@ class CostTerm(Term):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.nonconvex_in is not None:
-            wanted = "a tuple of indices, or None"
-            given = check_items("CostTerm: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
-            keep(self, nonconvex_in=tuple(check_count("CostTerm: nonconvex_in", i, at_least=0) for i in given))
-        for name in ("uses_control", "exact_hessian"):
-            keep(self, **{name: check_flag(f"CostTerm: {name}", getattr(self, name))})
         if self.factor is not None:
-            last = len(self.data) - 1
-            keep(self, factor=check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
+            check_count("CostTerm: factor", self.factor, at_least=0, at_most=len(self.data) - 1)
 
     @classmethod
     def of_residual(
@@ -140,7 +135,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
             " state, want none"
         )
 
-    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
+    @checked
+    def ahead(self, steps: Index, *, horizon: Horizon = "shrinking") -> Self:
         """The same for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
 
         Args:
@@ -148,8 +144,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
           horizon: "shrinking" for the rest of the plan, without the first rows; or "moving" for a plan of the same
             length, which repeats the last row.
         """
-        check_count("steps", steps, at_least=0)
-        filled = check_name("horizon", horizon, HORIZONS) == "moving"
+        filled = horizon == "moving"
         if not self.by_knot:
             return self
         return self._with_rows(lambda rows: left_after(min(steps, len(rows) - 1), rows, filled=filled))
@@ -181,6 +176,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
 class Cost(ProblemPart[CostTerm]):
     """One term of a cost."""
+
+    _want = "a cost such as QuadraticCost(...) or a sum of costs"
 
     @property
     def name(self) -> str:

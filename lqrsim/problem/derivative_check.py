@@ -9,9 +9,9 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.annotations import Line, checked
+from lqrsim.annotations import Bounds, Line, NonNegative, Positive, Seed, checked
 from lqrsim.codegen.user_functions import Term, UserFunction, first_numbers
-from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
+from lqrsim.errors import Array, InputError, excerpt
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.plain_term import PlainTerm
@@ -129,8 +129,14 @@ class DerivativeCheck:
         )
 
 
+@checked
 def check_derivatives(
-    subject: Problem | Dynamics, *, samples: int = 20, spread: float = 0.3, tolerance: float = 1e-5, seed: int = 0
+    subject: Problem | Dynamics,
+    *,
+    samples: Annotated[int, Bounds(at_least=1, at_most=10_000)] = 20,
+    spread: NonNegative = 0.3,
+    tolerance: Positive = 1e-5,
+    seed: Seed = 0,
 ) -> list[DerivativeCheck]:
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
@@ -152,9 +158,6 @@ def check_derivatives(
     Raises:
       InputError: a function fails, or an argument is not as described.
     """
-    check_count("samples", samples, at_most=10_000)
-    spread = check_number("spread", spread, at_least=0.0)
-    tolerance = check_number("tolerance", tolerance, above=0.0)
     dynamics = subject.dynamics if isinstance(subject, Problem) else subject
     if not isinstance(dynamics, Dynamics):
         raise InputError(f"subject: got {excerpt(subject)}, want a Problem or Dynamics")
@@ -162,7 +165,7 @@ def check_derivatives(
     x0, u0 = np.zeros(n), np.zeros(m)
     if isinstance(subject, Problem):
         x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
-    rng = np.random.default_rng(check_seed("seed", seed))
+    rng = np.random.default_rng(seed)
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
     found: dict[str, list[DerivativeCheck]] = {}
     matrices = [_of_dynamics(dynamics, points)]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Count, Finite, Positive, checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.edge_pushing import weighted_hessian
@@ -27,7 +28,7 @@ from lqrsim.codegen.user_functions import (
     plain_calls,
     with_derivatives,
 )
-from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, excerpt
 from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, step_curvature, substeps, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
@@ -95,6 +96,8 @@ class Dynamics:
         missing. The result of f is checked when it is first needed.
     """
 
+    _prefix = ""
+    _want = "Dynamics(...), such as robot.dynamics"
     # Whether MuJoCo does the steps; see `robots/mjcf_dynamics.py`. They have no second derivatives.
     by_mujoco: ClassVar[bool] = False
     # Relative size of states whose cost is negligible: if the least cost is zero, it is not reached to rounding.
@@ -104,6 +107,7 @@ class Dynamics:
     # Runge-Kutta steps in a control period; see `with_substeps`.
     substeps: int = 1
 
+    @checked
     def __init__(
         self,
         f: Callable[[Any, Any, Any], Any],
@@ -120,9 +124,9 @@ class Dynamics:
         control_limits: Limits | None = None,
         jacobian: Callable[..., None] | None = None,
         level: str | None = None,
-        period: float | None = None,
+        period: Positive | None = None,
     ) -> None:
-        self._period = None if period is None else check_number("period", period, above=0.0)
+        self._period = period
         for field, given in (("states", states), ("controls", controls)):
             if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
                 raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: unit")
@@ -472,7 +476,8 @@ class Dynamics:
             "support": support,
         }
 
-    def period_near(self, dt: float) -> float:
+    @checked
+    def period_near(self, dt: Finite) -> float:
         """The possible duration of steps nearest to `dt`: `dt` itself, or a multiple of `period`.
 
         Args:
@@ -481,14 +486,14 @@ class Dynamics:
         Returns:
           Seconds.
         """
-        dt = check_number("dt", dt)
         return dt if self.period is None else round(dt / self.period) * self.period
 
     def _parts_of(self, dt: float, most: int) -> int:
         """The number of equal parts, up to `most`, of a period of `dt` seconds at whose ends states are known."""
         return 1 if self.discrete else most
 
-    def check_period(self, dt: float) -> None:
+    @checked
+    def check_period(self, dt: Finite) -> None:
         """Check that a step can last `dt` seconds: of a map, its period; see `MjcfDynamics` for MuJoCo's steps.
 
         Args:
@@ -497,7 +502,6 @@ class Dynamics:
         Raises:
           InputError: it cannot.
         """
-        dt = check_number("dt", dt)
         if self.period is not None and abs(dt - self.period) > 1e-9 * self.period:  # rounding, as of 1 / 30
             raise InputError(f"dt: got {dt:g} s, want {self.period:g} s, the period of the map {self.name}")
 
@@ -525,13 +529,13 @@ class Dynamics:
         """How Runge-Kutta's steps in a control period of `dt` seconds become as short as `most` seconds, as text."""
         return f"use dt of at most {most * self.substeps:g} s, with {math.ceil(dt / most)} times as many steps"
 
-    def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
+    @checked
+    def solving(self, threads: Count) -> contextlib.AbstractContextManager[None]:
         """A context in which a solver works.
 
         Args:
           threads: number of threads that the solver may use for one trajectory.
         """
-        check_count("threads", threads)
         return contextlib.nullcontext()
 
     def quiet(self) -> contextlib.AbstractContextManager[None]:

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import (
@@ -23,7 +24,6 @@ from lqrsim.codegen.user_functions import (
 from lqrsim.errors import (
     Array,
     InputError,
-    check_flag,
     check_kind,
     check_name,
     check_shape,
@@ -95,6 +95,7 @@ class SymbolicCost(OfFormula, Cost):
       name: the name in messages; by default that of the function.
     """
 
+    @checked
     def __init__(
         self,
         function: Callable[[Any, Any, Any], Any],
@@ -104,7 +105,7 @@ class SymbolicCost(OfFormula, Cost):
         name: str | None = None,
     ) -> None:
         self._set_formula(function, parameters, name, "FunctionCost for it")
-        self.convex = check_flag("SymbolicCost: convex", convex)
+        self.convex = convex
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
@@ -171,6 +172,7 @@ class SymbolicConstraint(OfFormula, Constraint):
         is a lambda.
     """
 
+    @checked
     def __init__(
         self,
         function: Callable[[Any, Any, Any], Any],
@@ -180,7 +182,7 @@ class SymbolicConstraint(OfFormula, Constraint):
         at: str | npt.ArrayLike = "all",
         name: str | None = None,
     ) -> None:
-        self.equality = check_flag("SymbolicConstraint: equality", equality)
+        self.equality = equality
         self.at = check_name("SymbolicConstraint: at", at, STEPS) if isinstance(at, str) else _knots(at)
         self._table = np.zeros((0, 0))  # (K, P) of the knots
         if self.by_knot:
@@ -303,6 +305,7 @@ class FunctionCost(OfFunction, Cost):
       level: "compiled", "jax" or "plain"; by default compiled if the function is numba's, and plain otherwise.
     """
 
+    @checked
     def __init__(
         self,
         function: Callable[[Any, Any, Any], float],
@@ -316,7 +319,7 @@ class FunctionCost(OfFunction, Cost):
     ) -> None:
         self._set_name(name)
         self.function, self.derivatives = function, derivatives
-        self.convex = check_flag("FunctionCost: convex", convex)
+        self.convex = convex
         self.level = level_of(function, level)
         if self.level == "symbolic":
             if level is not None:

@@ -5,6 +5,7 @@ from typing import Self
 
 import numpy as np
 
+from lqrsim.annotations import NonNegative, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import check_name, check_number
 from lqrsim.problem.costs import Cost, CostTerm
@@ -19,14 +20,15 @@ class LimitCost(Cost):
       weight: weight of the square of each depth.
     """
 
+    @checked
     def __init__(
         self,
         low: Mapping[str, float] | None = None,
         high: Mapping[str, float] | None = None,
         *,
-        weight: float,
+        weight: NonNegative,
     ) -> None:
-        self.weight = check_number("LimitCost: weight", weight, at_least=0.0)
+        self.weight = weight
         self.bounds = [
             (name, sign, check_number(f"LimitCost: bound of {name}", bound))
             for sign, bounds in ((1.0, low), (-1.0, high))

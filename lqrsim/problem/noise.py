@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of, text_source
@@ -27,7 +28,7 @@ from lqrsim.codegen.user_functions import (
     rows_of,
     with_derivatives,
 )
-from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_count, check_name, check_number, excerpt
 from lqrsim.kernels import differences, user_functions
 from lqrsim.kernels import noise as noise_kernel
 from lqrsim.problem.dynamics import Dynamics
@@ -161,6 +162,7 @@ class Noise:
         other.parameters = self.parameters | symbolic.check_parameters(values)
         return other
 
+    @checked
     def bind(self, dynamics: Dynamics) -> NoiseTerm:
         """The noise for a system.
 
@@ -170,7 +172,6 @@ class Noise:
         Raises:
           InputError: the noise does not fit the system.
         """
-        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n = len(dynamics.state_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
         if self.matrix is not None:
@@ -239,6 +240,7 @@ class Noise:
         source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
 
+    @checked
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
         """The matrices M (K, n, k) at given states and controls, in the states' units.
 
@@ -250,7 +252,6 @@ class Noise:
         Raises:
           InputError: the noise, the states or the controls do not fit the system.
         """
-        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = check_array("states", states, (None, n), infinite=True)
         u = check_array("controls", controls, (len(x), m), infinite=True)

@@ -4,6 +4,7 @@ import copy
 
 import numpy as np
 
+from lqrsim.annotations import NonNegative, Positive, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, check_number
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
@@ -40,19 +41,20 @@ class ObstacleCost(KeepsClear, Cost):
       weight: cost of touching one obstacle, with one ball, for one step.
     """
 
+    @checked
     def __init__(
         self,
         world: World,
         *,
-        radius: float | None = None,
+        radius: NonNegative | None = None,
         balls: CollisionSpheres | None = None,
         geoms: CollisionGeoms | None = None,
-        sharpness: float = 10.0,
-        weight: float = 1.0,
+        sharpness: Positive = 10.0,
+        weight: NonNegative = 1.0,
     ) -> None:
         self._set_shape(world, radius, balls, geoms)
-        self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
-        self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
+        self.sharpness = sharpness
+        self.weight = weight
 
     def weighing(self, weight: float) -> "ObstacleCost":
         """The same cost with another weight.

@@ -4,24 +4,22 @@ import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Count, Finite, Index, NonNegative, Positive, Want, checked
 from lqrsim.errors import (
     Array,
     InputError,
     brief,
     check_array,
     check_count,
-    check_flag,
-    check_items,
     check_kind,
     check_memory,
     check_name,
     check_number,
-    excerpt,
     keep,
 )
 from lqrsim.problem.collision_shape import KeepsClear
@@ -48,6 +46,10 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
 ACCURATE = 1e-11  # smallest accuracy of steps; errors below are rounding
+Constraints = Annotated[
+    Sequence[Constraint],
+    Want("a list of constraints, such as [Clearance(...)] or, for a function, [SymbolicConstraint(function)]"),
+]
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -100,6 +102,7 @@ class FixedState:
         return self
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem(OneVersion):
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
@@ -145,22 +148,25 @@ class Problem(OneVersion):
         start that collides.
     """
 
+    _prefix = ""
+    _want = "a Problem, such as scenario.problem"
+
     dynamics: Dynamics
-    dt: float
-    steps: int
+    dt: Positive
+    steps: Count
     initial: Cost | FixedState
     stage_cost: Cost
     final_cost: Cost
     control_limits: Limits | None = None
-    constraints: Sequence[Constraint] = ()
-    begin: float = 0.0
+    constraints: Constraints = ()
+    begin: Finite = 0.0
     noise: Noise | None = None
-    risk: float = 0.0
+    risk: Finite = 0.0
     duration: tuple[float, float] | None = None
-    time_weight: float = 0.0
-    segments: Sequence[int] = ()
+    time_weight: NonNegative = 0.0
+    segments: Annotated[Sequence[Index], Want("knots, which are whole numbers")] = ()
     control_rate: ControlRate | None = None
-    accuracy: float | None = None
+    accuracy: Annotated[float, Bounds(at_least=ACCURATE)] | None = None
     between_knots: bool = False
     _terms: dict[str, tuple[CostTerm, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
@@ -168,10 +174,6 @@ class Problem(OneVersion):
     _controls: tuple[Coordinates, Coordinates] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        keep(self, dt=check_number("dt", self.dt, above=0.0), steps=check_count("steps", self.steps))
-        keep(self, begin=check_number("begin", self.begin))
-        if not isinstance(self.dynamics, Dynamics):
-            raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
         self.dynamics.check_period(self.dt)
         check_memory("steps", self.steps, self.bytes_per_step)
         for name in ("stage_cost", "final_cost", "initial"):
@@ -189,12 +191,8 @@ class Problem(OneVersion):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         keep(self, _terms=bound)
-        wanted = "a list of constraints, such as [Clearance(...)] or, for a function, [SymbolicConstraint(function)]"
-        keep(self, constraints=check_items("constraints", self.constraints, Constraint, wanted))
         keep(self, _constraint_terms=bind_all(self.constraints, self.dynamics, self.times))
-        check_kind("noise", self.noise, (Noise, type(None)), "a Noise, or None")
         keep(self, _noise_term=None if self.noise is None else self.noise.bind(self.dynamics))
-        keep(self, risk=check_number("risk", self.risk))
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         self._check_duration()
@@ -288,7 +286,8 @@ class Problem(OneVersion):
             return None
         return self.with_constraints([new or old for new, old in zip(refined, self.constraints, strict=True)])
 
-    def with_constraints(self, constraints: Sequence[Constraint]) -> "Problem":
+    @checked
+    def with_constraints(self, constraints: Constraints) -> "Problem":
         """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`.
 
         Args:
@@ -297,11 +296,10 @@ class Problem(OneVersion):
         Raises:
           InputError: the constraints do not fit the system, or each other.
         """
-        wanted = "a list of constraints, such as [Clearance(...)]"
-        kept = check_items("constraints", constraints, Constraint, wanted)
-        return self._with(constraints=kept, _constraint_terms=bind_all(kept, self.dynamics, self.times))
+        return self._with(constraints=constraints, _constraint_terms=bind_all(constraints, self.dynamics, self.times))
 
-    def later(self, seconds: float) -> "Problem":
+    @checked
+    def later(self, seconds: Finite) -> "Problem":
         """The same problem with a later beginning: moving obstacles are at their positions at that time, and costs and
         constraints with a row for each knot begin with a later one and repeat the last.
 
@@ -311,7 +309,7 @@ class Problem(OneVersion):
         Raises:
           InputError: the delay is no such number.
         """
-        other = self._with(begin=self.begin + check_number("seconds", seconds))
+        other = self._with(begin=self.begin + seconds)
         if any(one.by_knot for one in (*terms_of(self.stage_cost), *self.constraints)):
             steps = round(seconds / self.dt)
             if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
@@ -321,6 +319,7 @@ class Problem(OneVersion):
             other = other._with(stage_cost=self.stage_cost.ahead(steps, horizon="moving"), constraints=later)
         return other._bound_anew() if self.moving else other
 
+    @checked
     def settled(self, plan: Solution) -> "Problem":
         """The problem with the duration of a plan: of fixed steps, and with its segments where they are in the plan.
 
@@ -330,7 +329,6 @@ class Problem(OneVersion):
         Raises:
           InputError: the plan has another number of steps, or is not of this problem's segments.
         """
-        check_kind("plan", plan, Solution, "a Solution of the problem")
         knots = plan.options.get("segments", self.segments)
         if plan.trajectory.steps != self.steps or not isinstance(knots, Sequence) or len(knots) != len(self.segments):
             got = f"{plan.trajectory.steps} steps, segments at {brief(knots)}"
@@ -561,9 +559,7 @@ class Problem(OneVersion):
 
     def _check_duration(self) -> None:
         """Raises InputError if the duration is not as described, or must not be free for this kind of problem."""
-        keep(self, time_weight=check_number("time_weight", self.time_weight, at_least=0.0))
-        knots = check_items("segments", self.segments, (int, np.integer), "knots, which are whole numbers")
-        keep(self, segments=tuple(map(int, knots)))
+        knots = self.segments
         if any(late - early < 2 for early, late in itertools.pairwise((0, *knots, self.steps)) if knots):
             want = f"knots in order, with 2 steps in each segment of the {self.steps} at least"
             raise InputError(f"segments: got {brief(self.segments)}, want {want}")
@@ -594,7 +590,6 @@ class Problem(OneVersion):
 
     def _check_rate(self) -> None:
         """Raises InputError if the rates do not fit the controls, or there must be none for this kind of problem."""
-        check_kind("control_rate", self.control_rate, (ControlRate, type(None)), "a ControlRate, or None")
         if self.control_rate is None:
             return
         others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
@@ -606,11 +601,8 @@ class Problem(OneVersion):
     def _check_between_knots(self) -> None:
         """Raises InputError if the accuracy is no number, or this kind of problem is right at its knots alone."""
         formula = not self.dynamics.discrete and self.dynamics.level == "symbolic"
-        keep(self, between_knots=check_flag("between_knots", self.between_knots))
-        if self.accuracy is not None:
-            keep(self, accuracy=check_number("accuracy", self.accuracy, at_least=ACCURATE))
-            if self.dynamics.discrete or self.dynamics.level == "jax":
-                raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
+        if self.accuracy is not None and (self.dynamics.discrete or self.dynamics.level == "jax"):
+            raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
         if self.between_knots and not formula:
             raise InputError("between_knots: got True with dynamics that are not a formula, want False")
         if self.between_knots and any(one.world.moving for one in self.kept_clear):
@@ -624,6 +616,7 @@ class Problem(OneVersion):
             where, advice = found
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
 
+    @checked
     def violations(self, rollout: Rollout) -> dict[str, Array]:
         """By how much runs violate each constraint, other than clearances, which a `Rollout` has itself.
 
@@ -643,7 +636,6 @@ class Problem(OneVersion):
         Raises:
           InputError: the runs have other states, controls or steps.
         """
-        check_kind("rollout", rollout, Rollout, "a Rollout, as from simulate")
         sizes = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates), self.steps
         own = rollout.states.shape[2], rollout.applied.shape[2], rollout.plan.steps
         if own != sizes:

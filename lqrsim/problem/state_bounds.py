@@ -8,8 +8,9 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import checked
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_flag, check_items, check_number, numbers_of
+from lqrsim.errors import Array, InputError, check_array, check_items, check_number, numbers_of
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, Side, by_name
 from lqrsim.problem.dynamics import Dynamics
 
@@ -32,10 +33,11 @@ class GoalState(Constraint):
       InputError: no goal, a number that is not finite, or a state that is named twice.
     """
 
+    @checked
     def __init__(
         self, goal: npt.ArrayLike | Mapping[str, float] | None = None, /, *, count_turns: bool = False, **named: float
     ) -> None:
-        self.count_turns = check_flag("GoalState: count_turns", count_turns)
+        self.count_turns = count_turns
         self.goal: Array | dict[str, float]
         if goal is None or named or isinstance(goal, Mapping):
             self.goal = by_name("GoalState", goal, named, "a number", check_number)
