@@ -10,10 +10,12 @@ use all the room that there is. A constraint would only report that there is too
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.special import ndtri
 
+from lqrsim.annotations import Chance, Count, Positive, TextProgress, Want, checked
 from lqrsim.control.collision_chance import FAR, Spread, Surroundings, chance_of_clearances
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
@@ -21,12 +23,7 @@ from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import (
     InputError,
     check_array,
-    check_count,
-    check_function,
     check_items,
-    check_kind,
-    check_number,
-    check_progress,
     keep,
 )
 from lqrsim.problem.costs import weighing_obstacles
@@ -44,9 +41,12 @@ AIM = 0.8  # target for the next plan, relative to the requested chance
 WIDEN = 2.0  # largest factor on the margin, in standard deviations, from one plan to the next
 PATIENCE = 2  # stop widening margins, or raising weights, after this many plans in a row without a safer one
 HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # factors of the weight of the obstacles' cost
-MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
+MakeController = Annotated[
+    Callable[[Problem, Solution], OffsetFree | AffinePolicy], Want("a function of problem and solution, or None")
+]
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SafePlan:
     """A plan with its predicted chance of collision.
@@ -67,21 +67,14 @@ class SafePlan:
     solution: Solution
     controller: OffsetFree | AffinePolicy
     tube: Tube
-    asked: float
+    asked: Chance
     rounds: tuple[tuple[float, float, float, float], ...]
-    weight: float = 1.0
-    instead: Mapping[str, float] = field(default_factory=dict)
+    weight: Positive = 1.0
+    instead: Annotated[Mapping[str, float], Want("a dictionary of chances")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, kind in (("problem", Problem), ("solution", Solution), ("tube", Tube)):
-            check_kind(f"SafePlan: {name}", getattr(self, name), kind, f"a {kind.__name__}")
-        kinds = (OffsetFree, AffinePolicy)
-        check_kind("SafePlan: controller", self.controller, kinds, "an OffsetFree or an AffinePolicy")
-        keep(self, asked=check_number("SafePlan: asked", self.asked, above=0.0, below=1.0))
         rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
         keep(self, rounds=tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds))
-        keep(self, weight=check_number("SafePlan: weight", self.weight, above=0.0))
-        check_kind("SafePlan: instead", self.instead, Mapping, "a dictionary of chances")
 
     @property
     def success(self) -> bool:
@@ -114,14 +107,15 @@ class SafePlan:
         return "\n".join(lines)
 
 
+@checked
 def smooth_chance_constrained(
     problem: Problem,
     uncertainty: Uncertainty,
     *,
-    chance: float = 1e-3,
+    chance: Chance = 1e-3,
     controller: MakeController | None = None,
-    rounds: int = 8,
-    progress: Callable[[int, int, str], object] | None = None,
+    rounds: Count = 8,
+    progress: TextProgress | None = None,
 ) -> SafePlan:
     """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
@@ -147,12 +141,6 @@ def smooth_chance_constrained(
       InputError: there are no obstacles, an option is out of range, or something does not fit the system.
       KeyboardInterrupt: Ctrl-C; its `found` is the SafePlan of the rounds that are done, None if there are none.
     """
-    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
-    check_kind("uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
-    chance = check_number("chance", chance, above=0.0, below=1.0)
-    check_count("rounds", rounds)
-    check_function("controller", controller, "a function of problem and solution, or None", arguments=2)
-    check_progress(progress, text=True)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     if not surroundings.kept:
         raise InputError("problem: got a problem without obstacles, want an ObstacleCost or a Clearance in it")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.annotations import checked
 from lqrsim.control.controllers import Controller
 from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
@@ -27,7 +28,7 @@ from lqrsim.control.tracking import (
 )
 from lqrsim.control.tracking_laws import AT_END, Laws, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry
-from lqrsim.errors import Array, InputError, check_flag, check_kind
+from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
@@ -107,6 +108,7 @@ class OffsetFree(Controller):
         shorter than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
     """
 
+    @checked
     def __init__(
         self,
         problem: Problem,
@@ -123,7 +125,6 @@ class OffsetFree(Controller):
         replan_always: bool = False,
     ) -> None:
         check_plan("OffsetFree", problem, solution)
-        check_kind("OffsetFree: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
         plan = solution.trajectory
         memory = min(plan.horizon, MEMORY) if memory is None else memory
         memory = check_seconds("OffsetFree: memory", memory, above=0.0)
@@ -132,8 +133,8 @@ class OffsetFree(Controller):
             "tolerate": tolerate, "effort": effort, "at_end": at_end, "sensors": sensors, "memory": memory,
             "record": record, "replan_every": replan_every, "replan_always": replan_always,
         }  # fmt: skip
-        self.record = check_flag("OffsetFree: record", record)
-        self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
+        self.record = record
+        self.replan_always = replan_always
         self._sensors = sensors if isinstance(sensors, RobotSensors) else None
         states = None if isinstance(sensors, RobotSensors) else sensors
         sensor = sensor_of(states, problem.dynamics.state_coordinates)

@@ -11,15 +11,11 @@ from typing import Annotated
 
 import numpy as np
 
-from lqrsim.annotations import LINE, Line, checked
+from lqrsim.annotations import LINE, Index, Line, Want, checked
 from lqrsim.errors import (
     Array,
     InputError,
-    check_count,
-    check_flag,
-    check_function,
     check_kind,
-    check_name,
     check_number,
     excerpt,
 )
@@ -27,10 +23,11 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
-from lqrsim.results.solution_parts import HORIZONS
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.prepared import prepare
+
+Changes = Annotated[Callable[[float, Problem], Problem], Want("a function of the time and the problem")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,19 +87,15 @@ class ReplanRecord:
         went well. Such a plan may cost more than `before` if it violates the constraints less.
     """
 
-    step: int
-    trial: int
+    step: Index
+    trial: Index
     status: Line
-    iterations: int
+    iterations: Index
     seconds: float
     cost: float
     before: float
     used: bool
     reason: Annotated[str, 10 * LINE]
-
-    def __post_init__(self) -> None:
-        for name in ("step", "trial", "iterations"):
-            check_count(f"ReplanRecord: {name}", getattr(self, name), at_least=0)
 
 
 class ReplanLog:
@@ -223,11 +216,9 @@ class ReplanRule:
         predict: bool = True,
         when: Funnel | None = None,
         share: float = 1.0,
-        changes: Callable[[float, Problem], Problem] | None = None,
+        changes: Changes | None = None,
         at_least: float = 0.0,
     ) -> None:
-        check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
-        check_kind(f"{who}: solution", solution, Plan, "its Solution, or another Plan")
         plan, want = solution.trajectory, spaces_of(problem.dynamics)
         check_same_system(f"{who}: solution", "a plan", spaces_of(solution.policy), want, "the problem")
         if (plan.steps, plan.dt) != (problem.steps, problem.dt):
@@ -245,13 +236,10 @@ class ReplanRule:
                 f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"
                 f" {name}={self.every:g} s, {self.periods} control periods: one solve at a time"
             )
-        self.horizon = check_name(f"{who}: horizon", horizon, HORIZONS)
-        self.predict = check_flag(f"{who}: predict", predict)
+        self.horizon, self.predict, self.share = horizon, predict, share
         self.problem, self.solution, self.when = problem, solution, _checked_funnel(who, when, solution, horizon)
-        self.share = check_number(f"{who}: share", share, above=0.0, at_most=1.0)
         if when is None and self.share != 1:
             raise InputError(f"{who}: share: got {self.share:g} without a funnel, want when=... beside it")
-        check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
         self.changes, self._who = changes, who
         self.solver = prepare(problem)
         solution.shifted(0)  # makes the parts of a Solution that are otherwise made at the first solve
@@ -351,7 +339,6 @@ def within_rates(commands: Array, problem: Problem, sent: Array | None) -> Array
 
 def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str) -> Funnel | None:
     """Raises InputError unless it is None, or a funnel of the solution with a fixed end."""
-    check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
     if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
         raise InputError(f"{who}: when: got a funnel of another plan, want a funnel of the solution")
     if when is not None and horizon != "shrinking":

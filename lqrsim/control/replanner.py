@@ -5,22 +5,20 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Index, Want, checked
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
-from lqrsim.control.replan_rule import ActivePlan, ReplanLog, ReplanRule, SolveRequest, within_rates
+from lqrsim.control.replan_rule import ActivePlan, Changes, ReplanLog, ReplanRule, SolveRequest, within_rates
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_count,
-    check_flag,
     check_function,
-    check_kind,
     check_number,
     excerpt,
 )
@@ -30,6 +28,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
+from lqrsim.results.solution_parts import Horizon
 from lqrsim.solvers.parallel import workers
 
 SPARE = 0.5e-3  # s, time between the end of a solve and its deadline, for handing over the answer
@@ -65,16 +64,22 @@ class LiveReplanner:
         used; and `log.kept`, reason why a solve was not used, and the previous law continued -> number.
     """
 
-    def __init__(self, rule: ReplanRule, *, interpolate: bool, clock: Callable[[], float]) -> None:
-        check_kind("LiveReplanner: rule", rule, ReplanRule, "that of a Replanner")
+    _prefix = "Replanner.live: "
+
+    @checked
+    def __init__(
+        self,
+        rule: ReplanRule,
+        *,
+        interpolate: bool,
+        clock: Annotated[Callable[[], float], Want("a function that returns seconds")],
+    ) -> None:
         if not rule.delay:
             raise InputError(
                 "Replanner.live: deadline: got 0 s, want more: a solve takes time, during which the previous law"
                 " continues"
             )
-        check_function("Replanner.live: clock", clock, "a function that returns seconds", arguments=0, optional=False)
-        self._rule, self._clock = rule, clock
-        self._interpolate = check_flag("Replanner.live: interpolate", interpolate)
+        self._rule, self._clock, self._interpolate = rule, clock, interpolate
         self.problem, self.active, self.log = rule.problem, ActivePlan(rule.solution, 0), ReplanLog()
         self._asked = -1  # the step at which a solve was last due
         self._step, self._command, self._sent = -1, None, None  # of the last call, and the command of a period before
@@ -231,6 +236,7 @@ class Replanner(Controller):
       InputError: `every` is shorter than a control period or the deadline, or the solution is of another problem.
     """
 
+    @checked
     def __init__(
         self,
         problem: Problem,
@@ -238,13 +244,13 @@ class Replanner(Controller):
         *,
         every: float,
         deadline: float | None = None,
-        horizon: str = "shrinking",
+        horizon: Horizon = "shrinking",
         predict: bool = True,
-        changes: Callable[[float, Problem], Problem] | None = None,
+        changes: Changes | None = None,
         when: Funnel | None = None,
-        share: float = 1.0,
+        share: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 1.0,
         computing: Computing = 0.0,
-        seed: int = 0,
+        seed: Index = 0,
     ) -> None:
         who = "Replanner"
         if callable(computing):
@@ -258,7 +264,7 @@ class Replanner(Controller):
             changes=changes, at_least=computing if isinstance(computing, float) else 0.0,
         )  # fmt: skip
         self.problem, self.solution = problem, solution
-        self.computing, self.seed = computing, check_count(f"{who}: seed", seed, at_least=0)
+        self.computing, self.seed = computing, seed
 
     def __repr__(self) -> str:
         return f"Replanner(every {self.rule.every:g} s, with a {self.rule.horizon} horizon)"

@@ -18,11 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lqrsim.annotations import Positive, checked
 from lqrsim.codegen.compiled_module import CompiledModule, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import per_entry
-from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.kernels import tracking_law
 from lqrsim.kernels.records import PassArrays, PassSizes, PassWork
 from lqrsim.problem.dynamics import Dynamics
@@ -54,7 +55,8 @@ class Weights:
     emphasis: Array | None = None
 
     @classmethod
-    def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: float = AT_END) -> "Weights":
+    @checked
+    def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: Positive = AT_END) -> "Weights":
         """The weights for tolerances in the states' units and efforts (m,) in the controls'.
 
         Args:
@@ -64,7 +66,7 @@ class Weights:
         space = dynamics.state_coordinates
         state = per_entry("tolerate", tolerate, space, above=0.0)
         end, last = state.copy(), list(space.position) or slice(None)
-        end[last] *= check_number("at_end", at_end, above=0.0)
+        end[last] *= at_end
         return cls(state**-2.0, effort**-2.0, end**-2.0)
 
     @property

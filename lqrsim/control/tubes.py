@@ -60,6 +60,8 @@ class Tube:
         do not describe them. None without trials.
     """
 
+    _want = "a Tube, such as predict_tube(...) returns"
+
     plan: Trajectory
     state_coordinates: Annotated[Coordinates, "n"]
     mean: Annotated[Array, "T+1 n"]
@@ -82,6 +84,7 @@ class Tube:
         place = list(self.state_coordinates.position)
         return self.covariance[:, place][:, :, place]
 
+    @checked
     def added_to(self, rollout: Rollout) -> Rollout:
         """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
 
@@ -91,7 +94,6 @@ class Tube:
         Returns:
           The rollout with its `tube` and `collision_chance`.
         """
-        check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not self.state_coordinates.position:
             raise InputError("Tube: state_coordinates.position: got none, want the 2 or 3 states that are the position")
         if not np.array_equal(rollout.plan.states, self.plan.states):

@@ -6,16 +6,15 @@ For your own robot you can also state one directly.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from lqrsim.annotations import Bounds, NonNegative, Share, Want, checked
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_count,
-    check_items,
     check_kind,
     check_name,
     check_number,
@@ -31,8 +30,10 @@ MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, 
 SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)  # of Gauss and Legendre, from -1 to 1
+Periods = Annotated[int, Bounds(at_least=0, at_most=1000)]  # of a delay
 
 
+@checked
 @dataclass(frozen=True)
 class Unknown:
     """A quantity that differs from the value that the plan assumes: a stationary Gaussian process about that value.
@@ -50,10 +51,10 @@ class Unknown:
     """
 
     of: str | Mapping[str, float]
-    std: float
+    std: NonNegative
     time_constant: float = np.inf
-    order: int = 1
-    drift: float = 0.0
+    order: Annotated[int, Bounds(at_least=1, at_most=2)] = 1
+    drift: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         shares = {self.of: 1.0} if isinstance(self.of, str) else self.of
@@ -63,10 +64,7 @@ class Unknown:
         for name, share in shares.items():
             check_text("Unknown: of", name, "the name of a parameter")
             check_number(f"Unknown: of: {name}", share)
-        keep(self, std=check_number("Unknown: std", self.std, at_least=0.0))
-        keep(self, drift=check_number("Unknown: drift", self.drift, at_least=0.0))
         keep(self, time_constant=check_seconds("Unknown: time_constant", self.time_constant, at_least=0.0))
-        check_count("Unknown: order", self.order, at_most=2)
         if self.order == 2 and not 0 < self.time_constant < np.inf:
             raise InputError(f"Unknown: order: got 2 with a time constant of {self.time_constant:g} s, want 1")
         if self.drift and not self.constant:
@@ -94,6 +92,7 @@ class Unknown:
         return self.time_constant == 0
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Uncertainty:
     """The uncertainty in a run that its plan does not take into account.
@@ -116,21 +115,22 @@ class Uncertainty:
       left_out: disturbances that no linear model can represent, for the record.
     """
 
-    unknowns: Sequence[Unknown] = ()
+    _want = "an Uncertainty, such as uncertainty_of(...)"
+
+    unknowns: Annotated[Sequence[Unknown], Want("a tuple of Unknown")] = ()
     start: PerEntry = 0.0
     control: PerEntry = 0.0
     measurement: PerEntry = 0.0
     model_error: PerEntry = 0.0
-    lag: float = 0.0
-    delay: int = 0
-    latency: int = 0
-    loss: float = 0.0
-    command_loss: float = 0.0
-    obstacles: float = 0.0
-    left_out: Sequence[str] = field(default=(), compare=False)
+    lag: NonNegative = 0.0
+    delay: Periods = 0
+    latency: Periods = 0
+    loss: Share = 0.0
+    command_loss: Share = 0.0
+    obstacles: NonNegative = 0.0
+    left_out: Annotated[Sequence[str], Want("a tuple of texts")] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
-        keep(self, unknowns=check_items("Uncertainty: unknowns", self.unknowns, Unknown, "a tuple of Unknown"))
         for name in SUMMED:
             numbers = getattr(self, name)
             for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
@@ -139,14 +139,6 @@ class Uncertainty:
                 if given.ndim > 1:
                     raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want one number, or one per entry")
                 keep(self, **{name: tuple(given.tolist())})
-        keep(self, lag=check_number("Uncertainty: lag", self.lag, at_least=0.0))
-        for name in ("delay", "latency"):
-            keep(self, **{name: check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)})
-        for name in ("loss", "command_loss"):
-            share = check_number(f"Uncertainty: {name}", getattr(self, name), at_least=0.0, at_most=1.0)
-            keep(self, **{name: share})
-        keep(self, obstacles=check_number("Uncertainty: obstacles", self.obstacles, at_least=0.0))
-        keep(self, left_out=check_items("Uncertainty: left_out", self.left_out, str, "a tuple of texts"))
 
     def check(self, dynamics: Dynamics) -> None:
         """Check that the uncertainty fits a system.
@@ -161,7 +153,8 @@ class Uncertainty:
             for name in unknown.shares:
                 check_name("Uncertainty: unknowns", name, possible_unknowns(dynamics))
 
-    def steady(self, memory: float, share: float = MEAN) -> "Uncertainty":
+    @checked
+    def steady(self, memory: float, share: NonNegative = MEAN) -> "Uncertainty":
         """The uncertainty for a filter: varying unknowns may have a nonzero mean, and constant unknowns may change.
 
         In the linear model, this leaves no steady error: a filter that assumes a constant stops adapting, and one that
@@ -175,7 +168,6 @@ class Uncertainty:
           An Uncertainty.
         """
         memory = check_seconds("memory", memory, above=0.0)
-        share = check_number("share", share, at_least=0.0)
         constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
         for one in self.unknowns:
             constants.setdefault(tuple(sorted(one.shares.items())), []).append(one)
