@@ -1,10 +1,11 @@
 """The effects of a run's disturbances, applied one after the other, with checks of the values they return."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from lqrsim.annotations import Want
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance, Effect
@@ -12,7 +13,10 @@ from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
 
-MakeGenerator = Callable[[int, int], np.random.Generator]
+MakeGenerator = Annotated[
+    Callable[[int, int], np.random.Generator],
+    Want("a function of the trial and the disturbance's number that returns a numpy.random.Generator"),
+]
 
 
 class _ForceHook(NamedTuple):

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim.errors import Array, InputError, check_kind, check_number, check_text, shaped, vectors_of
+from lqrsim.annotations import checked
+from lqrsim.errors import Array, InputError, check_number, check_text, shaped, vectors_of
 from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
@@ -62,15 +63,16 @@ class Plant(OneVersion):
         robot.
     """
 
+    _prefix = ""
+    _want = "a Plant, such as scenario.plant()"
+
     def __repr__(self) -> str:
         moved = "MuJoCo" if self.simulator is None else self.simulator.name
         return f"Plant({self.robot.name} in scene {self.scene.name}, moved by {moved})"
 
     @unlogged()
+    @checked
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
-        check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
-        check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
-        check_kind("simulator", simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
         if simulator is not None:
             check_text("simulator: name", getattr(simulator, "name", None))
             check_number("simulator: timestep", getattr(simulator, "timestep", None), above=0.0)

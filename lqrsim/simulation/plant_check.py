@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from lqrsim.annotations import Count, Line, Positive, checked
-from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed
+from lqrsim.annotations import Bounds, Count, Line, Positive, Seed, checked
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.plan import Plan
@@ -107,6 +107,7 @@ class PlantCheck:
         return "\n".join(lines)
 
 
+@checked
 def check_plant(
     robot: Robot,
     scene: Scene,
@@ -119,9 +120,9 @@ def check_plant(
     spread: float | None = None,
     controls: Limits | None = None,
     settle: float | None = None,
-    samples: int = 50,
-    tolerance: float = 0.02,
-    seed: int = 0,
+    samples: Annotated[int, Bounds(at_least=1, at_most=100_000)] = 50,
+    tolerance: Positive = 0.02,
+    seed: Seed = 0,
 ) -> PlantCheck:
     """Compare a robot's dynamics with its MJCF over one control period, from random states.
 
@@ -161,17 +162,15 @@ def check_plant(
     near = _Region.of(robot, problem, plan, around, spread, controls)
     taken_away = [plant.model.geom(name).id for name in plant.obstacles]
     plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
-    rng = np.random.default_rng(check_seed("seed", seed))
+    rng = np.random.default_rng(seed)
     if settle is None:
         settle = 0.5 if simulator is None and 2 * len(plant.qvel) > n else 0.0
     waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
-    samples = check_count("samples", samples, at_most=100_000)
     if not samples * (waiting + substeps) <= MOST_STEPS:
         raise InputError(
             f"samples: got {samples}, which take {samples * (waiting + substeps):.3g} physics steps, want at most"
             f" {MOST_STEPS}: fewer samples, or a shorter period or time to settle"
         )
-    tolerance = check_number("tolerance", tolerance, above=0.0)
     found, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):

@@ -2,23 +2,19 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
 from lqrsim.control.controllers import Controller, ControllerLike, as_controller
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_count,
-    check_flag,
-    check_function,
     check_items,
-    check_kind,
     check_memory,
-    check_progress,
-    check_seed,
     check_text,
 )
 from lqrsim.problem.collision_shape import ShapeInWorld
@@ -34,10 +30,15 @@ from lqrsim.simulation.physics import part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.solvers.parallel import check_threads
 
-Progress = Callable[[int, int], object]
-Watch = Callable[[float, Array, npt.NDArray[np.bool_]], object]
+Watch = Annotated[
+    Callable[[float, Array, npt.NDArray[np.bool_]], object],
+    Want("a function of the time, MuJoCo's qpos and which trials are unstable"),
+]
+
+MOVING = "a World of the obstacles, such as ls.World([ls.Obstacle(..., velocity=...)])"
 
 
+@checked
 @dataclass(kw_only=True, eq=False)
 class RunSettings:
     """The arguments of `simulate`, with the same names, meanings and defaults, and what follows from them.
@@ -58,13 +59,15 @@ class RunSettings:
       InputError: as `simulate` does.
     """
 
+    _prefix = ""
+
     plant: Plant
     plan: Plan | None = None
     controller: ControllerLike | None = None
     disturbances: Sequence[Disturbance | Noise] = ()
-    seed: int = 0
-    trials: int = 1
-    first_trial: int = 0
+    seed: Seed = 0
+    trials: Count = 1
+    first_trial: Seed = 0
     goal_radius: float | None = None
     goal_tolerance: float | None = None
     frames: bool = True
@@ -74,8 +77,8 @@ class RunSettings:
     progress: Progress | None = None
     watch: Watch | None = None
     starts: Array | None = None
-    knot: int = 0
-    moving: World | None = None
+    knot: Index = 0
+    moving: Annotated[World, Want(MOVING)] | None = None
     acting: tuple[Disturbance, ...] = field(init=False)
     law: Controller = field(init=False)
     whole: Trajectory = field(init=False)
@@ -87,21 +90,13 @@ class RunSettings:
     substeps: int = field(init=False)
 
     def __post_init__(self) -> None:
-        check_kind("plant", self.plant, Plant, "a Plant, such as scenario.plant()")
         self.acting = as_disturbances(self.disturbances, "disturbances, such as ControlNoise(0.05)")
-        self.seed, self.first_trial = check_seed("seed", self.seed), check_seed("first_trial", self.first_trial)
-        self.trials, self.threads = check_count("trials", self.trials), check_threads(self.threads)
-        self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
-        wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
-        check_function("generators", self.generators, wanted, arguments=2)
-        check_progress(self.progress)
-        wanted = "a function of the time, MuJoCo's qpos and which trials are unstable"
-        check_function("watch", self.watch, wanted, arguments=3)
+        self.threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, self.plant.robot.dynamics)
         self.states, self.controls = _check_coordinates(self.law, self.plant)
         _check_plan(plan, self.plant)
         self.whole = plan.trajectory
-        if check_count("knot", self.knot, at_least=0) >= self.whole.steps:
+        if self.knot >= self.whole.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {self.whole.steps - 1}, before the plan's end")
         self.followed = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
         if self.starts is not None:
@@ -143,7 +138,6 @@ def _passing(plant: Plant, moving: World | None, time: float) -> ShapeInWorld | 
     """
     if moving is None:
         return None
-    check_kind("moving", moving, World, "a World of the obstacles, such as ls.World([ls.Obstacle(..., velocity=...)])")
     robot = plant.robot
     if twice := sorted({*moving.names} & {*plant.obstacles, *plant.world.names}):
         raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")

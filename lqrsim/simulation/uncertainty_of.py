@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lqrsim.annotations import checked
 from lqrsim.control.controllers import ControllerLike
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty, gathered
@@ -15,6 +16,7 @@ from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.plant import Plant
 
 
+@checked
 def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) -> Uncertainty:
     """Convert disturbances to zero-mean Gaussian uncertainty. Disturbances that do not fit are left out, by name.
 
@@ -31,7 +33,6 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
     Raises:
       InputError: a disturbance does not fit the plant.
     """
-    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     parts = list[Uncertainty]()
     for one in as_disturbances(disturbances, "a list of disturbances"):
         one.check(plant)

@@ -4,11 +4,12 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_name, check_number, keep
+from lqrsim.annotations import OneOf, Positive, checked
+from lqrsim.errors import Array, InputError
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
@@ -19,6 +20,7 @@ DRONES = ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350")
 INTEGRATORS = ("euler", "rk4", "symplectic_euler")
 
 
+@checked
 @dataclass(frozen=True)
 class Crazyflow(Simulator):
     """crazyflow's first-principles model for each trial: `Plant(simulator.quadrotor(), scene, simulator)`.
@@ -37,17 +39,12 @@ class Crazyflow(Simulator):
         imported without SCIPY_ARRAY_API=1 in the environment, which crazyflow needs.
     """
 
-    drone: str = "cf21B_500"
-    timestep: float = 0.002
-    integrator: str = "rk4"
+    drone: Annotated[str, OneOf(DRONES)] = "cf21B_500"
+    timestep: Positive = 0.002
+    integrator: Annotated[str, OneOf(INTEGRATORS)] = "rk4"
 
     name = "crazyflow"
     parameters = PARAMETERS
-
-    def __post_init__(self) -> None:
-        keep(self, timestep=check_number("Crazyflow: timestep", self.timestep, above=0.0))
-        check_name("Crazyflow: integrator", self.integrator, INTEGRATORS)
-        check_name("Crazyflow: drone", self.drone, DRONES)
 
     @property
     def weight(self) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lqrsim.annotations import Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt, keep
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
@@ -20,6 +21,7 @@ GRAVITY = 9.81  # m/s2, RotorPy's
 POSITIVE = ("mass", "Ixx", "Iyy", "Izz", "k_eta", "k_m", "rotor_speed_max")  # numbers of a vehicle
 
 
+@checked
 @dataclass(frozen=True)
 class RotorPy(Simulator):
     """RotorPy's `Multirotor` for each trial: `Plant(simulator.quadrotor(), scene, simulator)`.
@@ -38,14 +40,13 @@ class RotorPy(Simulator):
     """
 
     vehicle: str | Mapping[str, Any] = "hummingbird"
-    timestep: float = 0.01
+    timestep: Positive = 0.01
 
     name = "RotorPy"
     parameters = PARAMETERS
     wind = True
 
     def __post_init__(self) -> None:
-        keep(self, timestep=check_number("RotorPy: timestep", self.timestep, above=0.0))
         vehicle = self.vehicle
         if isinstance(vehicle, str):
             package("rotorpy", "rotorpy")

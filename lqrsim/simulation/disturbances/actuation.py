@@ -2,21 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import mujoco
 import numpy as np
 from mujoco import batch
 
+from lqrsim.annotations import NonNegative, Share, Want, checked
 from lqrsim.control.plan_model import Lag
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_name, check_number, excerpt, keep
+from lqrsim.errors import Array, InputError, check_name, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
     Numbers,
     check_numbers,
-    check_strength,
     fit,
     left_out,
     times,
@@ -27,6 +28,7 @@ from lqrsim.simulation.plant import Plant
 _FIXED = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 
 
+@checked
 @dataclass(frozen=True)
 class MotorLag(Disturbance):
     """Actuators follow their commands, within the limits, with a first-order lag. They begin at the plan's first
@@ -38,12 +40,9 @@ class MotorLag(Disturbance):
       time_constant: in s.
     """
 
-    time_constant: float
+    time_constant: NonNegative
 
     _scales = "time_constant"
-
-    def __post_init__(self) -> None:
-        keep(self, time_constant=check_number("MotorLag: time_constant", self.time_constant, at_least=0.0))
 
     def describe(self, plant: Plant) -> str:
         return f"motor lag, time constant {self.time_constant:g} s"
@@ -66,6 +65,7 @@ class MotorLag(Disturbance):
         return Uncertainty(lag=self.time_constant)
 
 
+@checked
 @dataclass(frozen=True)
 class Saturation(Disturbance):
     """Control limits that are narrower than the robot's own.
@@ -80,8 +80,8 @@ class Saturation(Disturbance):
 
     lowest: Numbers | None = None
     highest: Numbers | None = None
-    share: float | None = None
-    strength: float = 1.0
+    share: Share | None = None
+    strength: NonNegative = 1.0
 
     def __post_init__(self) -> None:
         given = [name for name in ("lowest", "highest") if getattr(self, name) is not None]
@@ -90,9 +90,6 @@ class Saturation(Disturbance):
             raise InputError(f"Saturation: share: got {got} share and limits, want lowest, highest or both, or a share")
         for name in given:
             keep(self, **{name: check_numbers(self, name, getattr(self, name))})
-        if self.share is not None:
-            keep(self, share=check_number("Saturation: share", self.share, at_least=0.0, at_most=1.0))
-        keep(self, strength=check_strength(self, self.strength))
 
     def describe(self, plant: Plant) -> str:
         space = plant.robot.dynamics.control_coordinates
@@ -162,6 +159,7 @@ class Saturation(Disturbance):
         return left_out(self, plant, "limits are not linear, and a law uses the robot's own")
 
 
+@checked
 @dataclass(frozen=True)
 class ActuatorLoss(Disturbance):
     """An actuator fails for good: its force in MuJoCo drops to a fraction. A wheel that loses its drive turns freely.
@@ -172,17 +170,11 @@ class ActuatorLoss(Disturbance):
       remaining: fraction of the force that remains, 0 to 1.
     """
 
-    actuator: str | None = None
-    at: float = 0.0
-    remaining: float = 0.0
+    actuator: Annotated[str, Want("a name, or None to draw one")] | None = None
+    at: NonNegative = 0.0
+    remaining: Share = 0.0
 
     discrete = True
-
-    def __post_init__(self) -> None:
-        if self.actuator is not None and not isinstance(self.actuator, str):
-            raise InputError(f"ActuatorLoss: actuator: got {excerpt(self.actuator)}, want a name, or None to draw one")
-        keep(self, at=check_number("ActuatorLoss: at", self.at, at_least=0.0))
-        keep(self, remaining=check_number("ActuatorLoss: remaining", self.remaining, at_least=0.0, at_most=1.0))
 
     def describe(self, plant: Plant) -> str:
         which = self.actuator or f"one of {', '.join(plant.robot.actuators)}"

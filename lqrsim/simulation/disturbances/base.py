@@ -9,18 +9,17 @@ refuses plants that cannot have the disturbance. `uncertainty` describes it to f
 import abc
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from mujoco import batch
 
+from lqrsim.annotations import Want, checked
 from lqrsim.control.uncertainty import Uncertainty, Unknown, per_entry, possible_unknowns
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_function,
-    check_kind,
     check_name,
     check_number,
     check_text,
@@ -35,12 +34,14 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import PARAMETERS
 
-Hook = Callable[[int, Array], Array]
-ReadHook = Callable[[int, dict[str, Array]], dict[str, Array]]
-Kick = Callable[[int, Array, Array], Array]
+ONE, TWO = Want("a function of one argument, or None"), Want("a function of the step and an array, or None")
+Hook = Annotated[Callable[[int, Array], Array], TWO]
+ReadHook = Annotated[Callable[[int, dict[str, Array]], dict[str, Array]], TWO]
+Kick = Annotated[Callable[[int, Array, Array], Array], Want("a function of the step, states and controls, or None")]
 Numbers = float | Sequence[float]
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
     """The effect of a disturbance on a run of K trials. A field of None has no effect. Steps count control periods.
@@ -65,9 +66,9 @@ class Effect:
       displaced: (K, obstacles, 3), displacement of each of the plant's obstacles from its place in the scene, in m.
     """
 
-    initial_states: Callable[[Array], Array] | None = None
-    factors: Mapping[str, Array] | None = None
-    alter: Callable[[batch.Batch], None] | None = None
+    initial_states: Annotated[Callable[[Array], Array], ONE] | None = None
+    factors: Annotated[Mapping[str, Array], Want("factors by name: {'mass': factors}")] | None = None
+    alter: Annotated[Callable[[batch.Batch], None], ONE] | None = None
     measure: Hook | None = None
     read: ReadHook | None = None
     actuate: Hook | None = None
@@ -78,17 +79,10 @@ class Effect:
     displaced: Array | None = None
 
     def __post_init__(self) -> None:
-        for name in ("initial_states", "alter"):
-            check_function(f"Effect: {name}", getattr(self, name), "a function of one argument, or None", arguments=1)
-        for name in ("measure", "read", "actuate", "force", "torque", "wind"):
-            wanted = "a function of the step and an array, or None"
-            check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
-        wanted = "a function of the step, states and controls, or None"
-        check_function("Effect: kick", self.kick, wanted, arguments=3)
         if self.factors is not None:
-            check_kind("Effect: factors", self.factors, Mapping, "factors by name: {'mass': factors}")
-            factors = {check_name("Effect: factors", name, PARAMETERS): one for name, one in dict(self.factors).items()}
-            for name, one in factors.items():
+            factors: dict[str, Array] = {}
+            for name, one in self.factors.items():
+                check_name("Effect: factors", name, PARAMETERS)
                 factors[name] = check_array(f"Effect: factors: {name}", one, (None, None))
                 if not (factors[name] > 0).all():
                     raise InputError(f"Effect: factors: {name}: got {factors[name].min():g}, want numbers > 0")

@@ -7,14 +7,15 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Share, checked
+from lqrsim.annotations import Bounds, Index, Share, checked
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, check_count, check_number, keep
+from lqrsim.errors import Array, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, times, uniform
 from lqrsim.simulation.plant import Plant
 
 
+@checked
 @dataclass(frozen=True)
 class Late(Disturbance):
     """Base class of delays.
@@ -23,13 +24,10 @@ class Late(Disturbance):
       periods: the delay in control periods.
     """
 
-    periods: int
+    periods: Index
 
     what: ClassVar[str]
     known_as: ClassVar[str]  # the field of an Uncertainty
-
-    def __post_init__(self) -> None:
-        keep(self, periods=check_count(f"{type(self).__name__}: periods", self.periods, at_least=0))
 
     def describe(self, plant: Plant) -> str:
         return f"{self.what} late by {self.periods} control period{'' if self.periods == 1 else 's'}"

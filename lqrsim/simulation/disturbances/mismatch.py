@@ -9,15 +9,16 @@ import abc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
+from lqrsim.annotations import Bounds, NonNegative, Want, checked
 from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown, possible_unknowns
-from lqrsim.errors import Array, InputError, check_name, check_number, check_text, keep
+from lqrsim.errors import Array, InputError, check_name, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.simulation.disturbances.actuation import check_gains
@@ -39,6 +40,7 @@ CUT = 3.0  # standard deviations at which normal numbers are truncated
 CUT_STD = math.sqrt(1 - 2 * CUT * math.exp(-(CUT**2) / 2) / math.sqrt(2 * math.pi) / math.erf(CUT / math.sqrt(2)))
 
 
+@checked
 @dataclass(frozen=True)
 class Mismatch(Disturbance):
     """Base class of mismatches.
@@ -48,7 +50,7 @@ class Mismatch(Disturbance):
       factor: the factor itself, > 0, in place of `std`: one number, or one for each of `parts`.
     """
 
-    std: float | None = None
+    std: Annotated[float, Bounds(at_least=0.0, below=1 / CUT)] | None = None
     factor: Numbers | None = None
 
     what: ClassVar[str]
@@ -59,8 +61,6 @@ class Mismatch(Disturbance):
         if (self.std is None) == (self.factor is None):
             got = "neither of" if self.std is None else "both"
             raise InputError(f"{name}: got {got} std and factor, want one of the two")
-        if self.std is not None:
-            keep(self, std=check_number(f"{name}: std", self.std, at_least=0.0, below=1 / CUT))
         if self.factor is not None:
             factor = check_numbers(self, "factor", self.factor)
             if not np.min(factor) > 0:
@@ -124,6 +124,7 @@ class MassMismatch(Mismatch):
         return parameter_unknown(self, plant, "mass")
 
 
+@checked
 @dataclass(frozen=True)
 class Payload(Disturbance):
     """A load at the centre of mass of one body, unknown to the plan. For example, a gripper holds something.
@@ -135,14 +136,10 @@ class Payload(Disturbance):
       body: name of the body that carries it.
     """
 
-    mass: float
-    body: str
+    mass: NonNegative
+    body: Annotated[str, Want("the name of a body")]
 
     _scales = "mass"
-
-    def __post_init__(self) -> None:
-        keep(self, mass=check_number("Payload: mass", self.mass, at_least=0.0))
-        check_text("Payload: body", self.body, "the name of a body")
 
     def check(self, plant: Plant) -> None:
         plant.check_simulator(type(self).__name__)

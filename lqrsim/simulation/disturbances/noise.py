@@ -6,8 +6,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from lqrsim.annotations import NonNegative, checked
 from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown
-from lqrsim.errors import Array, InputError, check_array, check_items, check_number, keep
+from lqrsim.errors import Array, InputError, check_array, check_items, keep
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -266,6 +267,7 @@ def as_disturbances(given: object, wanted: str) -> tuple[Disturbance, ...]:
     return tuple(StateNoise(one) if isinstance(one, Noise) else one for one in items)
 
 
+@checked
 @dataclass(frozen=True)
 class Push(Disturbance):
     """A single push at the robot's centre of mass, spread over the control period in which it comes.
@@ -276,13 +278,12 @@ class Push(Disturbance):
     """
 
     impulse: Sequence[float]
-    at: float
+    at: NonNegative
 
     _scales = "impulse"
 
     def __post_init__(self) -> None:
         keep(self, impulse=tuple(check_array("Push: impulse", self.impulse, (3,)).tolist()))
-        keep(self, at=check_number("Push: at", self.at, at_least=0.0))
 
     def describe(self, plant: Plant) -> str:
         return f"push of {words(self.impulse)} N s at {self.at:g} s"

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_kind, check_name
+from lqrsim.annotations import checked
+from lqrsim.errors import InputError, check_name
 from lqrsim.simulation.disturbances.actuation import MotorLag
 from lqrsim.simulation.disturbances.base import Disturbance, GaussianDisturbance
 from lqrsim.simulation.disturbances.links import CommandDropouts, MeasurementDropouts
@@ -35,6 +36,7 @@ PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 LIQUID = 100.0  # kg/m^3; a medium that is denser has currents, not the turbulence of air
 
 
+@checked
 def preset(name: str, plant: Plant) -> list[Disturbance]:
     """The disturbances of a preset that the plant supports, in the order in which they act. Each can be scaled by 2.
 
@@ -50,7 +52,6 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     Raises:
       InputError: there is no such preset.
     """
-    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     strength = PRESETS[check_name("preset", name, PRESETS)]
     return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one) and _acts(one)]
 

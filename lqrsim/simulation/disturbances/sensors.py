@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.annotations import NonNegative, checked
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, check_items, check_kind, check_name, check_number, keep
+from lqrsim.errors import Array, check_items, check_kind, check_name, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import Sensor
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, left_out, normal, uniform
@@ -17,6 +18,7 @@ from lqrsim.simulation.plant import Plant
 SETTINGS = tuple(one.name for one in fields(Sensor)[1:])  # all but the name
 
 
+@checked
 @dataclass(frozen=True)
 class SensorErrors(Disturbance):
     """Noise, biases and losses of sensors of the MJCF, for a controller that reads them.
@@ -30,13 +32,12 @@ class SensorErrors(Disturbance):
     """
 
     sensors: Mapping[str, Mapping[str, float]] | Sequence[Sensor]
-    strength: float = 1.0
+    strength: NonNegative = 1.0
 
     discrete = True
     _scales = "strength"
 
     def __post_init__(self) -> None:
-        keep(self, strength=check_number("SensorErrors: strength", self.strength, at_least=0.0))
         given = self.sensors
         if not isinstance(given, Mapping):
             known = check_items("SensorErrors: sensors", given, Sensor, "a list of Sensor")

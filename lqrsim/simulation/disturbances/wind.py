@@ -6,9 +6,11 @@ They act through the robot's linear drag, F = drag * wind, as the velocity of th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from lqrsim.annotations import Bounds, Finite, Positive, checked
 from lqrsim.control.uncertainty import Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
@@ -82,6 +84,7 @@ class MeanWind(Wind):
         return unknowns_of(self, plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
 
 
+@checked
 @dataclass(frozen=True)
 class Gusts(Wind):
     """Gusts, or currents, that rise and fade: an Ornstein-Uhlenbeck process on each axis.
@@ -94,14 +97,13 @@ class Gusts(Wind):
     """
 
     std: Numbers = 1.0
-    time_constant: float = 1.0
+    time_constant: Positive = 1.0
 
     _scales = "std"
 
     def __post_init__(self) -> None:
         keep(self, std=check_numbers(self, "std", self.std, at_least=0.0))
         fit(self, self.std, "xyz")
-        keep(self, time_constant=check_number("Gusts: time_constant", self.time_constant, above=0.0))
 
     def describe(self, plant: Plant) -> str:
         return f"gusts, std {words(self.std)} m/s, time constant {self.time_constant:g} s"
@@ -116,6 +118,7 @@ class Gusts(Wind):
         return unknowns_of(self, plant, [Unknown(f"wind_{axis}", std, self.time_constant) for axis, std in winds])
 
 
+@checked
 @dataclass(frozen=True)
 class Dryden(Wind):
     """Dryden turbulence near the ground, without its mean wind (MIL-F-8785C, below 1000 ft).
@@ -129,16 +132,14 @@ class Dryden(Wind):
     """
 
     wind: float | str = "light"
-    altitude: float = 2.0
-    direction: float = 0.0
+    altitude: Annotated[float, Bounds(at_least=0.0, at_most=1000 * FOOT)] = 2.0
+    direction: Finite = 0.0
 
     def __post_init__(self) -> None:
         if isinstance(self.wind, str):
             check_name("Dryden: wind", self.wind, SEVERITIES)
         else:
             keep(self, wind=check_number("Dryden: wind", self.wind, at_least=0.0))
-        keep(self, altitude=check_number("Dryden: altitude", self.altitude, at_least=0.0, at_most=1000 * FOOT))
-        keep(self, direction=check_number("Dryden: direction", self.direction))
 
     @property
     def wind_at_20_ft(self) -> float:
