@@ -8,6 +8,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Finite, checked
 from lqrsim.errors import (
     Array,
     InputError,
@@ -185,7 +186,8 @@ class Coordinates:
         """Whether the position is in a horizontal plane without a height: the ground under the robot."""
         return len(self.position) == 2 and self.offset is None
 
-    def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
+    @checked
+    def in_world(self, places: npt.ArrayLike, *, height: Finite = 0.0) -> Array:
         """Points (..., 3) in the world of positions (..., 2 or 3).
 
         Args:
@@ -195,7 +197,6 @@ class Coordinates:
         Raises:
           InputError: the places are not numbers of this shape, or there is no position.
         """
-        height = check_number("height", height)
         if not self.position:
             raise InputError("places: got positions, but the coordinates have none, want position=(names) with them")
         places = vectors_of("places", places, len(self.position))

@@ -8,14 +8,12 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Chance, Line, Positive, checked
+from lqrsim.annotations import Bounds, Chance, Line, NonNegative, Positive, checked
 from lqrsim.errors import (
     Array,
     InputError,
     check_count,
-    check_kind,
     check_name,
-    check_number,
     check_symmetric,
     excerpt,
     shaped,
@@ -68,6 +66,8 @@ class Funnel:
     Raises:
       InputError: the parts do not fit together, or the trials do not show the rate.
     """
+
+    _want = "a Funnel, such as funnel(...) returns"
 
     plan: Trajectory
     state_coordinates: Annotated[Coordinates, "n"]
@@ -182,6 +182,7 @@ class Funnel:
         level = self.level(t)
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
 
+    @checked
     def left_at(self, rollout: Rollout) -> Array:
         """The time at which each run first left the funnel, (K,), in seconds; infinite if it never did.
 
@@ -191,13 +192,13 @@ class Funnel:
         Raises:
           InputError: the rollout has another plan.
         """
-        check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not np.array_equal(rollout.plan.states, self.plan.states):
             raise InputError("rollout: got a run of another plan, want a run of the funnel's plan")
         inside = np.array([self.contains(rollout.states[:, i], t) for i, t in enumerate(self.plan.times)])
         return np.where(inside.all(axis=0), np.inf, self.plan.dt * np.argmin(inside, axis=0))
 
-    def states_at(self, knot: int, points: npt.ArrayLike, level: float) -> Array:
+    @checked
+    def states_at(self, knot: int, points: npt.ArrayLike, level: NonNegative) -> Array:
         """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot.
 
         Args:
@@ -214,7 +215,7 @@ class Funnel:
         knot = check_count("knot", knot, at_least=0, at_most=self.plan.steps)
         points = vectors_of("points", points, len(self.states))
         states = np.tile(self.plan.states[knot], (*points.shape[:-1], 1))
-        states[..., self.chosen] += check_number("level", level, at_least=0.0) * points @ self._root(knot).T
+        states[..., self.chosen] += level * points @ self._root(knot).T
         return states
 
     @property
@@ -262,8 +263,9 @@ class Funnel:
         widest = {unit: max(h for h, u in zip(half, units, strict=True) if u == unit) for unit in units}
         return ", ".join(f"{size:.3g} {unit}".rstrip() for unit, size in widest.items())
 
-    def _knot(self, t: float) -> int:
-        return min(round(check_number("t", t, at_least=0.0) / self.plan.dt), self.plan.steps)
+    @checked
+    def _knot(self, t: NonNegative) -> int:
+        return min(round(t / self.plan.dt), self.plan.steps)
 
     @cached_property
     def _inverse(self) -> Array:

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Positive, checked
 from lqrsim.errors import Array, InputError, check_number, excerpt, keep, shaped
 from lqrsim.results.coordinates import Coordinates
 
@@ -177,7 +178,8 @@ class Target:
         apart = np.max(np.abs(self._off(states)) / self.scale, axis=-1)
         return np.where(np.isfinite(states).all(axis=-1), apart, np.nan)
 
-    def radius(self, robot_radius: float | None, goal_radius: float | None, goal_tolerance: float | None) -> float:
+    @checked
+    def radius(self, robot_radius: float | None, goal_radius: float | None, goal_tolerance: Positive | None) -> float:
         """The distance within which the target counts as reached.
 
         Args:
@@ -205,7 +207,7 @@ class Target:
                 f" {self.name} has no position among {names}"
             )
         if goal_tolerance is not None:
-            return check_number("goal_tolerance", goal_tolerance, above=0.0)
+            return goal_tolerance
         return self.on_the_way(TOLERANCE)
 
     def radius_of_plan(self, radius: float | None) -> float | None:

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import LINE, Positive, checked
-from lqrsim.errors import Array, InputError, check_count, check_name, check_shape
+from lqrsim.annotations import LINE, Index, Positive, checked
+from lqrsim.errors import Array, InputError, check_shape
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import HORIZONS, Multipliers, Status, Trajectory, left_after
+from lqrsim.results.solution_parts import Horizon, Multipliers, Status, Trajectory, left_after
 from lqrsim.results.value_functions import Quadratic
 
 
@@ -33,6 +33,8 @@ class Plan:
       goal: (n,) the goal state of the problem, NaN in states that do not matter; None if there is no goal.
       goal_radius: distance from the goal, in `target.unit`, within which the plan reaches it; None if it is unknown.
     """
+
+    _want = "a Plan, such as a Solution"
 
     status: Status
     detail: Annotated[str, 10 * LINE]
@@ -69,7 +71,8 @@ class Plan:
         """The goal of a run, or the end of the plan if there is no goal."""
         return Target(self.policy.state_coordinates, self.goal, self.trajectory.states)
 
-    def shifted(self, steps: int, *, horizon: str = "moving") -> Self:
+    @checked
+    def shifted(self, steps: Index, *, horizon: Horizon = "moving") -> Self:
         """The rest of the plan after `steps` steps, as a start for the next solve: `start=solution.shifted(k)`.
 
         A "moving" horizon keeps its length: the last law, value function, multipliers and control are repeated at the
@@ -82,9 +85,9 @@ class Plan:
         Raises:
           InputError: `steps` is not a whole number from 0 to the last step, or `horizon` is neither of the two.
         """
-        if check_count("steps", steps, at_least=0) >= self.trajectory.steps:
+        if steps >= self.trajectory.steps:
             raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the plan")
-        filled = check_name("horizon", horizon, HORIZONS) == "moving"
+        filled = horizon == "moving"
 
         def moved(array: npt.ArrayLike) -> Array:
             return left_after(steps, array, filled=filled)

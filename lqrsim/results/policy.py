@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Positive, checked, repr_of
-from lqrsim.errors import Array, InputError, check_count, check_flag, check_name, check_number, excerpt, vectors_of
+from lqrsim.errors import Array, InputError, check_count, check_flag, check_number, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.solution_parts import HORIZONS, left_after
+from lqrsim.results.solution_parts import Horizon, left_after
 
 
 @checked
@@ -58,7 +58,8 @@ class AffinePolicy:
         rules = self.state_coordinates.rules, self.control_coordinates.rules
         return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt), *rules)[:16]
 
-    def shifted(self, steps: int, *, horizon: str = "moving") -> "AffinePolicy":
+    @checked
+    def shifted(self, steps: int, *, horizon: Horizon = "moving") -> "AffinePolicy":
         """The rest of the policy after `steps` steps; see `Solution.shifted`.
 
         Args:
@@ -66,7 +67,7 @@ class AffinePolicy:
           horizon: "moving" or "shrinking", as in `Solution.shifted`.
         """
         steps = check_count("steps", steps, at_least=0, at_most=self.steps - 1)
-        filled = check_name("horizon", horizon, HORIZONS) == "moving"
+        filled = horizon == "moving"
         parts = {name: left_after(steps, getattr(self, name), filled=filled) for name in ("gain", "offset", "nominal")}
         return replace(self, **parts)
 

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Line, NonNegative, Positive, checked, repr_of
-from lqrsim.errors import Array, InputError, check_count, check_symmetric, excerpt, vectors_of
+from lqrsim.annotations import Bounds, Index, Line, NonNegative, Positive, checked, repr_of
+from lqrsim.errors import Array, InputError, check_symmetric, excerpt, vectors_of
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_error, tracking_unit, worst_of
@@ -154,6 +154,8 @@ class Rollout:
         of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
 
+    _want = "a Rollout, such as simulate(...) returns"
+
     robot: Line
     body: Line
     scene: Line
@@ -266,7 +268,8 @@ class Rollout:
         """The world's axes of `places`; for a robot without a position, the axes of its last ball."""
         return self.state_coordinates.plane or ("xyz" if self.balls is not None else "")
 
-    def places(self, trial: int) -> Array:
+    @checked
+    def places(self, trial: Index) -> Array:
         """Places of the robot in a trial: its position, or the position of its last ball.
 
         Args:
@@ -275,7 +278,7 @@ class Rollout:
         Returns:
           (T+1, 2 or 3), in metres.
         """
-        if not check_count("trial", trial, at_least=0) < self.trials:
+        if not trial < self.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {self.trials - 1}")
         if self.state_coordinates.position or self.balls is None:
             return self.states[trial][:, list(self.state_coordinates.position)]

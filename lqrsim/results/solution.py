@@ -45,6 +45,8 @@ class Solution(Plan):
       candidates: the starts that were tried, if there were several.
     """
 
+    _want = "a Solution, such as smooth(problem)"
+
     inverse_policy: AffinePolicy | None
     cost_to_come: Quadratic | Moments | None
     iterations: tuple[Iteration, ...]

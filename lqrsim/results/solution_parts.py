@@ -8,11 +8,12 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Line, NonNegative, Positive, checked, repr_of
-from lqrsim.errors import Array, InputError, check_count
+from lqrsim.annotations import Index, Line, NonNegative, OneOf, Positive, checked, repr_of
+from lqrsim.errors import Array, InputError
 
 # The end of a "moving" horizon moves along with the robot; the end of a "shrinking" horizon stays.
 HORIZONS = ("moving", "shrinking")
+Horizon = Annotated[str, OneOf(HORIZONS)]
 COARSE = 1e-4  # error of a step that a solution mentions: over a hundred steps it may add up to a hundredth
 
 
@@ -208,13 +209,13 @@ class Iteration:
         "  method"
     )
 
-    def row(self, number: int) -> str:
+    @checked
+    def row(self, number: Index) -> str:
         """The line of this iteration in the table under `HEADER`.
 
         Args:
           number: number of the iteration, from 1.
         """
-        number = check_count("number", number, at_least=0)
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
         gap = "-" if np.isnan(self.gap) else f"{self.gap:.1e}"
