@@ -7,8 +7,9 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Finite, checked
 from lqrsim.capsules import Capsule
-from lqrsim.errors import Array, check_number
+from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_kinematics import placed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -139,7 +140,8 @@ def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
     return pairs
 
 
-def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
+@checked
+def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int64], count: int, reach: Finite) -> Array:
     """The data of `kernels/mjcf_distances.py`, except the address of p.
 
     Args:
@@ -151,7 +153,7 @@ def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int6
     moving = np.where(model.body_weldid[bodies[:, 1]] != 0, bodies[:, 1], 0)
     columns = [rows, pairs[:, 0], bodies[:, 0], pairs[:, 1], radii.sum(axis=1), planes, moving]
     table = np.stack(columns, axis=1).astype(np.float64)
-    return np.concatenate([[count, len(pairs), check_number("reach", reach)], table.ravel()])
+    return np.concatenate([[count, len(pairs), reach], table.ravel()])
 
 
 def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:

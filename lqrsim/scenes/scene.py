@@ -19,11 +19,12 @@ import math
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, excerpt, keep
+from lqrsim.annotations import Want, checked
+from lqrsim.errors import InputError, check_count, check_items, check_name, excerpt
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
 from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
@@ -35,6 +36,7 @@ _FLAT = 1e-9  # m, thickness of geoms without one
 Choice = bool | Sequence[str] | Callable[[Any], bool]  # a choice of obstacles; see `load_scene`
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A place for a robot to move in.
@@ -45,9 +47,11 @@ class Scene:
       geoms: ids of their geoms in the model, in the same order.
     """
 
+    _want = "a Scene, such as load_scene('cage')"
+
     mjcf: MjcfModel
     world: World
-    geoms: tuple[int, ...]
+    geoms: Annotated[tuple[int, ...], Want("ids of geoms")]
 
     @property
     def name(self) -> str:
@@ -68,9 +72,6 @@ class Scene:
         return f"Scene({self.name!r}, {len(self.world)} obstacles)"
 
     def __post_init__(self) -> None:
-        check_kind("Scene: mjcf", self.mjcf, MjcfModel, "an MjcfModel")
-        check_kind("Scene: world", self.world, World, "a World")
-        keep(self, geoms=check_items("Scene: geoms", self.geoms, (int, np.integer), "ids of geoms"))
         for geom in self.geoms:
             check_count("Scene: geoms", geom, at_least=0, at_most=self.model.ngeom - 1)
         if len(set(self.geoms)) < len(self.geoms):

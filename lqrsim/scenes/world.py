@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, check_text, keep, real
+from lqrsim.annotations import Finite, OneOf, Want, checked
+from lqrsim.errors import Array, InputError, check_array, check_name, check_text, keep, real
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance
 
@@ -82,6 +84,7 @@ class Obstacle:
         return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), self.size])
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class World:
     """A set of obstacles.
@@ -90,10 +93,9 @@ class World:
       obstacles: in the order in which they are numbered.
     """
 
-    obstacles: Sequence[Obstacle] = ()
+    _want = "a World, such as scene.world"
 
-    def __post_init__(self) -> None:
-        keep(self, obstacles=check_items("obstacles", self.obstacles, Obstacle, "a list of Obstacle"))
+    obstacles: Annotated[Sequence[Obstacle], Want("a list of Obstacle")] = ()
 
     def __len__(self) -> int:
         return len(self.obstacles)
@@ -144,7 +146,8 @@ class World:
         tables[:, :, 1:4] += moved
         return tables
 
-    def moved(self, seconds: float) -> "World":
+    @checked
+    def moved(self, seconds: Finite) -> "World":
         """The world at a later time: each obstacle has moved at its velocity.
 
         An obstacle that is seen at the time t of a run goes into its problem as `ls.World([seen]).moved(-t)`.
@@ -152,12 +155,12 @@ class World:
         Args:
           seconds: the delay in seconds; negative for an earlier time.
         """
-        seconds = check_number("seconds", seconds)
         if not self.moving:
             return self
         return World([replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles])
 
-    def seen_by(self, plane: str, offset: float | None = None) -> "World":
+    @checked
+    def seen_by(self, plane: Annotated[str, OneOf((SPACE, *PLANES))], offset: Finite | None = None) -> "World":
         """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
 
         A robot in space ("xyz") sees this world itself. For a plane, its two axes become x and y, in their order; the
@@ -177,8 +180,6 @@ class World:
           InputError: there is no such plane; a vertical plane has no offset; or, seen from above, an obstacle is
             tilted, so that its outline is no primitive.
         """
-        check_name("plane", plane, (SPACE, *PLANES))
-        offset = None if offset is None else check_number("offset", offset)
         if plane == SPACE:
             return self
         if (plane, offset) not in self._seen:
