@@ -37,6 +37,8 @@ class Robot(abc.ABC):
         distances. None by default.
     """
 
+    _want = "a Robot, such as Quadrotor()"
+
     name: str
     body: str
     joints: tuple[str, ...]

@@ -4,18 +4,17 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Finite, NonNegative, OneOf, checked
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_flag,
     check_items,
-    check_kind,
     check_name,
     check_number,
     check_weights,
@@ -115,6 +114,7 @@ class MjcfRobot(Robot):
         describe: deformable parts, delays, plugins with states.
     """
 
+    @checked
     def __init__(
         self,
         file: str | os.PathLike[str] | Scene,
@@ -125,23 +125,22 @@ class MjcfRobot(Robot):
         outline: bool | None = None,
         floors: bool = True,
         obstacles: Choice = True,
-        turns_about: str | None = None,
+        turns_about: Annotated[str, OneOf(AXES)] | None = None,
         mocap: str | None = None,
     ) -> None:
         given = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
         self.name, who = given.name, f"MjcfRobot {given.name}"
-        axis = None if turns_about is None else check_name(f"{who}: turns_about", turns_about, AXES)
-        if given.turns_about != axis:
-            given = replace(given, turns_about=axis)
+        if given.turns_about != turns_about:
+            given = replace(given, turns_about=turns_about)
         mjcf = given.complete() if mocap is None else given.complete().with_mocap(mocap, who)
         model, number = mjcf.model, mjcf.body_of(body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
-        default = in_the_way(model, candidates, number, floors=check_flag(f"{who}: floors", floors))
+        default = in_the_way(model, candidates, number, floors=floors)
         geoms = chosen_geoms(model, obstacles, default, who)
         self.scene, self.mjcf = scene_of(mjcf, geoms, (*KINDS, *OTHER_KINDS)), mjcf
         self._stated: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
-            "turns_about": axis,
+            "turns_about": turns_about,
             "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
         }  # fmt: skip
         self.body = model.body(number).name
@@ -151,9 +150,9 @@ class MjcfRobot(Robot):
         names, units = zip(*mjcf.states, strict=True)
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
         rotations = tuple(one.dof + turned[one.kind] for one in mjcf.joints if one.kind in turned)
-        if axis is not None and not rotations:
-            raise InputError(f"{who}: turns_about: got {axis!r} without a free or ball joint, want None")
-        turns = [] if axis is None else [first + AXES.index(axis) for first in rotations]
+        if turns_about is not None and not rotations:
+            raise InputError(f"{who}: turns_about: got {turns_about!r} without a free or ball joint, want None")
+        turns = [] if turns_about is None else [first + AXES.index(turns_about) for first in rotations]
         self._axes = position_of(mjcf, number)
         place, plane = self._position(position, names, who)
         ends = {one.dof: one.limits for one in mjcf.joints if one.limits is not None}
@@ -173,13 +172,14 @@ class MjcfRobot(Robot):
         reach = reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
         found = outline_of(model)
-        many = not place and len(found.radii) > 0 if outline is None else check_flag(f"{who}: outline", outline)
+        many = not place and len(found.radii) > 0 if outline is None else outline
         self.balls = MjcfBalls(found, mjcf) if many else None
 
     @cached_property
     def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
         return MjcfGeoms(self.scene)
 
+    @checked
     def among(self, world: World) -> ShapeInWorld:
         """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them.
 
@@ -189,7 +189,7 @@ class MjcfRobot(Robot):
         Raises:
           InputError: an obstacle is a mesh or the like, or has the name of a geom.
         """
-        if not len(check_kind("world", world, World, "a World, such as scene.world")):
+        if not len(world):
             return shape_in(self.dynamics, world, geoms=self.geoms)
         copy = Scene(self.mjcf.with_obstacles(world), World(), ())
         stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
@@ -360,6 +360,7 @@ class MjcfRobot(Robot):
         model = self.dynamics.physics.model
         return holding(model, self.configuration(state)[0])
 
+    @checked
     def problem(
         self,
         start: npt.ArrayLike,
@@ -371,9 +372,9 @@ class MjcfRobot(Robot):
         effort: PerEntry | None = None,
         damping: float = 1e-3,
         attitude: float = 0.1,
-        limits: float = 100.0,
-        clearance: float | None = None,
-        self_clearance: float | None = None,
+        limits: NonNegative = 100.0,
+        clearance: Finite | None = None,
+        self_clearance: Finite | None = None,
         force_limits: bool = True,
         control_rate: ControlRate | None = None,
     ) -> Problem:
@@ -436,20 +437,20 @@ class MjcfRobot(Robot):
         if calm.any():
             cost = cost + QuadraticCost(calm, about=about_state)
         bounds = self._bounds(start, goal)
-        if check_number("limits", limits, at_least=0.0) > 0 and any(bounds):
+        if limits > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
         period = dynamics.period_near(_PERIOD) or dynamics.period if dt is None else dt
         kept: list[Constraint] = []
         if clearance is not None:
-            kept.append(Clearance(self.scene.world, **self.shape, margin=check_number("clearance", clearance)))
+            kept.append(Clearance(self.scene.world, **self.shape, margin=clearance))
         if self_clearance is not None:
-            apart = self.self_clearance(check_number("self_clearance", self_clearance))
+            apart = self.self_clearance(self_clearance)
             for field, state in (("start", start), ("goal", goal)):
                 apart.check(field, dynamics, state)
             kept.append(apart)
         sides = np.array([controls.low, controls.high])
         forces = ForceLimits([one for one in self._forces[0] if one.can_be_kept(start, *sides)])
-        if check_flag("force_limits", force_limits) and forces.limits:
+        if force_limits and forces.limits:
             free = forces.removed_from(dynamics)
             if _is_stable(free, start, first.controls, period):
                 dynamics = free

@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import process
+from lqrsim.annotations import Count, Positive, checked
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
-from lqrsim.errors import Array, InputError, check_count, check_name, check_number
+from lqrsim.errors import Array, InputError, check_name, check_number
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
 from lqrsim.problem.dynamics import Dynamics
@@ -236,9 +237,10 @@ class MjcfDynamics(Dynamics):
     def _parts_of(self, dt: float, most: int) -> int:
         return round(dt / self.period)
 
-    def check_period(self, dt: float) -> None:
+    @checked
+    def check_period(self, dt: Positive) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""
-        timestep, dt = float(self.physics.model.opt.timestep), check_number("dt", dt, above=0.0)
+        timestep = float(self.physics.model.opt.timestep)
         steps = dt / timestep
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
@@ -276,14 +278,15 @@ class MjcfDynamics(Dynamics):
         return unlogged()
 
     @contextlib.contextmanager
-    def solving(self, threads: int) -> Iterator[None]:
+    @checked
+    def solving(self, threads: Count) -> Iterator[None]:
         """In this context, that many threads linearise together, and MuJoCo does not print what statuses report.
 
         No more threads than processors are started, because they would wait for each other. None are started if bodies
         carry loads, which helper threads do not have. After a signal that raises KeyboardInterrupt all steps are NaN,
         so that the signal need not wait for the end of an iteration.
         """
-        threads = min(check_count("threads", threads), 1 if self.parameters else processors())
+        threads = min(threads, 1 if self.parameters else processors())
         team, helpers = self.physics.team, list[threading.Thread]()
         with unlogged(), process.on_interrupt(partial(team.__setitem__, kernel.SIGNALLED, 1)):
             with _forming:

@@ -1,11 +1,12 @@
 """Costs and constraints on sites of an MJCF, such as a gripper at a desired pose: classes and kernel."""
 
 from math import atan2, sqrt
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import OneOf, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, brief, check_array, check_name, check_text, check_weights
 from lqrsim.kernels.declarations import N, at, call, int32, stack, store
@@ -139,16 +140,17 @@ class SiteConstraint(Constraint):
       at: "final", or "all" steps except a start that is given exactly.
     """
 
+    @checked
     def __init__(
         self,
         site: str,
         *,
         position: npt.ArrayLike | None = None,
         orientation: npt.ArrayLike | None = None,
-        at: str = "final",
+        at: Annotated[str, OneOf(STEPS)] = "final",
     ) -> None:
         self.pose = _Pose("SiteConstraint", site, position, orientation)
-        self.at = check_name("SiteConstraint: at", at, STEPS)
+        self.at = at
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return self

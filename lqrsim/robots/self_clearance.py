@@ -5,9 +5,10 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Finite, checked
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_number, vectors_of
+from lqrsim.errors import Array, InputError, vectors_of
 from lqrsim.kernels import mjcf_distances
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -33,9 +34,10 @@ class SelfClearance(Constraint):
       margin: the margin in metres. links: the pairs of links that are kept apart, by the names of their bodies.
     """
 
-    def __init__(self, mjcf: MjcfModel, body: str, margin: float = 0.0) -> None:
+    @checked
+    def __init__(self, mjcf: MjcfModel, body: str, margin: Finite = 0.0) -> None:
         model = mjcf.model
-        self.margin = check_number("SelfClearance: margin", margin)
+        self.margin = margin
         self._mjcf, self._pairs = mjcf, link_pairs(model, model.body(body).id)
         own = model.geom_bodyid[self._pairs]
         bodies = np.sort(np.where(model.body_weldid[own] != 0, model.body_weldid[own], own), axis=1)

@@ -3,11 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, check_number, check_text, keep
+from lqrsim.annotations import Bounds, Positive, Want, checked
+from lqrsim.errors import Array, InputError, check_items, check_number, keep
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.robots.base import Robot
@@ -21,6 +23,7 @@ _ROUNDING = 1e-9
 Reader = Callable[[Array, Array, Array], Array]
 
 
+@checked
 @dataclass(frozen=True)
 class Sensor:
     """An element of an MJCF's `<sensor>`, with errors and timing. Units are those of MuJoCo's reading.
@@ -42,22 +45,18 @@ class Sensor:
       InputError: a number is out of range.
     """
 
-    name: str
+    name: Annotated[str, Want("the name of an element of <sensor>")]
     noise: float | None = None
     bias: float = 0.0
     bias_walk: float = 0.0
-    rate: float | None = None
+    rate: Positive | None = None
     delay: float | None = None
-    loss: float = 0.0
+    loss: Annotated[float, Bounds(at_least=0.0, below=1.0)] = 0.0
 
     def __post_init__(self) -> None:
-        check_text("Sensor: name", self.name, "the name of an element of <sensor>")
         for field in ("noise", "bias", "bias_walk", "delay"):
             if getattr(self, field) is not None:
                 keep(self, **{field: check_number(f"Sensor: {field}", getattr(self, field), at_least=0.0)})
-        if self.rate is not None:
-            keep(self, rate=check_number("Sensor: rate", self.rate, above=0.0))
-        keep(self, loss=check_number("Sensor: loss", self.loss, at_least=0.0, below=1.0))
 
 
 class RobotSensors:
@@ -79,12 +78,14 @@ class RobotSensors:
       InputError: the MJCF has no sensor of a name, or a kind is not supported, or one is given twice.
     """
 
+    _prefix = ""
+
+    @checked
     def __init__(self, robot: Robot, scene: Scene, sensors: Sequence[Sensor]) -> None:
         given = check_items("sensors", sensors, Sensor, "a list of Sensor")
         if not given or len({one.name for one in given}) < len(given):
             raise InputError(f"sensors: got {[one.name for one in given]}, want at least one, each at most once")
-        self._robot = check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
-        self._scene = check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
+        self._robot, self._scene = robot, scene
         self.drag = robot.drag
         found = [file_sensor(scene.model, one.name, "sensors") for one in given]
         self.sensors = tuple(
