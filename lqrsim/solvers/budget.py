@@ -6,14 +6,16 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from lqrsim.annotations import Want
 from lqrsim.codegen.compiled_module import compilations
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Status
 
-Callback = Callable[[Iteration], object]
+Callback = Annotated[Callable[[Iteration], object], Want("a function of an Iteration")]
 
 _log = logging.getLogger("lqrsim")
 ATTENTION = 0.1  # s, after which compiled code returns to check for Ctrl-C

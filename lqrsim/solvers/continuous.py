@@ -7,22 +7,19 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PPoly
 
-from lqrsim.annotations import Positive, checked
+from lqrsim.annotations import Bounds, Positive, Want, checked
 from lqrsim.codegen.user_functions import UserFunction, interrupt_of, raised_by
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_count,
     check_function,
-    check_kind,
-    check_number,
     excerpt,
     real,
 )
@@ -68,10 +65,6 @@ class ContinuousSolution:
     iterations: tuple[Iteration, ...] = ()
     _backward: Pass | None = field(repr=False, compare=False)
     _forward: Pass | None = field(repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        for name in ("_backward", "_forward"):
-            check_kind(f"ContinuousSolution: {name}", getattr(self, name), (Pass, type(None)), "a Pass or None")
 
     @property
     def success(self) -> bool:
@@ -207,10 +200,11 @@ class ContinuousSolution:
         return np.einsum("...ij,...j->...i", law[..., :-1], states) + law[..., -1]
 
 
+@checked
 def smooth_lq_continuous(
     stage: Stage | Callable[[float], Stage],
     *,
-    horizon: float,
+    horizon: Positive,
     initial: Quadratic,
     final: Quadratic,
     rtol: float = 1e-9,
@@ -234,7 +228,6 @@ def smooth_lq_continuous(
     Raises:
       InputError: an argument is not as described.
     """
-    horizon = check_number("horizon", horizon, above=0.0)
     tolerances = tolerances_of(rtol, atol)
 
     def at(t: float) -> Stage:
@@ -292,16 +285,17 @@ def _check_minimum(backward: Pass, forward: Pass) -> None:
         raise IntegrationFailure(Status.NOT_POSITIVE_DEFINITE, NO_MINIMUM, float(times[flat][0]))
 
 
+@checked
 def smooth_continuous(
     problem: Problem,
     *,
-    tolerance: float = 1e-4,
-    gap_tolerance: float = 1e-3,
-    max_iterations: int = 50,
+    tolerance: Positive = 1e-4,
+    gap_tolerance: Positive = 1e-3,
+    max_iterations: Annotated[int, Bounds(at_least=1, at_most=1_000_000)] = 50,
     start: npt.ArrayLike | InitialPrior | None = None,
     rtol: float = 1e-8,
     atol: float = 1e-8,
-    callback: Callable[[Iteration], object] | None = None,
+    callback: Annotated[Callable[[Iteration], object], Want("a function of an Iteration")] | None = None,
 ) -> ContinuousSolution:
     """Compute a locally optimal feedback policy by iterated LQR smoothing in continuous time. Paper: Sec. V.
 
@@ -329,8 +323,6 @@ def smooth_continuous(
     Raises:
       InputError: an argument is not as described; the dynamics or a cost is not finite at the start.
     """
-    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
-    check_function("callback", callback, "a function of an Iteration", arguments=1)
     if isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
@@ -350,9 +342,9 @@ def smooth_continuous(
             f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"
         )
     limits = _Limits(
-        check_number("tolerance", tolerance, above=0.0),
-        check_number("gap_tolerance", gap_tolerance, above=0.0),
-        check_count("max_iterations", max_iterations, at_most=1_000_000),
+        tolerance,
+        gap_tolerance,
+        max_iterations,
     )
     tolerances = tolerances_of(rtol, atol)
     control, prior = _initial_guess(problem, start)

@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind
+from lqrsim.annotations import checked
+from lqrsim.errors import Array, InputError
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
@@ -32,7 +33,7 @@ from lqrsim.solvers.assembly import clearance_of, copy_of, parts_of
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, is_function
-from lqrsim.solvers.settings import Settings, SmootherSettings, check_problem
+from lqrsim.solvers.settings import Settings, SmootherSettings
 
 P = TypeVar("P", Solution, Replan)
 S = TypeVar("S", bound=Settings)
@@ -106,6 +107,7 @@ def _gains(
     return gain, cost_to_go
 
 
+@checked
 def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
     """The best feedback about a plan for a problem with a `control_rate`, which remembers the last command.
 
@@ -124,8 +126,6 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
       InputError: the problem has no such weight, the solution is of another problem, or there is no feedback about its
         plan.
     """
-    check_problem(problem)
-    check_kind("solution", solution, Solution, "the Solution of the problem")
     rate = problem.control_rate
     if rate is None or rate.weight is None:
         raise InputError(f"problem: got control_rate={rate!r}, want one with a weight")

@@ -17,9 +17,9 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Line, checked
+from lqrsim.annotations import Bounds, Line, Want, checked
 from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array, InputError, check_array, check_flag, check_function, check_kind
+from lqrsim.errors import Array, InputError, check_array, check_kind
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
@@ -61,8 +61,9 @@ class Gradients:
     controls: Annotated[Array, "T m P", Bounds()] | None = None
 
 
+@checked
 def gradients(
-    make: Callable[[Array], Problem],
+    make: Annotated[Callable[[Array], Problem], Want("a function of the parameters that returns a Problem")],
     at: npt.ArrayLike,
     solution: Solution,
     *,
@@ -88,14 +89,12 @@ def gradients(
       InputError: an argument is not as described; or the problem has noise, rates or a free duration, the plan is at
         the edge of its contact modes, or limits of forces were refined within its periods.
     """
-    check_function("make", make, "a function of the parameters that returns a Problem", arguments=1, optional=False)
     point = check_array("at", at, (None,))
     if not len(point):
         raise InputError("at: got no numbers, want one at least")
     sizes = np.maximum(np.abs(point), SMALLEST) if scale is None else check_array("scale", scale, point.shape)
     if not (sizes > 0).all():
         raise InputError(f"scale: got {sizes.min():g}, want numbers above 0")
-    plan = check_flag("plan", plan)
     _check_solution(solution, plan)
     problem = _made(make, point)
     if problem.accuracy is not None or problem.between_knots:
@@ -126,7 +125,6 @@ def gradients(
 
 def _check_solution(solution: Solution, plan: bool) -> None:
     """Raises InputError unless a solution has a gradient of its cost, and if asked for, of its plan."""
-    check_kind("solution", solution, Solution, "the Solution of make(at)")
     if solution.status is not Status.CONVERGED:
         raise InputError(f"solution: got one that is {solution.status.name}, want a CONVERGED one")
     if solution.certificate.contacts is not None:

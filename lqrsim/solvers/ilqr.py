@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.annotations import checked
 from lqrsim.errors import InputError, check_number
 from lqrsim.kernels import declarations
 from lqrsim.problem.derivative_check import check_functions
@@ -26,8 +27,6 @@ from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import (
     Settings,
     SmootherSettings,
-    check_callback,
-    check_problem,
     settings_from,
     warn_of_goal,
 )
@@ -35,6 +34,7 @@ from lqrsim.solvers.settings import (
 TOLERANCE = 1e-4  # default tolerance
 
 
+@checked
 def ilqr(
     problem: Problem,
     *,
@@ -75,8 +75,6 @@ def ilqr(
     settings = Settings(
         stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
     )
-    check_callback(callback)
-    check_problem(problem)
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     warn_of_goal(problem)
@@ -116,8 +114,8 @@ def ilqr_many(
 _NO_PRIOR = "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
 
 
+@checked
 def _check(problem: Problem, settings: Settings) -> None:
-    check_problem(problem)
     check_number("tolerance", settings.tolerance, above=0.0)
     if isinstance(settings.start, InitialPrior):
         raise InputError(_NO_PRIOR)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, TypeGuard
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
+from lqrsim.annotations import Count, checked
+from lqrsim.errors import Array, InputError, check_array, check_number, excerpt, numbers_of
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
@@ -34,12 +35,13 @@ class InitialPrior:
       controls: the controls (m,) or (T, m) of the first pass; by default the problem's nominal control.
     """
 
+    @checked
     def __init__(
         self,
         weight: npt.ArrayLike,
         *,
         about: npt.ArrayLike,
-        iterations: int = 1,
+        iterations: Count = 1,
         obstacles: Sequence[float] = (),
         controls: npt.ArrayLike | None = None,
     ) -> None:
@@ -54,7 +56,7 @@ class InitialPrior:
             raise InputError(
                 f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times"
             )
-        self.iterations = check_count("InitialPrior: iterations", iterations)
+        self.iterations = iterations
         shares = check_array("InitialPrior: obstacles", obstacles, (None,))
         if ((shares < 0) | (shares > 1)).any():
             raise InputError(f"InitialPrior: obstacles: got {excerpt(obstacles)}, want numbers from 0 to 1")
@@ -83,6 +85,7 @@ class InitialPrior:
         share = step - before
         return (1 - share) * self.about[before] + share * self.about[before + 1]
 
+    @checked
     def fitting(self, problem: Problem) -> "InitialPrior":
         """Check that the prior fits a problem.
 
@@ -95,7 +98,6 @@ class InitialPrior:
         Raises:
           InputError: it does not fit.
         """
-        check_kind("problem", problem, Problem, "a Problem")
         n = len(problem.dynamics.state_coordinates)
         check_array("start: InitialPrior: weight", self.weight, (n,))
         if self.about.ndim == 2:

@@ -1,11 +1,12 @@
 """LQR smoothing of linear-quadratic problems: Sec. IV of the paper."""
 
 import time
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_array, check_kind, check_memory, check_name, check_number
+from lqrsim.annotations import OneOf, Positive, checked
+from lqrsim.errors import Array, InputError, check_array, check_memory
 from lqrsim.kernels.records import (
     CostToCome,
     CostToGo,
@@ -27,8 +28,14 @@ from lqrsim.solvers import compiled
 from lqrsim.versions import versions
 
 
+@checked
 def smooth_lq(
-    stage: Stage, *, initial: Quadratic | FixedState, final: Quadratic, form: str = "dual", dt: float = 1.0
+    stage: Stage,
+    *,
+    initial: Quadratic | FixedState,
+    final: Quadratic,
+    form: Annotated[str, OneOf(compiled.FORMS)] = "dual",
+    dt: Positive = 1.0,
 ) -> Solution:
     """Solve a linear-quadratic problem exactly, by one backward pass and one forward pass. Paper: Sec. IV.
 
@@ -53,8 +60,6 @@ def smooth_lq(
       InputError: the arrays do not fit together, or the form does not support them.
     """
     clock = time.perf_counter()
-    check_name("form", form, tuple(compiled.FORMS))
-    dt = check_number("dt", dt, above=0.0)
     parts = _parts(stage)
     passes = _passes(parts, initial, final, form)
     start, detail = _start(passes, initial)
@@ -192,9 +197,9 @@ def _policy(gain: Array, offset: Array, nominal: Array, dt: float) -> AffinePoli
     )  # fmt: skip
 
 
+@checked
 def _parts(stage: Stage) -> tuple[Array, ...]:
     """The stage's arrays. Raises InputError unless there is one stage per step."""
-    check_kind("stage", stage, Stage, "a Stage")
     if np.ndim(stage.B) != 3:
         raise InputError("stage: got a single stage, want one stage per step: B of shape (T, n, m)")
     return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))

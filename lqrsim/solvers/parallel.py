@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.annotations import Progress, checked
 from lqrsim.codegen.user_functions import UserFunction
-from lqrsim.errors import InputError, check_count, check_items, check_kind, check_progress
+from lqrsim.errors import InputError, check_count, check_items, check_kind
 from lqrsim.machine import processors
 from lqrsim.problem.derivative_check import check_functions, functions_of
 from lqrsim.problem.noise import Noise
@@ -22,6 +23,7 @@ from lqrsim.solvers.settings import Settings
 MOST_THREADS = 1024
 
 
+@checked
 def solve_all(
     problems: list[Problem],
     settings: Settings,
@@ -29,10 +31,9 @@ def solve_all(
     solve: Callable[..., Solution],
     *,
     threads: int | None,
-    progress: Callable[[int, int], object] | None,
+    progress: Progress | None,
 ) -> list[Solution]:
     """Solve each problem with `solve(problem, settings)`, on several threads; return the solutions in order."""
-    check_progress(progress)
     threads = check_threads(threads)
     for i, problem in enumerate(problems):
         try:

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Positive, checked
 from lqrsim.codegen.user_functions import raised_by
-from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
@@ -31,7 +32,7 @@ from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.restoration import restore
-from lqrsim.solvers.settings import FINE, SmootherSettings, check_problem
+from lqrsim.solvers.settings import FINE, SmootherSettings
 from lqrsim.solvers.stages import Sizes
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
@@ -49,6 +50,7 @@ OLDEST = 20  # steps for which derivatives may serve; most solves take fewer
 BARRIER, ROOM = 10.0, 0.5
 
 
+@checked
 def prepare(
     problem: Problem,
     *,
@@ -80,7 +82,6 @@ def prepare(
         tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
-    check_problem(problem)
     solved = problem if problem.control_rate is None else with_last_command(problem)
     if tolerance is None and solved.constraints and settings.second_order(solved):
         if _can_yield(solved):
@@ -99,11 +100,10 @@ class PreparedSolver(OneVersion):
       threads: number of threads that compute derivatives of an MJCF's steps.
     """
 
+    @checked
     def __init__(self, problem: Problem, settings: SmootherSettings, threads: int = 1) -> None:
-        check_problem(problem)
         if problem.duration is not None:
             raise InputError("problem: got a free duration, want a fixed one for solves in real time")
-        check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
         self.problem, self.settings, self.threads = problem, settings, threads
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.applied_coordinates
@@ -152,6 +152,7 @@ class PreparedSolver(OneVersion):
                 stages, plan, stages.sizes(plan), price=1.0, most=1, watch=lambda *_: True, stationary=lambda *_: False
             )
 
+    @checked
     def check(self, problem: Problem) -> Problem:
         """Check that a problem needs no compiling: only numbers may differ from the prepared one.
 
@@ -161,7 +162,6 @@ class PreparedSolver(OneVersion):
         Raises:
           InputError: the problem would have to be compiled.
         """
-        check_problem(problem)
         other = (problem.control_rate is None) != (self._wide is None)
         if other or compiled.structure(problem) != self._structure:
             raise InputError(
@@ -172,6 +172,7 @@ class PreparedSolver(OneVersion):
             self._wide.check(with_last_command(problem))
         return problem
 
+    @checked
     def solve(
         self,
         state: npt.ArrayLike,
@@ -179,7 +180,7 @@ class PreparedSolver(OneVersion):
         *,
         problem: Problem | None = None,
         after: int = 0,
-        time_limit: float | None = None,
+        time_limit: Positive | None = None,
         previous: npt.ArrayLike | None = None,
     ) -> Replan:
         """Solve from a state, starting from a plan. The answer is no worse than continuing with that plan; see
@@ -199,12 +200,11 @@ class PreparedSolver(OneVersion):
         clock = time.perf_counter()
         own = self.problem if problem is None else self.check(problem)
         problem = own.from_state(state, after=after, previous=previous)
-        check_kind("start", start, (Plan, InitialGuess), "a Plan, such as a Solution or a Replan")
         if self._wide is not None:
             return self._solve_wide(self._wide, problem, start, time_limit, clock)
         stop = Stop(reserve=self._pace + self._closing)
         if time_limit is not None:
-            stop.deadline = clock + check_number("time_limit", time_limit, above=0.0)
+            stop.deadline = clock + time_limit
         budget = Budget(self.settings.max_iterations, stop, attentive=True)
         run = SolveRun.lent(
             problem, self.settings, resolve(start, problem), np.asarray(state, dtype=np.float64), budget
@@ -245,7 +245,7 @@ class PreparedSolver(OneVersion):
         wide = with_last_command(problem)
         assert wide.start is not None
         if time_limit is not None:
-            left = check_number("time_limit", time_limit, above=0.0) - (time.perf_counter() - clock) - self._closing
+            left = time_limit - (time.perf_counter() - clock) - self._closing
             time_limit = max(left, 1e-9)
         found = solver.solve(wide.start, widened(start, problem, wide), problem=wide, time_limit=time_limit)
         ended = time.perf_counter()

@@ -1,11 +1,13 @@
 """Costs under noise: of sampled runs; and the largest risk for which the expectation of exp(risk * cost) exists."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 
+from lqrsim.annotations import Bounds, Seed, checked
 from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_memory, check_seed
+from lqrsim.errors import Array, InputError, check_memory
 from lqrsim.kernels.records import Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -13,14 +15,21 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import resolve
-from lqrsim.solvers.settings import SmootherSettings, check_problem
+from lqrsim.solvers.settings import SmootherSettings
 
 DIGITS = 1e-12  # relative accuracy of the bisection
 MOST_TRIALS = 10_000_000
 Fails = Callable[[float], int]  # maps a risk to the step at which a backward pass fails, or -1
 
 
-def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, seed: int = 0) -> Array:
+@checked
+def sample_costs(
+    problem: Problem,
+    solution: Solution,
+    *,
+    trials: Annotated[int, Bounds(at_least=1, at_most=MOST_TRIALS)] = 1000,
+    seed: Seed = 0,
+) -> Array:
     """Costs of simulated runs of a solution's policy from the first state of its plan, with noise drawn at random.
 
     The robot moves by the formulas of the problem, x' = g(x, u) + M(x, u) w, not in MuJoCo, and obstacles do not stop
@@ -39,16 +48,13 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     Raises:
       InputError: the problem has no noise, the solution does not fit it, or an argument is not as described.
     """
-    check_problem(problem)
     if problem.noise_term is None:
         raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
-    check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
     shape = problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates)
     if solution.policy.gain.shape != shape:
         got = solution.policy.gain.shape
         raise InputError(f"solution: got a policy of shape {got}, want {shape}: steps, controls, states")
-    trials = check_count("trials", trials, at_most=MOST_TRIALS)
-    seed, size = check_seed("seed", seed), problem.noise_term.size
+    size = problem.noise_term.size
     check_memory("trials", trials, 8 * (problem.steps * size + 1), "whose noise")
     draws = np.empty((trials, problem.steps, size))
     for trial in range(trials):
@@ -59,6 +65,7 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     return compiled.noisy_costs(problem, start, policy, draws)
 
 
+@checked
 def largest_risk(problem: Problem, solution: Solution) -> float:
     """The largest `risk` for which a backward pass about a solution's plan succeeds, found by bisection.
 
@@ -75,10 +82,8 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     Raises:
       InputError: the problem has no noise, the solution is not of such a problem, or the pass fails even without risk.
     """
-    check_problem(problem)
     if problem.noise is None:
         raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
-    check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
     plan = solution.trajectory
     wanted = (problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates))
     if (got := (*plan.controls.shape, plan.states.shape[1])) != wanted:

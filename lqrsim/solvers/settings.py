@@ -2,25 +2,18 @@
 
 import logging
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
+from lqrsim.annotations import Bounds, OneOf, Positive, checked
 from lqrsim.errors import (
     InputError,
-    check_count,
-    check_flag,
     check_function,
-    check_kind,
     check_memory,
-    check_name,
-    check_number,
-    keep,
-    keep_positive,
 )
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers import compiled
-from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
 
 MOST_STARTS = 10_000
@@ -31,62 +24,49 @@ INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the
 MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point, augmented Lagrangian
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Settings:
     """Options that all solvers share; see `ilqr`."""
 
-    stop: str = "optimal"
-    tolerance: float | None = None
-    max_iterations: int = 500
-    time_limit: float | None = None
+    _prefix = ""
+
+    stop: Annotated[str, OneOf(("optimal", "cost"))] = "optimal"
+    tolerance: Positive | None = None
+    max_iterations: Annotated[int, Bounds(at_least=1, at_most=1_000_000)] = 500  # a log of this length takes 48 MB
+    time_limit: Positive | None = None
     start: StartLike | InitialGuess = None
 
     def __post_init__(self) -> None:
-        check_name("stop", self.stop, ("optimal", "cost"))
         if is_function(self.start):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
-        # Plain Python numbers: NumPy's numbers are other types for the compiler, and JSON has no form for them.
-        keep_positive(self, "tolerance")
-        # A log of this length takes 48 MB.
-        most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
-        keep(self, max_iterations=most)
-        keep_positive(self, "time_limit")
 
     def options(self, start: InitialGuess) -> dict[str, object]:
         """The options that a solution records."""
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SmootherSettings(Settings):
     """Options of `smooth`."""
 
-    gap_tolerance: float = 1e-3
-    form: str = "dual"
-    first_pass: str = "forward"
+    gap_tolerance: Positive = 1e-3
+    form: Annotated[str, OneOf(compiled.FORMS)] = "dual"
+    first_pass: Annotated[str, OneOf(("forward", "backward"))] = "forward"
     safeguard: bool = True
-    starts: int | None = None
-    constraint_tolerance: float | None = None
-    penalty: float | None = None
-    finish: str | None = "newton"
-    elastic: float | None = None
+    starts: Annotated[int, Bounds(at_least=1, at_most=MOST_STARTS)] | None = None
+    constraint_tolerance: Positive | None = None
+    penalty: Positive | None = None
+    finish: Annotated[str, OneOf(("newton",))] | None = "newton"
+    elastic: Positive | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        keep_positive(self, "elastic")
-        if self.finish is not None:
-            check_name("finish", self.finish, ("newton",))
-        if self.starts is not None:
-            keep(self, starts=check_count("starts", self.starts, at_most=MOST_STARTS))
-            if self.starts > 1 and self.start is not None:
-                raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
-        keep(self, gap_tolerance=check_number("gap_tolerance", self.gap_tolerance, above=0.0))
-        keep_positive(self, "constraint_tolerance", "penalty")
+        if (self.starts or 1) > 1 and self.start is not None:
+            raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
         if self.penalty is not None and self.start is None:
             raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
-        check_name("form", self.form, tuple(compiled.FORMS))
-        check_name("first_pass", self.first_pass, ("forward", "backward"))
-        keep(self, safeguard=check_flag("safeguard", self.safeguard))
 
     def second_order(self, problem: Problem) -> bool:
         """Whether Newton's method or the interior point ends a solve; with stop="cost" the paper's method does."""
@@ -144,19 +124,9 @@ def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
     return kind(**options)
 
 
-def check_callback(callback: Callback | None) -> None:
-    """Raises InputError unless it is None or callable with one argument."""
-    check_function("callback", callback, "a function of an Iteration", arguments=1)
-
-
 def check_runs(problem: Problem, starts: int) -> None:
     """Raises InputError if the arrays of this number of starts do not fit into memory."""
     check_memory("starts", starts, problem.steps * problem.bytes_per_step)
-
-
-def check_problem(problem: Problem) -> None:
-    """Raises InputError unless it is a problem."""
-    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
 
 
 def warn_of_goal(problem: Problem) -> None:

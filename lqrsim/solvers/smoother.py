@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from lqrsim.annotations import checked
 from lqrsim.errors import InputError
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
@@ -16,8 +17,6 @@ from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.settings import (
     SmootherSettings,
-    check_callback,
-    check_problem,
     check_runs,
     settings_from,
     warn_of_goal,
@@ -25,6 +24,7 @@ from lqrsim.solvers.settings import (
 from lqrsim.solvers.strategy import solve
 
 
+@checked
 def smooth(
     problem: Problem,
     *,
@@ -118,8 +118,6 @@ def smooth(
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
         constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish, elastic=elastic,
     )  # fmt: skip
-    check_callback(callback)
-    check_problem(problem)
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     warn_of_goal(problem)
@@ -167,8 +165,8 @@ def _solve(problem: Problem, settings: SmootherSettings, **options: Any) -> Solu
     return solution
 
 
+@checked
 def _check(problem: Problem, settings: SmootherSettings) -> None:
-    check_problem(problem)
     if problem.control_rate is not None:
         for option, got, want in (("form", settings.form, "dual"), ("first_pass", settings.first_pass, "forward")):
             if got != want:
