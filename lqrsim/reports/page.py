@@ -6,19 +6,20 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as packaged
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jinja2
 import numpy as np
 from matplotlib.axes import Axes
 from PIL import Image
 
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, check_progress
+from lqrsim.annotations import Bounds, Progress, checked
+from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import replacing
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
 from lqrsim.scenarios.packaged import Scenario
@@ -163,12 +164,13 @@ def base64_text(path: Path) -> str:
 MOST_VIDEOS = 100  # a page with more videos is too large for a browser
 
 
+@checked
 def report(
     results: Results,
     out: str | os.PathLike[str],
     *,
-    videos: int = 4,
-    progress: Callable[[int, int], object] | None = None,
+    videos: Annotated[int, Bounds(at_least=0, at_most=MOST_VIDEOS)] = 4,
+    progress: Progress | None = None,
 ) -> Path:
     """Write a campaign as one self-contained HTML page; returns its path.
 
@@ -185,9 +187,6 @@ def report(
       InputError: no trial has been run yet; a file is damaged; `results` lacks a scenario that is your own function; or
         the page cannot be written.
     """
-    check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
-    check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
-    check_progress(progress)
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from av.error import FFmpegError
 from mujoco import mjtGeom as Geom
 
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_progress
+from lqrsim.annotations import Index, checked
+from lqrsim.errors import Array, InputError, check_progress
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import spaces_of
@@ -29,9 +30,9 @@ from lqrsim.view.video_metadata import Pane, VideoMetadata
 Progress = Callable[[int, int], object]
 
 
+@checked
 def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
     """Raises InputError unless the arguments are a solution and a function, or None."""
-    check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
     check_progress(progress)
 
 
@@ -377,11 +378,12 @@ def run_beside(path: str | os.PathLike[str]) -> Path:
     raise InputError(f"run: no file in {folder} has the run that {Path(path).name} shows, want its file, --run RUN.npz")
 
 
+@checked
 def verify_video(
     path: str | os.PathLike[str],
     rollout: Rollout,
     *,
-    trial: int | None = None,
+    trial: Index | None = None,
     solution: Solution | None = None,
     progress: Progress | None = None,
 ) -> Verification:
@@ -399,8 +401,6 @@ def verify_video(
       InputError: the file was not written by lqrsim, or lacks the necessary panes.
     """
     check_arguments(solution, progress)
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    trial = None if trial is None else check_count("trial", trial, at_least=0)
     metadata, plane = video_metadata.read(path), rollout.plane
     digest = video_metadata.digest(rollout)
     run = metadata.runs.index(digest) if digest in metadata.runs else 0

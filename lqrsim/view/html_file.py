@@ -19,7 +19,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, check_path, excerpt
+from lqrsim.annotations import checked
+from lqrsim.errors import Array, InputError, check_items, check_path, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
@@ -45,6 +46,7 @@ LEVELS = np.iinfo(np.uint16).max
 SHADES = 9  # colours of the legend's map of errors, between which the browser interpolates
 
 
+@checked
 def render_html(
     rollout: Rollout,
     path: str | os.PathLike[str],
@@ -74,7 +76,6 @@ def render_html(
     path = check_path("path", path)
     if path.suffix.lower() != ".html":
         raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in .html")
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     shown, rows, arrays = check_overlays(overlays), _rows(rollout, trial), _Arrays()
     scale = common_scale(RecordedTrial(rollout, row) for row in rows)
 

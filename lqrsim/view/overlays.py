@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, check_name
+from lqrsim.annotations import checked
+from lqrsim.errors import Array, InputError, check_items, check_name
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.results.solution import Solution
@@ -175,6 +176,9 @@ class Overlays:
       membership: (T+1) whether the run is in the funnel at each step, as text; None without the overlay.
     """
 
+    _prefix = ""
+
+    @checked
     def __init__(
         self,
         recorded: RecordedTrial,
@@ -185,8 +189,6 @@ class Overlays:
         funnel: Funnel | None = None,
         segments: int = SEGMENTS,
     ) -> None:
-        check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
-        check_kind("funnel", funnel, (Funnel, type(None)), "a Funnel about the plan of the run, or None")
         self.recorded, self.scale = recorded, scale
         self.membership: tuple[str, ...] | None = None
         self._lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])

@@ -3,14 +3,15 @@
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 from mujoco.rendering.classic import gl_context
 
-from lqrsim.errors import Array, InputError, check_count, check_items, check_name, check_text, excerpt, keep
+from lqrsim.annotations import Want, checked
+from lqrsim.errors import Array, InputError, check_count, check_items, check_text, excerpt, keep
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -169,12 +170,15 @@ QUALITIES: dict[Quality, QualitySettings] = {
 }
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureOptions:
     """The arguments of these names of `render`; `open_picture` checks everything that depends on the runs."""
 
+    _prefix = ""
+
     trial: int | Sequence[int] = 0
-    camera: str = "overview"
+    camera: Annotated[str, Want("the name of a camera")] = "overview"
     insets: Sequence[str] = ()
     titles: Sequence[str] = ()
     overlays: Sequence[Overlay] = OVERLAYS
@@ -185,9 +189,7 @@ class PictureOptions:
     speed: float = 1.0
 
     def __post_init__(self) -> None:
-        check_name("quality", self.quality, QUALITIES)
         size = _checked_size(self.pixels)
-        check_text("camera", self.camera, "the name of a camera")
         wanted = f"a tuple of the names of cameras, {MOST_INSETS} at most"
         insets = check_items("insets", self.insets, str, wanted, at_most=100)
         overlays = check_overlays(self.overlays)

@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.ticker import MaxNLocator
 
+from lqrsim.annotations import Index, NonNegative, checked
 from lqrsim.control.tubes import Tube
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text
+from lqrsim.errors import Array, InputError, check_kind, check_text
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
@@ -112,11 +113,9 @@ def _entries(*drawn: Axes) -> dict[str, Artist]:
     return {label: artist for axes in drawn for artist, label in zip(*axes.get_legend_handles_labels(), strict=True)}
 
 
-def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, world: World) -> None:
-    check_kind("solution", solution, Solution, "a Solution")
-    check_kind("world", world, World, "a World, such as scene.world")
+@checked
+def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: Index, world: World) -> None:
     check_kind("rollouts", rollouts, Mapping, "a dictionary of label: Rollout")
-    check_count("trial", trial, at_least=0)
     if not 1 <= len(rollouts) <= len(RUNS):
         raise InputError(f"rollouts: got {len(rollouts)}, want 1 to {len(RUNS)}")
     for name, run in rollouts.items():
@@ -266,12 +265,13 @@ LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)))
 FLAT = 0.05  # a curve whose range is a smaller part of the largest one's in its unit has another strip
 
 
+@checked
 def plot_policy(
     solution: Solution,
     path: str | os.PathLike[str],
     *,
     world: World | None = None,
-    radius: float = 0.0,
+    radius: NonNegative = 0.0,
     tube: Tube | None = None,
     style: Style = "screen",
 ) -> Path:
@@ -295,13 +295,10 @@ def plot_policy(
     Raises:
       InputError: the solution has no policy, or the tube is of another plan or has no position.
     """
-    check_kind("solution", solution, Solution, "a Solution")
     world = World() if world is None else world
     check_kind("world", world, World, "a World, such as scene.world")
-    radius = check_number("radius", radius, at_least=0.0)
     if solution.cost_to_go is None:
         raise InputError(f"solution: got no cost-to-go ({solution.status.name}), want a solution of a completed solve")
-    check_kind("tube", tube, (Tube, type(None)), "a Tube, such as predict_tube(...) returns, or None")
     if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
         raise InputError("tube: got a tube of another plan, want one of the solution's plan")
     if tube is not None and not solution.policy.state_coordinates.position:
@@ -421,8 +418,9 @@ def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
 FACE, EDGE = "#cfe3f5", "#5f97c9"
 
 
+@checked
 def plot_funnel(
-    funnel: Funnel, path: str | os.PathLike[str], *, world: World, radius: float, style: Style = "screen"
+    funnel: Funnel, path: str | os.PathLike[str], *, world: World, radius: NonNegative, style: Style = "screen"
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a funnel; returns its path.
 
@@ -437,9 +435,6 @@ def plot_funnel(
       radius: radius of the robot, in metres.
       style: as in `plot_run`.
     """
-    check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
-    check_kind("world", world, World, "a World, such as scene.world")
-    radius = check_number("radius", radius, at_least=0.0)
     views = funnel_views(funnel, world, radius)
     with styles.figure(path, style=style) as figure:
         *parts, levels = arrange(figure, [*views.panels(style), Panel(1.4 * CURVE)], style)

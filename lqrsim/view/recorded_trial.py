@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.annotations import Index, checked
+from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
 from lqrsim.scenes.mjcf_model import model_from_xml
@@ -153,14 +154,14 @@ def _recent_mean(forces: Array, dt: float) -> Array:
     return (total[window:] - total[:-window]) / window
 
 
-def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
+@checked
+def model_of(rollout: Rollout, trial: Index) -> mujoco.MjModel:
     """Compile the model that was run, with the obstacles where they were in the trial.
 
     Raises:
       InputError: there is no such trial, the robot has no place, or the model lacks a part that was recorded.
     """
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
+    if not 0 <= trial < rollout.trials:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
     if not rollout.plane:
         wanted = "the 2 or 3 states that are the position, or a run of a robot with balls that has frames"

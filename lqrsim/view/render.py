@@ -12,13 +12,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from html import escape
 from pathlib import Path
+from typing import Annotated
 
 import av
 import numpy as np
 from av.video.reformatter import Colorspace
 from PIL import Image
 
-from lqrsim.errors import InputError, check_name, check_number, check_path, check_progress, excerpt
+from lqrsim.annotations import Bounds, Progress, checked
+from lqrsim.errors import InputError, check_number, check_path, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
@@ -118,6 +120,7 @@ class PictureFile(type(Path())):  # a Path of this system: before Python 3.12 a 
         return f'<img alt="{escape(self.name)}" style="max-width:100%" src="{data}"/>'
 
 
+@checked
 def render(
     runs: Rollout | Sequence[Rollout],
     path: str | os.PathLike[str],
@@ -132,8 +135,8 @@ def render(
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
     fps: float | None = None,
-    speed: float = 1.0,
-    progress: Callable[[int, int], None] | None = None,
+    speed: Annotated[float, Bounds(at_least=1e-3, at_most=1000)] = 1.0,
+    progress: Progress | None = None,
 ) -> PictureFile:
     """Write a video of a run, or of several runs side by side: mp4 (h264) or GIF, by the suffix.
 
@@ -162,11 +165,9 @@ def render(
       The path. A notebook shows the video if the call is a cell's last expression.
     """
     path = _checked_path(path, ".mp4", ".gif")
-    check_progress(progress)
     animated = path.suffix.lower() == ".gif"
     fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)
-    speed = check_number("speed", speed, at_least=1e-3, at_most=1000)
     size = size if size is not None or not animated else _gif_size(quality)
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
@@ -254,8 +255,9 @@ def _frame_count(end: float, speed: float, rate: Fraction) -> int:
     return count
 
 
+@checked
 def _gif_size(quality: Quality) -> tuple[int, int]:
-    width, height = QUALITIES[check_name("quality", quality, QUALITIES)].size  # pyright: ignore[reportArgumentType]
+    width, height = QUALITIES[quality].size  # pyright: ignore[reportArgumentType]
     return max(width // 2, SMALLEST_GIF[0]), max(height // 2, SMALLEST_GIF[1])
 
 

@@ -26,7 +26,8 @@ from matplotlib.ticker import (
     StrMethodFormatter,
 )
 
-from lqrsim.errors import InputError, check_name, check_path, excerpt
+from lqrsim.annotations import checked
+from lqrsim.errors import InputError, check_path, excerpt
 from lqrsim.results.archive import replacing
 
 PLAN = "#222222"
@@ -72,6 +73,7 @@ GAP = 2.0  # pixels between the numbers of ticks at least
 
 
 @contextlib.contextmanager
+@checked
 def figure(
     *paths: str | os.PathLike[str], size: tuple[float, float] | None = None, style: Style = "screen"
 ) -> Iterator[Figure]:
@@ -88,7 +90,6 @@ def figure(
     for place in places:
         if place.suffix.lower() not in METADATA:
             raise InputError(f"path: got {excerpt(place.name)}, want a name that ends in one of: {', '.join(METADATA)}")
-    check_name("style", style, LOOKS)
     look = LOOKS[style]
     text = {"font.size": look.text, "axes.titlesize": look.text * STYLE["axes.titlesize"] / STYLE["font.size"]}
     with contextlib.ExitStack() as stack:

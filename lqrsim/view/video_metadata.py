@@ -10,8 +10,8 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
-from lqrsim.annotations import Line, Positive, checked
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, excerpt
+from lqrsim.annotations import Count, Line, Positive, checked
+from lqrsim.errors import Array, InputError, check_path, excerpt
 from lqrsim.results.archive import excerpt_of, sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import record_from, tree_of
@@ -57,11 +57,10 @@ class VideoMetadata:
     markers: tuple[Positive, ...]
     rate: Fraction
     speed: Positive
-    frames: int
+    frames: Count
     panes: tuple[Pane, ...]
 
     def __post_init__(self) -> None:
-        check_count("VideoMetadata: frames", self.frames)
         fits = self.rate > 0 and len(self.markers) == len(self.runs)
         if not (fits and all(pane.run < len(self.runs) for pane in self.panes)):
             raise InputError(f"VideoMetadata: got {excerpt(vars(self))}, whose parts do not fit together")
@@ -111,9 +110,9 @@ def read(path: str | os.PathLike[str]) -> VideoMetadata:
     return VideoMetadata.from_json(text)
 
 
+@checked
 def digest(rollout: Rollout) -> str:
     """Hash of a rollout, from its plan, states, controls, seed and first trial."""
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     parts: list[str | Array] = [f"{rollout.robot} {rollout.scene} {rollout.seed} {rollout.first_trial}"]
     for array in (rollout.plan.states, rollout.plan.controls, rollout.states, rollout.applied):
         parts += [f"{array.shape}", np.asarray(array, dtype=np.float64)]
