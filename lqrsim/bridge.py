@@ -22,12 +22,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
+from lqrsim.annotations import Bounds, checked
 from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import (
@@ -35,9 +36,7 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_count,
-    check_flag,
     check_kind,
-    check_number,
     excerpt,
     vectors_of,
 )
@@ -89,6 +88,7 @@ class Bridged:
         return "\n".join(lines)
 
 
+@checked
 def run(
     controller: Bridgeable,
     *,
@@ -97,10 +97,10 @@ def run(
     odometry: str | None = None,
     joints: str | None = None,
     names: Mapping[str, str] | None = None,
-    seconds: float | None = None,
+    seconds: Annotated[float, Bounds(above=0.0, at_most=1e9)] | None = None,
     lockstep: bool = False,
-    lost_after: float | None = None,
-    patience: float = 10.0,
+    lost_after: Annotated[float, Bounds(above=0.0, at_most=1e6)] | None = None,
+    patience: Annotated[float, Bounds(above=0.0, at_most=1e6)] = 10.0,
     domain: int | None = None,
 ) -> Bridged:
     """Control a robot by messages: in each control period of a monotonic clock, a command for the newest state.
@@ -136,12 +136,9 @@ def run(
     safe = check_array("safe", safe, (len(controls),))
     if (safe < controls.low).any() or (safe > controls.high).any():
         raise InputError(f"safe: got {excerpt(safe.tolist())}, want numbers from {controls.low} to {controls.high}")
-    lockstep, patience = check_flag("lockstep", lockstep), check_number("patience", patience, above=0.0, at_most=1e6)
-    longest = patience if lockstep else LATE * dt
-    if lost_after is not None:
-        longest = check_number("lost_after", lost_after, above=0.0, at_most=1e6)
+    longest = lost_after or (patience if lockstep else LATE * dt)
     if seconds is not None:
-        steps = math.ceil(check_number("seconds", seconds, above=0.0, at_most=1e9) / dt - 1e-9)
+        steps = math.ceil(seconds / dt - 1e-9)
     needed = law.policy.measured_coordinates.names if isinstance(law, OutputFeedback) else states.names
     node, commands = _Node(domain), _checked_topic(commands)
     inlet = _Inlet(node, _topics(odometry, joints), states, needed, names, reliable=lockstep)
@@ -210,6 +207,9 @@ class SimulatedRobot:
       InputError: as in `run`.
     """
 
+    _prefix = ""
+
+    @checked
     def __init__(
         self,
         plan: Plan | AffinePolicy,
@@ -218,12 +218,12 @@ class SimulatedRobot:
         odometry: str | None = None,
         joints: str | None = None,
         names: Mapping[str, str] | None = None,
-        patience: float = 10.0,
+        patience: Annotated[float, Bounds(above=0.0, at_most=1e6)] = 10.0,
         domain: int | None = None,
     ) -> None:
         policy = plan.policy if isinstance(plan, Plan) else check_kind("plan", plan, AffinePolicy, "a plan or a policy")
         self._controls = policy.control_coordinates
-        self._patience = check_number("patience", patience, above=0.0, at_most=1e6)
+        self._patience = patience
         self._names, node, topics = _renamed(policy.state_coordinates, names), _Node(domain), _topics(odometry, joints)
         self._turns_about = _turns_about(policy.state_coordinates, self._names)
         self._outlets = {kind: node.writer(topic, kind) for kind, topic in topics.items()}

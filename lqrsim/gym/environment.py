@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -10,13 +10,12 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from lqrsim.annotations import Count, OneOf, Seed, checked
 from lqrsim.control.controllers import ControllerLike, ControllerRun, as_controller
 from lqrsim.errors import (
     Array,
     InputError,
-    check_count,
     check_kind,
-    check_name,
     check_seed,
     excerpt,
     shaped,
@@ -60,11 +59,14 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
       task: the scenario and its plant. solution: the solution with the plan.
     """
 
+    _prefix = ""
+
     metadata: dict[str, Any] = {  # noqa: RUF012 - as in its base class
         "render_modes": list(RENDER_MODES),
         "render_fps": 30,
     }
 
+    @checked
     def __init__(
         self,
         scenario: str | Scenario,
@@ -73,22 +75,20 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         disturbances: Disturbances = (),
         strength: float = 1.0,
         actions: Actions = "normalized",
-        render_mode: str | None = None,
+        render_mode: Annotated[str, OneOf(RENDER_MODES)] | None = None,
         camera: str = "overview",
         size: tuple[int, int] = (640, 360),
     ) -> None:
         self.task = Task(scenario, solution, disturbances, strength, actions)
-        if render_mode is not None:
-            check_name("render_mode", render_mode, RENDER_MODES)
         self.render_mode = render_mode
         self._picture = LivePicture(camera, size)
         self.action_space, self.observation_space = self.task.action_space(), self.task.observation_space()
         fps = max(round(1 / self.task.scenario.problem.dt), 1)
         self.metadata = {**type(self).metadata, "render_fps": fps}
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+    @checked
+    def reset(self, *, seed: Seed | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin an episode; see the class. Raises InputError for an invalid seed or option."""
-        seed = None if seed is None else check_seed("seed", seed)
         super().reset(seed=seed)
         episode = self._begin(seed, self.np_random, options, 1, frames=True, threads=1)
         return episode.observations[0], self._info(episode)
@@ -175,13 +175,16 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
     The other arguments are the arguments of `Environment`.
     """
 
+    _prefix = ""
+
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 - as in its base class
 
+    @checked
     def __init__(
         self,
         scenario: str | Scenario,
         *,
-        num_envs: int = 1,
+        num_envs: Count = 1,
         solution: Solution | str | os.PathLike[str] | None = None,
         disturbances: Disturbances = (),
         strength: float = 1.0,
@@ -189,7 +192,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         threads: int | None = None,
         frames: bool = False,
     ) -> None:
-        self.num_envs = check_count("num_envs", num_envs)
+        self.num_envs = num_envs
         self.task = Task(scenario, solution, disturbances, strength, actions)
         self.single_action_space, self.single_observation_space = (
             self.task.action_space(), self.task.observation_space(),

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
 
+from lqrsim.annotations import checked
 from lqrsim.control.controllers import Controller, ControllerRun, turn_to_nearest
 from lqrsim.errors import (
     Array,
@@ -53,6 +54,9 @@ class Task:
       scenario, plant: robot and problem of the episodes. low, high: limits of the controls, (m,) each.
     """
 
+    _prefix = ""
+
+    @checked
     def __init__(
         self,
         scenario: str | Scenario,
@@ -65,7 +69,6 @@ class Task:
             kinds = "a Scenario, or a reference to one, such as 'quadrotor,query=3'"
             scenario = resolve(check_kind("scenario", scenario, str, kinds))
         self.scenario, self.plant = scenario, _plant_of(scenario)
-        check_name("actions", actions, ACTIONS)
         self._actions = actions
         self._given = None if solution is None else given(self.scenario, solution)
         for remark in [] if self._given is None else remarks(self.scenario, self._given):
