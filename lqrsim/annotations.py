@@ -24,7 +24,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -187,8 +187,12 @@ def declarations(kind: type) -> dict[str, Declared]:
 
 @cache
 def _of_fields(kind: type) -> dict[str, Declared]:
-    hints = get_type_hints(kind, include_extras=True)
-    return {field.name: declared(hints[field.name]) for field in fields(kind)}
+    """The declarations of fields alone: what else a class is annotated with may be imported for type checkers only."""
+    own = SimpleNamespace(__annotations__={field.name: field.type for field in fields(kind)})
+    names: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        names |= vars(sys.modules[base.__module__])
+    return {name: declared(hint) for name, hint in get_type_hints(own, names, include_extras=True).items()}
 
 
 @cache
@@ -402,9 +406,6 @@ def check_string(field: str, value: Any, longest: int | None = None) -> str:
     """`value` if it is text that a file can hold; with `longest`, one printable line of at most that many characters.
 
     Lines are printed as they are, and a terminal obeys control characters.
-
-    Raises:
-      InputError: it is no such text.
     """
     if not isinstance(value, str):
         raise InputError(f"{field}: got {excerpt(value)}, want text")

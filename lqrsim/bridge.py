@@ -129,7 +129,7 @@ def run(
       The record of the run.
 
     Raises:
-      InputError: an argument is not as described, the robot is not there, or cyclonedds is not installed.
+      InputError: the robot is not there, or cyclonedds is not installed.
     """
     law, dt, steps, nominal = _law_of(controller)
     states, controls = law.coordinates
@@ -191,20 +191,13 @@ class SimulatedRobot:
     It publishes the measured state of each control period and waits for a command. With a bridge in lockstep, the
     simulation runs as fast as both programs allow. With a bridge that runs by a clock, it runs as fast as the clock.
 
+    The other arguments are as in `run`.
+
     Args:
-      plan: a plan or a policy, for the names of the states and controls.
-      commands: as in `run`.
-      odometry: as in `run`.
-      joints: as in `run`.
-      names: as in `run`.
       patience: time in s to wait for the other program to appear, and for each command.
-      domain: as in `run`.
 
     Attributes:
       round_trips: times in s from publishing each state to the arrival of its command.
-
-    Raises:
-      InputError: as in `run`.
     """
 
     _prefix = ""

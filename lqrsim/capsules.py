@@ -87,9 +87,6 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
         Returns:
           `count` lists with the same number of coordinates.
-
-        Raises:
-          InputError: the arguments are not two points of the same size.
         """
         try:
             first, last = (list(itertools.islice(iter(one), 4)) for one in (start, end))

@@ -250,12 +250,7 @@ def check_flag(field: str, value: object) -> bool:
 
 
 def check_text(field: str, value: object, want: str = "text", *, at_most: int = 200, empty: bool = False) -> str:
-    """`value` if it is one printable line of text. Raises InputError otherwise.
-
-    Args:
-      at_most: largest number of characters.
-      empty: whether the text may be empty.
-    """
+    """`value` if it is one printable line of text. Raises InputError otherwise."""
     if not isinstance(value, str) or not (value or empty) or not value.isprintable():
         raise InputError(f"{field}: got {excerpt(value)}, want {want}: one printable line")
     if len(value) > at_most:

@@ -42,7 +42,6 @@ class Source:
       constants: (name, number or tuple of numbers), which replace the module's.
       fills: (name, source, name there) of functions that fill declarations of the module or its imports, or replace
         their functions.
-      what: name of the source in messages.
     """
 
     module: str = ""
@@ -119,9 +118,6 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
     Args:
       field: its name in messages. source: text or Source. functions: name -> number of arguments, for each function
         that it must define.
-
-    Raises:
-      InputError: the source is neither, or does not define the functions.
     """
     if isinstance(source, Source):
         return source

@@ -53,10 +53,7 @@ class SafePlan:
 
     Attributes:
       problem: the problem, with the clearances that were found as constraints; or with heavier obstacles.
-      solution: the solution of that problem.
-      controller: the controller that follows the plan, an OffsetFree or a policy.
       tube: the prediction of its runs; `tube.collision_chance` is the chance.
-      asked: the requested chance.
       rounds: for each plan that was solved for: smallest and largest margin in m, cost, and predicted chance.
       weight: factor of the weight of the problem's obstacles, usually 1. `solution.cost` has it, `cost` does not.
       instead: if the plan is not safe enough, the predicted chances on the same plan with actuators without lag, with
@@ -130,7 +127,6 @@ def smooth_chance_constrained(
       chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> the controller that runs the plan, an OffsetFree or an AffinePolicy. By default
         an OffsetFree for the uncertainty, with tolerances chosen for each plan.
-      rounds: the largest number of plans with clearances.
       progress: called with the number of plans that are done, the largest possible number of plans, and a text about
         the last one. The largest number counts plans with margins and plans with heavier obstacles.
 

@@ -152,7 +152,6 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
 
     Args:
       given: the controller; None for the policy of the plan.
-      plan: the plan; None for the controller's own.
       dynamics: dynamics of the robot that the controller runs on.
     """
     wanted = "a Plan, such as smooth(problem), which may be followed by another policy: controller=policy"

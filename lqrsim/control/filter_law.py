@@ -26,9 +26,6 @@ class Design:
     """A filter with the law that follows it, or with C laws.
 
     Attributes:
-      model: the model that the filter assumes.
-      filter: its gains and covariances.
-      weights: of deviations from the plan.
       laws: gain and offset of the law, as of `tracking_laws`.
     """
 
@@ -53,10 +50,7 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      plan: the plan that the law follows, as solved.
       model: the linear model about the plan, which the filter assumes.
-      filter: its gains and covariances.
-      weights: weights of deviations from the plan.
       gain: (T, m, Z). offset: (T, m).
       nominal: z in an undisturbed run, (T+1, Z).
     """
@@ -100,12 +94,9 @@ class FilterRun(ControllerRun):
     commands since, to the time at which the next command acts.
 
     Args:
-      law: the law at the beginning.
-      trials: K, the number of trials.
       records: arrays for `estimates` and `innovations`, to be filled; None to record nothing.
 
     Attributes:
-      law: the law in force.
       first: the step at which the law's plan begins.
       z: the current estimates, (K, Z), at the knot of the newest measurement.
       estimates: the recorded estimates, (T+1, K, Z), or None; see `OffsetFree`.

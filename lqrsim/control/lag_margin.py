@@ -49,7 +49,6 @@ def with_margin(
 
     Args:
       stated: model of the true system, with a lag.
-      design: of one law.
       tried: makes the weights of C laws that may be chosen.
       assumed: model for a filter that is told of this share of the lag, with this much doubt.
     """

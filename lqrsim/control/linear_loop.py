@@ -78,7 +78,6 @@ class LinearLoop:
     """A closed loop about a plan.
 
     Attributes:
-      model: model of the true system.
       gain, offset: of a law, (T, m, Z or n) and (T, m), in deviations from the plan; or of C laws, (C, T, m, Z or n).
       filter_gain: of a Kalman filter, (T+1, Z, Y); None for a law of the measured states.
       low, high: limits of the controls, (m,).

@@ -61,14 +61,12 @@ class OffsetFree(Controller):
     plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
     `lag_margin.py`. `model.uncertainty` is the uncertainty that the filter assumes.
 
+    The other arguments are as in `track`.
+
     Args:
-      problem: the problem that was solved.
       solution: its solution, or another solution with a plan of the same system.
       uncertainty: uncertainty of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean,
         and constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
-      tolerate: as in `track`.
-      effort: as in `track`.
-      at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u; or sensors of the MJCF, `plant.sensors(...)`, each
         with its own noise, bias, rate, delay and loss: see `sensor_filter.py`. With these the uncertainty says nothing
@@ -157,12 +155,7 @@ class OffsetFree(Controller):
         return f"OffsetFree({plan.steps} steps of {plan.dt:g} s, {self.model.n} states and {unknowns} unknowns)"
 
     def _redesigned(self, solution: Solution, uncertainty: Uncertainty) -> "OffsetFree":
-        """The same kind of law, with its sensors, tolerances and memory, for another uncertainty or solution.
-
-        Args:
-          solution: a solution of the same problem.
-          uncertainty: uncertainty of the run.
-        """
+        """The same kind of law, with its sensors, tolerances and memory, for another uncertainty or solution."""
         return OffsetFree(self.problem, solution, uncertainty, **self._stated)
 
     def _sensor_filter(self, sensors: RobotSensors, replan_every: float | None) -> SensorFilter:

@@ -151,7 +151,6 @@ class PlanModel:
     """A plan and its uncertainty, linearised.
 
     Attributes:
-      dynamics: the dynamics with the disturbances as parameters.
       plan: nominal states (T+1, n) and controls (T, m).
       uncertainty: the uncertainty in a run. sensor: the measured quantities.
     """

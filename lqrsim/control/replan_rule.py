@@ -35,7 +35,6 @@ class ActivePlan:
     """A plan that is in force, or will be.
 
     Attributes:
-      plan: the plan, with its law.
       first: the control period at which it begins.
     """
 
@@ -44,9 +43,6 @@ class ActivePlan:
 
     def row(self, step: int) -> int:
         """The index of the plan's law at a step; after the horizon, the index of the last law.
-
-        Args:
-          step: number of the control period.
 
         Returns:
           The index of a row of the gains.
@@ -78,9 +74,7 @@ class ReplanRecord:
       step: control period in which the solve began.
       trial: number of a simulation, else 0.
       status: how the solve ended.
-      iterations: number of iterations.
       seconds: duration of the solve.
-      cost: cost of the new plan.
       before: cost of continuing with the law in force.
       used: whether the new plan came into force.
       reason: why the plan was not used, or the status with which it was used without having converged; empty if all
@@ -117,7 +111,6 @@ class ReplanLog:
         Args:
           step: control period in which the solve began.
           trial: number of a simulation, else 0.
-          replan: the answer of the solve.
           late: whether the answer came after the deadline.
 
         Returns:

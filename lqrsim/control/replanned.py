@@ -34,8 +34,6 @@ class ReplannedRun(ControllerRun):
 
     Args:
       rule: the periods in which to check whether a solve is needed.
-      law: the law at the beginning.
-      trials: K, the number of trials.
       records: as for `FilterRun`, of all trials.
       always: whether to solve at each of these times, wherever the law leads.
 

@@ -52,10 +52,10 @@ class LiveReplanner:
     period in which one is due. Its answer comes into force at the deadline. An answer that is not ready then is not
     used, and the previous law continues. Everything is compiled before the first step.
 
+    The other arguments are as in `Replanner.live`.
+
     Args:
       rule: the rule that determines the problem, time and start of each solve.
-      interpolate: as in `Replanner.live`.
-      clock: as in `Replanner.live`.
 
     Attributes:
       problem: the problem that is solved from now on.
@@ -212,8 +212,6 @@ class Replanner(Controller):
     `controller_run` has a `log` of the solves, like a `LiveReplanner`, and the plans in force, `active`.
 
     Args:
-      problem: the problem that was solved.
-      solution: its solution, or another plan for it.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
         default one control period, or `computing` if that is a number and longer.

@@ -278,7 +278,6 @@ def track(
     controller=track(...))`; it is saved and drawn like any other policy.
 
     Args:
-      problem: the problem that was solved.
       solution: its solution, or another solution with a plan of the same system.
       tolerate: the tolerated deviation of each state, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s":
         0.2}. Only the ratios to one another and to `effort` matter. By default, the tolerances with which the robot is

@@ -41,7 +41,6 @@ class Tube:
 
     Attributes:
       plan: nominal states and controls.
-      state_coordinates: names and units of the states.
       mean: mean of the deviation of the state, (T+1, n).
       covariance: covariance of that deviation, (T+1, n, n).
       across: covariance of the deviation with the deviation at the previous knot, (T, n, n).
@@ -54,7 +53,6 @@ class Tube:
       linear_chance: chance of colliding at all, by these moments.
       collision_chance: chance of colliding at all, by moments and sampled trials: the fraction of trials that collide,
         if it refutes the moments' chance, else both combined.
-      samples: number of sampled trials.
       strays: fraction of the trials that get farther from the plan than six of the position's largest standard
         deviations; without a position, of the states of the goal, each divided by its range over the plan. The moments
         do not describe them. None without trials.
@@ -88,9 +86,6 @@ class Tube:
     def added_to(self, rollout: Rollout) -> Rollout:
         """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
 
-        Args:
-          rollout: rollout of the same plan.
-
         Returns:
           The rollout with its `tube` and `collision_chance`.
         """
@@ -114,7 +109,6 @@ def predict_tube(
 
     Args:
       problem: the problem that was solved, with the obstacles in its costs and constraints.
-      solution: the solution whose plan is run.
       uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are computed from the
         samples that stay finite.
       controller: an OffsetFree of this solution or an AffinePolicy; by default the solution's policy. It may have been
@@ -122,7 +116,6 @@ def predict_tube(
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
         written in plain Python, and with distances by MuJoCo.
-      seed: seed of these trials.
 
     Returns:
       The Tube.

@@ -141,11 +141,7 @@ class Uncertainty:
                 keep(self, **{name: tuple(given.tolist())})
 
     def check(self, dynamics: Dynamics) -> None:
-        """Check that the uncertainty fits a system.
-
-        Args:
-          dynamics: dynamics of the system.
-        """
+        """Check that the uncertainty fits a system."""
         states, controls = dynamics.state_coordinates, dynamics.control_coordinates
         for name in SUMMED:
             per_entry(f"Uncertainty: {name}", getattr(self, name), controls if name == "control" else states)

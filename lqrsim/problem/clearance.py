@@ -30,7 +30,6 @@ class Clearance(KeepsClear, Constraint):
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
       radius: radius of the robot in metres, as for an ObstacleCost. Give exactly one of `radius`, `balls` and `geoms`.
-      balls: the robot's balls, as for an ObstacleCost.
       geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
         obstacle.
       margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).

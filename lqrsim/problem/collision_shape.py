@@ -199,11 +199,7 @@ class ShapeInWorld:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GeomsInWorld(ShapeInWorld):
-    """Geoms among obstacles.
-
-    Attributes:
-      geoms: the geoms, which compute their distances.
-    """
+    """Geoms among obstacles."""
 
     geoms: CollisionGeoms
 
@@ -259,11 +255,7 @@ def shape_in(
     dynamics: Dynamics, world: World, *, radius: float = 0.0, balls: CollisionSpheres | None = None,
     geoms: CollisionGeoms | None = None,
 ) -> ShapeInWorld:  # fmt: skip
-    """The shape of a robot among obstacles. A ball at the position of a robot without a position is among no obstacles.
-
-    Raises:
-      InputError: it does not fit the dynamics.
-    """
+    """The shape of a robot among obstacles. A robot without a position is among none by its radius."""
     space = dynamics.state_coordinates
     if geoms is not None:
         return GeomsInWorld(dynamics, world, np.array([geoms.size]), geoms=geoms)

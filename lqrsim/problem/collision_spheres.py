@@ -63,12 +63,7 @@ class SphereCenters(Term):
         return {"places": 3, "places_jacobian": 4}
 
     def world_seen(self, world: World, space: Coordinates) -> World:
-        """The obstacles in the coordinates of the places.
-
-        Args:
-          world: the obstacles.
-          space: the coordinates of the states.
-        """
+        """The obstacles in the coordinates of the places."""
         return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
 
     def filling(self, kernel: Source) -> Source:
@@ -175,9 +170,6 @@ class CollisionSpheres:
 
         Args:
           dynamics: dynamics of the system whose states move the balls.
-
-        Raises:
-          InputError: the places do not fit the system.
         """
         if self.level != "symbolic":
             return self._bind_functions(dynamics)

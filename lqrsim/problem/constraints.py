@@ -127,33 +127,15 @@ class Constraint(ProblemPart[ConstraintTerm]):
     _rough: float = 0.0
 
     def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
-        """The final values that it requires of states, by their indices.
-
-        Args:
-          dynamics: dynamics of the system.
-
-        Raises:
-          InputError: it does not fit the system.
-        """
+        """The final values that it requires of states, by their indices."""
         return {}
 
     def _turning_states(self, dynamics: Dynamics) -> Set[int]:
-        """The indices of the states whose final value it requires only up to whole turns.
-
-        Args:
-          dynamics: dynamics of the system.
-        """
+        """The indices of the states whose final value it requires only up to whole turns."""
         return frozenset()
 
     def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
-        """The low and the high bound, each a number or (K,) for K knots, of each state that it bounds, by its index.
-
-        Args:
-          dynamics: dynamics of the system.
-
-        Raises:
-          InputError: it does not fit the system.
-        """
+        """The low and the high bound, each a number or (K,) for K knots, of each state that it bounds, by its index."""
         return {}
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "Constraint | None":
@@ -182,11 +164,7 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
 
 
 def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array) -> tuple[ConstraintTerm, ...]:
-    """The constraints for a system and the times (T+1,) in s of the knots.
-
-    Raises:
-      InputError: the constraints do not fit the system, or each other.
-    """
+    """The constraints for a system and the times (T+1,) in s of the knots."""
     goals, terms = goals_of(constraints, dynamics), []
     _check_bounds([one.state_bounds(dynamics) for one in constraints], dynamics, len(times))
     for constraint in constraints:

@@ -96,14 +96,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> _BoundTerm:
-        """Bind the term to a system.
-
-        Args:
-          dynamics: dynamics of the system.
-
-        Raises:
-          InputError: it does not fit the system.
-        """
+        """Bind the term to a system."""
 
     @property
     def by_knot(self) -> bool:
@@ -140,7 +133,6 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """The same for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
 
         Args:
-          steps: number of steps that are over.
           horizon: "shrinking" for the rest of the plan, without the first rows; or "moving" for a plan of the same
             length, which repeats the last row.
         """

@@ -146,17 +146,12 @@ def check_derivatives(
 
     Args:
       subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
-      samples: number of points.
       spread: their standard deviation, in the units of states and controls.
       tolerance: tolerance of the error, relative to each entry.
-      seed: seed of the points.
 
     Returns:
       One check per matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the
       verdict.
-
-    Raises:
-      InputError: a function fails, or an argument is not as described.
     """
     dynamics = subject.dynamics if isinstance(subject, Problem) else subject
     if not isinstance(dynamics, Dynamics):

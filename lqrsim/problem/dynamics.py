@@ -211,9 +211,6 @@ class Dynamics:
 
         Args:
           **values: parameter -> number.
-
-        Raises:
-          InputError: there is no such parameter, or the value is not finite.
         """
         for name in values:
             check_name("parameters", name, self.parameters)
@@ -498,9 +495,6 @@ class Dynamics:
 
         Args:
           dt: seconds.
-
-        Raises:
-          InputError: it cannot.
         """
         if self.period is not None and abs(dt - self.period) > 1e-9 * self.period:  # rounding, as of 1 / 30
             raise InputError(f"dt: got {dt:g} s, want {self.period:g} s, the period of the map {self.name}")

@@ -30,9 +30,6 @@ class Stage:
       q: (..., n).
       r: (..., m).
       constant: (...).
-
-    Raises:
-      InputError: shapes that do not fit together, numbers that are not finite, Q or R not symmetric.
     """
 
     A: npt.ArrayLike
@@ -86,11 +83,7 @@ class Stage:
 
 
 def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]:
-    """Hessian (n, n), gradient (n,) and constant of an initial or final cost.
-
-    Raises:
-      InputError: the cost is no Quadratic of n states, or its Hessian is not symmetric.
-    """
+    """Hessian (n, n), gradient (n,) and constant of an initial or final cost."""
     if not isinstance(cost, Quadratic):
         raise InputError(f"{field}: got {excerpt(cost)}, want a Quadratic")
     hessian = check_symmetric(f"{field}: hessian", check_array(f"{field}: hessian", cost.hessian, (n, n)))

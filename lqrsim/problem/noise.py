@@ -139,9 +139,6 @@ class Noise:
 
         Args:
           strength: the number, at least 0; strengths of several calls multiply.
-
-        Raises:
-          InputError: the strength is negative or not finite.
         """
         other = copy.copy(self)
         other.strength = self.strength * check_number("Noise: strength", strength, at_least=0.0)
@@ -152,9 +149,6 @@ class Noise:
 
         Args:
           **values: name of a parameter -> its value.
-
-        Raises:
-          InputError: there is no such parameter, or the value is not finite.
         """
         for name in values:
             check_name("parameters", name, self.parameters)
@@ -168,9 +162,6 @@ class Noise:
 
         Args:
           dynamics: dynamics of the system, with its states and controls.
-
-        Raises:
-          InputError: the noise does not fit the system.
         """
         n = len(dynamics.state_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
@@ -248,9 +239,6 @@ class Noise:
           dynamics: dynamics of the system, with its states and controls.
           states: (K, n).
           controls: (K, m).
-
-        Raises:
-          InputError: the noise, the states or the controls do not fit the system.
         """
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = check_array("states", states, (None, n), infinite=True)

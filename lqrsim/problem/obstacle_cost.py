@@ -30,7 +30,6 @@ class ObstacleCost(KeepsClear, Cost):
     the balls and mapped to the states by the Jacobian of the centres. Second derivatives of the centres are left out.
 
     Args:
-      world: the obstacles.
       radius: radius of the robot at its position, in metres.
       balls: the robot's balls, in place of `radius`, as `robot.balls`. The attribute `radius` is then the largest one.
       geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances. The sum is then

@@ -64,9 +64,6 @@ class FixedState:
 
     Attributes:
       state: the numbers; they may be by name until a Problem has the state.
-
-    Raises:
-      InputError: not finite numbers (n,), none at all, or a state that is named twice.
     """
 
     state: PerEntry
@@ -231,13 +228,8 @@ class Problem(OneVersion):
 
         Args:
           state: (n,).
-          after: number of steps that are over.
           previous: (m,) the last command, from which a `control_rate` counts; by default the problem's own, and after
             some steps none.
-
-        Raises:
-          InputError: the state is not (n,) finite numbers, no step is left, or there is a last command without a
-            `control_rate`.
         """
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
@@ -270,9 +262,6 @@ class Problem(OneVersion):
         Args:
           stage_cost: the stage cost, or None for the present one.
           final_cost: the final cost, or None for the present one.
-
-        Raises:
-          InputError: a cost does not belong to the system.
         """
         given = {"stage_cost": stage_cost, "final_cost": final_cost}
         costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
@@ -288,14 +277,7 @@ class Problem(OneVersion):
 
     @checked
     def with_constraints(self, constraints: Constraints) -> "Problem":
-        """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`.
-
-        Args:
-          constraints: the constraints, in the place of the present ones.
-
-        Raises:
-          InputError: the constraints do not fit the system, or each other.
-        """
+        """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`."""
         return self._with(constraints=constraints, _constraint_terms=bind_all(constraints, self.dynamics, self.times))
 
     @checked
@@ -305,9 +287,6 @@ class Problem(OneVersion):
 
         Args:
           seconds: the delay in seconds; with such costs or constraints, a multiple of dt.
-
-        Raises:
-          InputError: the delay is no such number.
         """
         other = self._with(begin=self.begin + seconds)
         if any(one.by_knot for one in (*terms_of(self.stage_cost), *self.constraints)):
@@ -322,9 +301,6 @@ class Problem(OneVersion):
     @checked
     def settled(self, plan: Solution) -> "Problem":
         """The problem with the duration of a plan: of fixed steps, and with its segments where they are in the plan.
-
-        Args:
-          plan: a solution of the problem.
 
         Raises:
           InputError: the plan has another number of steps, or is not of this problem's segments.
@@ -632,9 +608,6 @@ class Problem(OneVersion):
           its `name` or that of its function, with "[0]" for the first of several entries. Only a lambda without a name
           is called by its expressions, which may have numbers. If an earlier constraint has the same name, " (2)"
           follows, and so on.
-
-        Raises:
-          InputError: the runs have other states, controls or steps.
         """
         sizes = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates), self.steps
         own = rollout.states.shape[2], rollout.applied.shape[2], rollout.plan.steps

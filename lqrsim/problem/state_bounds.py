@@ -28,9 +28,6 @@ class GoalState(Constraint):
       count_turns: whether a goal of 2 pi is another than 0. By default, the states that the dynamics declare as angles
         reach their goals up to whole turns, and a search may take any. A QuadraticCost about a goal counts them.
       **named: name of a state -> number, in place of a dictionary.
-
-    Raises:
-      InputError: no goal, a number that is not finite, or a state that is named twice.
     """
 
     @checked
@@ -93,9 +90,6 @@ class StateBounds(Constraint):
       bounds: a dictionary of name or unit of a state: (low, high), in its unit, each a number or (T+1,) numbers. An
         infinite number means no bound. A name takes precedence over a unit.
       **named: name of a state -> (low, high), in place of a dictionary.
-
-    Raises:
-      InputError: no bounds, no finite bound for a state, low not below high, or a state that is named twice.
     """
 
     def __init__(self, bounds: Mapping[str, Bounds] | None = None, /, **named: Bounds) -> None:

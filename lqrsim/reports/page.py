@@ -56,7 +56,6 @@ def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.Path
 
     Args:
       curves: policy -> strength -> low, middle and high.
-      label: of the vertical axis.
     """
     with _over_strength(curves, path, label) as axes:
         disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
@@ -175,10 +174,8 @@ def report(
     """Write a campaign as one self-contained HTML page; returns its path.
 
     Args:
-      results: the campaign.
       out: FILE.html.
       videos: number of the worst trials to repeat and render. Without OpenGL the page has no videos, and says so.
-      progress: called with the number of finished parts and the number of all parts.
 
     Returns:
       The path of the page.

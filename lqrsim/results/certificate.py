@@ -15,25 +15,16 @@ class FailureCertificate:
     """The probability that a policy fails, as measured by multilevel splitting, and a description of the measurement.
 
     Attributes:
-      solution: the solution with the plan.
       scenario: reference to the scenario, as in `ReliabilityProblem`.
-      sweep: name of the set of disturbances.
       strength: factor by which they are scaled.
-      policy: name of the policy.
-      design_disturbances: name of the set for which it is designed, or None.
-      failure: the event that counts as a failure.
       goal_radius: as in `ReliabilityProblem`.
       goal_tolerance: as in `ReliabilityProblem`.
-      disturbances: a description of each disturbance.
       model: hash of the simulated MJCF.
       policy_digest: hash of everything that the controls depend on.
-      probability: the estimate.
       low: lower end of the interval.
       high: upper end of the interval.
-      confidence: confidence level of the interval.
       repetitions: the estimate of each repetition, (R,).
       particles: number of trials at each level.
-      seed: seed of all random numbers.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       keep: fraction of the trials that exceeds the next level; 0 if failures were counted.
     """

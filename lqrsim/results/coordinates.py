@@ -47,7 +47,6 @@ class Coordinates:
     """The meaning of the entries of a vector.
 
     Attributes:
-      names: names of the entries.
       units: units of the entries; "" for none. A position is in m, angles and rotation vectors in rad.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
@@ -209,9 +208,6 @@ class Coordinates:
 
         Args:
           points: (..., 3), in metres.
-
-        Raises:
-          InputError: the points are not numbers of this shape.
         """
         return vectors_of("points", points, 3)[..., list(self.world_axes)]
 
@@ -226,9 +222,6 @@ class Coordinates:
         Args:
           vector: (..., n).
           near: (..., n); leading dimensions broadcast.
-
-        Raises:
-          InputError: the arguments are not numbers of these shapes.
         """
         out, near = vectors_of("vector", vector, len(self)), vectors_of("near", near, len(self))
         try:
@@ -258,7 +251,6 @@ class Coordinates:
         """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit.
 
         Args:
-          field: of the message.
           given: name of an entry, or a unit -> the value for it, or for all entries in this unit.
           check: a function of a field and a value, which returns the value, or raises.
 
@@ -277,7 +269,6 @@ class Coordinates:
         """Numbers by name or by unit as an array (n,), with 0 for entries without a number.
 
         Args:
-          field: of the message.
           given: number by name or unit of an entry.
 
         Returns:
@@ -289,11 +280,7 @@ class Coordinates:
         return out
 
     def _ranges(self, field: str, limits: Limits) -> tuple[Array, Array]:
-        """The lowest and the highest value of each entry, (n,) each, as `limited` takes them; `field` of the message.
-
-        Raises:
-          InputError: a limit is not a number, or there is no such name.
-        """
+        """The lowest and the highest value of each entry, (n,) each, as `limited` takes them."""
         if isinstance(limits, Mapping):
             low, high = np.array(self.low), np.array(self.high)
             for i, pair in self._by_name(field, limits, _pair).items():
@@ -312,9 +299,6 @@ class Coordinates:
         Args:
           limits: (lowest, highest), each a number or (n,); or a dictionary of name or unit: (lowest, highest). Entries
             that are not named keep their limits.
-
-        Raises:
-          InputError: a limit is not a number, the lower is not below the upper, or there is no such name.
         """
         low, high = self._ranges("control_limits", limits)
         for name, lowest, highest in zip(self.names, low, high, strict=True):
@@ -370,9 +354,6 @@ def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose
     Args:
       field: field in messages. what: description of the given object, such as "a policy". got, want: its coordinates,
         and the required ones. whose: name of the owner of the required coordinates.
-
-    Raises:
-      InputError: names differ.
     """
     for kind, one, other in zip(("states", "controls"), got, want, strict=True):
         if one.names != other.names:

@@ -49,12 +49,10 @@ class ExportedC:
     """The result of `export_c`.
 
     Attributes:
-      files: paths of the files.
       sha256: hash of the policy's content, as in its file; it is also in the header.
       table_bytes: size of the constant tables.
       rounding: (m,), the largest change of each control by rounding the gains, in the control's unit, if every state,
         including the filter's, is off its nominal value by one unit.
-      controls: names and units of the controls.
     """
 
     files: tuple[Path, ...]

@@ -42,8 +42,6 @@ class Funnel:
 
     Attributes:
       plan: nominal states and controls.
-      state_coordinates: names and units of the states.
-      control_coordinates: names and units of the controls.
       states: names of the d states that may be off the plan.
       shape: (T+1, d, d), the ellipsoids of level 1, in the units of these states.
       family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
@@ -56,15 +54,8 @@ class Funnel:
       rate: required fraction of runs that succeed.
       confidence: required confidence that all levels are right.
       simulated: total number of trials that were run.
-      policy_digest: hash of the controller.
       goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
-      disturbances: a description of each disturbance.
-      seed: seed of all random numbers.
-      options: the settings of the search.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
-
-    Raises:
-      InputError: the parts do not fit together, or the trials do not show the rate.
     """
 
     _want = "a Funnel, such as funnel(...) returns"
@@ -137,9 +128,6 @@ class Funnel:
 
         Args:
           t: seconds since the start of the plan.
-
-        Raises:
-          InputError: `t` is negative or not finite.
         """
         return float(np.interp(self._knot(t), self.knots, self.levels))
 
@@ -153,9 +141,6 @@ class Funnel:
           x: (..., n).
           t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
-
-        Raises:
-          InputError: states of another size; `t` is negative or not finite.
         """
         knot, size = self._knot(t), len(self.state_coordinates)
         given = vectors_of("x", x, size)
@@ -175,9 +160,6 @@ class Funnel:
           x: (..., n).
           t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
-
-        Raises:
-          InputError: as `deviation`.
         """
         level = self.level(t)
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
@@ -188,9 +170,6 @@ class Funnel:
 
         Args:
           rollout: K trials of the funnel's plan.
-
-        Raises:
-          InputError: the rollout has another plan.
         """
         if not np.array_equal(rollout.plan.states, self.plan.states):
             raise InputError("rollout: got a run of another plan, want a run of the funnel's plan")
@@ -202,9 +181,7 @@ class Funnel:
         """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot.
 
         Args:
-          knot: number of the knot.
           points: (..., d).
-          level: level of the ellipsoid.
 
         Returns:
           The states (..., n).

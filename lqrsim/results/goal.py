@@ -88,16 +88,12 @@ class Target:
     """The goal of a run, or the end of its plan if the final cost names no goal.
 
     Args:
-      space: space of the states.
       goal: (n,), NaN in the states that do not count; None without a goal.
       plan: (T+1, n), the planned states.
 
     Attributes:
       state: (n,), the goal or the end of the plan; NaN in the states that do not count.
       name: "goal" or "plan's end".
-
-    Raises:
-      InputError: the goal has another shape, or is NaN in all states.
     """
 
     space: Coordinates
@@ -187,9 +183,6 @@ class Target:
             `on_the_way`.
           goal_radius: radius in metres.
           goal_tolerance: bound of the scaled error, by default TOLERANCE; see `on_the_way`.
-
-        Raises:
-          InputError: a radius or tolerance is out of range, or is not in the unit of this target.
         """
         if self.places:
             if goal_tolerance is not None:

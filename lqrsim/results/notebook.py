@@ -68,7 +68,6 @@ def of_table(
     """A heading, remarks, and a table next to a picture.
 
     Args:
-      rows: rows of the table.
       head: whether the first row names the columns; otherwise the first column names the rows.
     """
     lines = "".join(f"<div>{escape(remark)}</div>" for remark in remarks)

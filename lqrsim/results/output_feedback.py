@@ -45,9 +45,6 @@ class OutputFeedbackPolicy:
       state_coordinates: names and units of the states, and which of them wrap.
       control_coordinates: names, units and limits of the controls.
       measured_coordinates: names and units of the measured numbers, and which of them wrap.
-
-    Raises:
-      InputError: the arrays do not fit together, or a number is not finite.
     """
 
     gain: Annotated[Array, "T m Z", Bounds()]
@@ -101,9 +98,6 @@ class OutputFeedbackPolicy:
           z: (..., Z), from `start` or the previous call; it is not changed.
           measurement: (..., Y), angles in any representative; None if it was lost: z is then only predicted.
           t: seconds since the start.
-
-        Raises:
-          InputError: `t` is negative or not finite, or an array is not finite or has another length.
         """
         z, t = vectors_of("z", z, self.nominal.shape[1]), check_number("t", t, at_least=0.0)
         k, n = int(min(t / self.dt + 1e-9, self.steps - 1)), len(self.state_coordinates)

@@ -25,7 +25,6 @@ class Plan:
     Attributes:
       status: how the solve ended; see `Status`.
       detail: where and why it failed; for solutions also remarks.
-      policy: the feedback law.
       trajectory: the plan: the rollout of the policy by the model from its first state.
       cost_to_go: the value function of the law, a `Quadratic`; None if it is unknown, and for re-plans with
         constraints, which do not need it.
@@ -81,9 +80,6 @@ class Plan:
         Args:
           steps: steps that are over, fewer than the plan has.
           horizon: "moving" or "shrinking".
-
-        Raises:
-          InputError: `steps` is not a whole number from 0 to the last step, or `horizon` is neither of the two.
         """
         if steps >= self.trajectory.steps:
             raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the plan")
@@ -122,7 +118,6 @@ class Replan(Plan):
       cost: cost of the plan, start and end included.
       before: cost of the rollout of the law that the solve began with.
       violation: violation of the worst constraint at the steps; 0 if all are kept.
-      iterations: number of iterations.
       seconds: time that the solve took.
       iterating: the part of `seconds` spent in iterations and in the first rollout.
     """

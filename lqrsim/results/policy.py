@@ -63,7 +63,6 @@ class AffinePolicy:
         """The rest of the policy after `steps` steps; see `Solution.shifted`.
 
         Args:
-          steps: steps that are over.
           horizon: "moving" or "shrinking", as in `Solution.shifted`.
         """
         steps = check_count("steps", steps, at_least=0, at_most=self.steps - 1)
@@ -77,9 +76,6 @@ class AffinePolicy:
         Args:
           state: (..., n), in the nominal's representative.
           step: number of the step, from 0.
-
-        Raises:
-          InputError: there is no such step, or the states have another shape.
         """
         step = check_count("step", step, at_least=0, at_most=self.steps - 1)
         return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
@@ -95,9 +91,6 @@ class AffinePolicy:
           state: (..., n), measured; angles and rotation vectors in any representative.
           t: seconds since the start, 0 or more.
           interpolate: whether to blend the laws of two knots.
-
-        Raises:
-          InputError: `t` is negative or not finite, or the state is not finite or not of length n.
         """
         state, t = vectors_of("state", state, self.gain.shape[-1]), check_number("t", t, at_least=0.0)
         if not np.isfinite(state).all():

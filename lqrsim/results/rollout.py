@@ -69,7 +69,6 @@ class MovingObstacles:
     O obstacles, with axes and sizes as in an `Obstacle`.
 
     Attributes:
-      names: names of the obstacles.
       kinds: their kinds, such as "sphere".
       positions: (O, 3) at the beginning of the run, in metres.
       rotations: (O, 3, 3) with their axes as columns.
@@ -104,14 +103,9 @@ class Rollout:
     equal processors.
 
     Attributes:
-      robot: name of the robot.
-      body: name of the robot's body in the MJCF.
-      scene: name of the scene.
       model: the MJCF that was run, as text.
       plan: the nominal states and controls.
-      policy_digest: hash of the controller.
       state_coordinates: names and units of the states, and which of them wrap.
-      control_coordinates: names and units of the controls, and their limits.
       goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan. If a
         `Replanner` had a goal that moved, the last one.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: in metres, or a scaled
@@ -138,7 +132,6 @@ class Rollout:
       frame_times: (F,) seconds.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each disturbance, and whether the goal moved.
-      seed: seed of the random numbers.
       first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
@@ -271,9 +264,6 @@ class Rollout:
     @checked
     def places(self, trial: Index) -> Array:
         """Places of the robot in a trial: its position, or the position of its last ball.
-
-        Args:
-          trial: row of the rollout.
 
         Returns:
           (T+1, 2 or 3), in metres.

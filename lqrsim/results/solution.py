@@ -34,7 +34,6 @@ class Solution(Plan):
         if the problem has no obstacles.
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
       gap: gap of the plan; see `Iteration.gap`. NaN if it is not defined.
-      solver: name of the function that was called.
       options: the settings of the solver; with noise, also a description of the noise, and the risk.
       problem_digest: hash of everything that defines the problem.
       problem_parts: what the problem asks for, by part, as `print(problem)` says it; empty in older files.

@@ -240,7 +240,6 @@ class ContactCertificate:
         cost more; minus infinity if there are no switches, or none can be crossed on its own.
       sampled: cost that the cheapest of the sampled plans saves; negative if all cost more.
       radius: largest change of a control in these plans, as a fraction of its range.
-      samples: number of sampled plans.
     """
 
     pressed: int
@@ -315,11 +314,8 @@ class Candidate:
     """One of several starts that a search tried; or a plan for softer contacts, from which the next plan begins.
 
     Attributes:
-      start: name of the start.
       cost: cost of its last plan; infinite if a pass failed, or if the plan was only to meet the constraints.
-      iterations: number of iterations.
       status: status at its end; None if it was dropped after a few iterations.
-      trajectory: its last plan.
     """
 
     start: Line

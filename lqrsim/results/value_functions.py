@@ -55,9 +55,6 @@ class Quadratic:
 
         Args:
           states: (T+1, n).
-
-        Raises:
-          InputError: the states have another shape.
         """
         x = vectors_of("states", states, self.gradient.shape[-1])
         try:

@@ -31,8 +31,5 @@ def get(name: str) -> Robot:
 
     Args:
       name: one of `names()`.
-
-    Raises:
-      InputError: there is no such robot.
     """
     return _registry()[check_name("robot", name, names())]()

@@ -1,12 +1,11 @@
 """Robots: constants, analytic dynamics, MJCF names, and the maps between the two."""
 
 import abc
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_number, keep, vectors_of
+from lqrsim.errors import Array, InputError, check_kind, vectors_of
 
 if TYPE_CHECKING:
     from lqrsim.problem.collision_shape import CollisionGeoms, ShapeInWorld
@@ -129,16 +128,6 @@ class Robot(abc.ABC):
         import numpy as np
 
         return np.asarray(control, dtype=np.float64)
-
-    def _check(self, *, above_zero: Sequence[str] = (), at_least_zero: Sequence[str] = ()) -> None:
-        """For `__post_init__` of robots whose constants are fields: convert them to floats; refuse impossible values.
-
-        Raises:
-          InputError: a constant is not finite, or is zero or negative where it must not be.
-        """
-        for field in (*above_zero, *at_least_zero):
-            least = {"above": 0.0} if field in above_zero else {"at_least": 0.0}
-            keep(self, **{field: check_number(f"{type(self).__name__}: {field}", getattr(self, field), **least)})
 
 
 def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int) -> tuple[Array, Array]:

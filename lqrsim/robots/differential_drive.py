@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Positive, checked
 from lqrsim.errors import Array, vectors_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.base import Robot, configuration_of
 
 
+@checked
 @dataclass(frozen=True)
 class DifferentialDrive(Robot):
     """State: (x, y, heading) of the middle of the axle. Control: speed of the left and the right wheel.
@@ -23,24 +25,18 @@ class DifferentialDrive(Robot):
       radius: radius of the body in m.
       max_speed: largest speed of a wheel's rim in m/s, in either direction.
       wheel_radius: radius of a wheel in m; also the height of the axle.
-
-    Raises:
-      InputError: a constant is not above 0.
     """
 
-    axle_length: float = 0.258
-    radius: float = 0.17
-    max_speed: float = 0.5
-    wheel_radius: float = 0.036
+    axle_length: Positive = 0.258
+    radius: Positive = 0.17
+    max_speed: Positive = 0.5
+    wheel_radius: Positive = 0.036
 
     name = "differential_drive"
     body = "create"
     joints = ("create_base", "create_wheel_left", "create_wheel_right")
     actuators = ("create_wheel_left", "create_wheel_right")
     wheels = ("create_tread_left", "create_tread_right")
-
-    def __post_init__(self) -> None:
-        self._check(above_zero=("axle_length", "radius", "max_speed", "wheel_radius"))
 
     @property
     def dynamics(self) -> Dynamics:

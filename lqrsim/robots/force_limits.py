@@ -35,7 +35,6 @@ class ForceLimits(Constraint):
     whose forces are not linear, such as those of muscles, stay in the dynamics.
 
     Attributes:
-      limits: the limited forces, L of them.
       later: (K, S L, 1+n+m) the forces at the S later physics steps, of each of K periods or of all: each force's value
         at zero, and its slopes in state and control; None for the beginning of a period alone.
     """

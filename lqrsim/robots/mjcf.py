@@ -242,9 +242,6 @@ class MjcfRobot(Robot):
 
         They are those of `forcerange` and `actuatorfrcrange` where the force is linear in state and control, as of
         motors and servos. MuJoCo clips forces, and a solver cannot tell how a force that is clipped comes back.
-
-        Raises:
-          InputError: there is no such limit.
         """
         if not self._forces[0]:
             raise InputError(f"MjcfRobot {self.name}: force_limits: got none that are linear, want problems without")
@@ -285,9 +282,6 @@ class MjcfRobot(Robot):
 
         Returns:
           An MjcfRobot.
-
-        Raises:
-          InputError: as `dynamics.with_parameters` does.
         """
         changed = self.dynamics.with_parameters(**values)
         scene = scene_of(changed.mjcf, self.scene.geoms, (*KINDS, *OTHER_KINDS))
@@ -303,9 +297,6 @@ class MjcfRobot(Robot):
           (m,), the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
           those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
           which activations never rest, as an integrator's whose control cannot be 0.
-
-        Raises:
-          InputError: the state is not (n,) finite numbers.
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
@@ -389,7 +380,6 @@ class MjcfRobot(Robot):
         Args:
           start: (n,), a state.
           goal: (n,), a state.
-          steps: the number of control periods.
           dt: the control period in seconds; by default about 0.02.
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
             that are not named then have none.
@@ -414,8 +404,8 @@ class MjcfRobot(Robot):
           The Problem.
 
         Raises:
-          InputError: an argument is not as described; the goal moves a joint past its limits; or the start has one past
-            them by more than a tenth of its range, unless it is there in the MJCF's rest or in a keyframe.
+          InputError: the goal moves a joint past its limits; or the start has one past them by more than a tenth of its
+            range, unless it is there in the MJCF's rest or in a keyframe.
         """
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates

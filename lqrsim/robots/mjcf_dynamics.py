@@ -53,9 +53,6 @@ class MjcfDynamics(Dynamics):
     actuators that have states. The control is MuJoCo's `ctrl`. Derivatives are products of those of the physics steps,
     differences that are each good to 1e-5 of the largest entry; those of an arm's period are good to some 1e-7. There
     is no rate: solvers in continuous time, and solvers that need an inverse, do not accept these dynamics.
-
-    Attributes:
-      mjcf: the MJCF.
     """
 
     by_mujoco: ClassVar[bool] = True

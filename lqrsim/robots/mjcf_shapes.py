@@ -26,11 +26,7 @@ _FAR = 1e6  # m, a distance beyond all obstacles
 
 
 class MjcfGeoms(CollisionGeoms):
-    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
-
-    Args:
-      scene: the robot's scene, in which all geoms have names.
-    """
+    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene

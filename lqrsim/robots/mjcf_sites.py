@@ -95,7 +95,6 @@ class SiteCost(Cost):
     As a stage cost it acts at each step; as a final cost, at the end.
 
     Args:
-      site: name of the site in the MJCF.
       position: (3,) the desired position in the world, in metres; None for any.
       orientation: (4,) the desired orientation in the world, as a quaternion (w, x, y, z); None for any. The angle is
         that of the rotation from the desired orientation, less than half a turn.
@@ -134,7 +133,6 @@ class SiteConstraint(Constraint):
         ls.SiteConstraint("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0))
 
     Args:
-      site: name of the site in the MJCF.
       position: (3,) as in a SiteCost.
       orientation: (4,) as in a SiteCost.
       at: "final", or "all" steps except a start that is given exactly.

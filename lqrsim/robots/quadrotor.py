@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
+from lqrsim.annotations import NonNegative, Positive, checked
 from lqrsim.errors import Array, check_number, vectors_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.base import Robot, configuration_of
 
 
+@checked
 @dataclass(frozen=True)
 class Quadrotor(Robot):
     """State: position, velocity in world axes, rotation vector, angular velocity in body axes. Control: rotor forces.
@@ -30,21 +32,18 @@ class Quadrotor(Robot):
       max_force: largest force of a rotor in N.
       min_force: least force of a rotor in N.
       radius: radius of the collision sphere in m.
-
-    Raises:
-      InputError: a constant is out of range.
     """
 
-    mass: float = 0.5
-    inertia: float = 0.05
-    arm: float = 0.17
-    torque_ratio: float = 0.025
-    drag: float = 0.15
-    gravity: float = 9.8
-    max_force: float = 3.71
-    radius: float = 0.3
-    yaw_inertia: float | None = None
-    min_force: float = 0.0
+    mass: Positive = 0.5
+    inertia: Positive = 0.05
+    arm: Positive = 0.17
+    torque_ratio: NonNegative = 0.025
+    drag: NonNegative = 0.15
+    gravity: NonNegative = 9.8
+    max_force: Positive = 3.71
+    radius: Positive = 0.3
+    yaw_inertia: Positive | None = None
+    min_force: NonNegative = 0.0
 
     name = "quadrotor"
     body = "quadrotor"
@@ -57,12 +56,6 @@ class Quadrotor(Robot):
     )
 
     def __post_init__(self) -> None:
-        self._check(
-            above_zero=("mass", "inertia", "arm", "max_force", "radius"),
-            at_least_zero=("torque_ratio", "drag", "gravity", "min_force"),
-        )
-        if self.yaw_inertia is not None:
-            self._check(above_zero=("yaw_inertia",))
         check_number("Quadrotor: min_force", self.min_force, below=self.max_force)
 
     @property

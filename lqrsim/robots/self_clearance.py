@@ -71,11 +71,7 @@ class SelfClearance(Constraint):
         return ConstraintTerm.of_residual(distances, np.array([[self.margin]]), [0] * len(told), describe)
 
     def distances(self, dynamics: MjcfDynamics, states: npt.ArrayLike) -> Array:
-        """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m.
-
-        Raises:
-          InputError: the states are not (..., n).
-        """
+        """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m."""
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(self.links)
         out, which, segments = np.empty(len(flat) * count + 1), np.empty(count + 1), np.empty((count + 1, 6))

@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Positive, Want, checked
-from lqrsim.errors import Array, InputError, check_items, check_number, keep
+from lqrsim.annotations import Bounds, NonNegative, Positive, Want, checked
+from lqrsim.errors import Array, InputError, check_items
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.robots.base import Robot
@@ -40,32 +40,19 @@ class Sensor:
       rate: readings in a second; by default by the file's `interval`, and without that at each knot.
       delay: seconds from a reading to its arrival; by default the file's `delay`.
       loss: chance that a reading is lost.
-
-    Raises:
-      InputError: a number is out of range.
     """
 
     name: Annotated[str, Want("the name of an element of <sensor>")]
-    noise: float | None = None
-    bias: float = 0.0
-    bias_walk: float = 0.0
+    noise: NonNegative | None = None
+    bias: NonNegative = 0.0
+    bias_walk: NonNegative = 0.0
     rate: Positive | None = None
-    delay: float | None = None
+    delay: NonNegative | None = None
     loss: Annotated[float, Bounds(at_least=0.0, below=1.0)] = 0.0
-
-    def __post_init__(self) -> None:
-        for field in ("noise", "bias", "bias_walk", "delay"):
-            if getattr(self, field) is not None:
-                keep(self, **{field: check_number(f"Sensor: {field}", getattr(self, field), at_least=0.0)})
 
 
 class RobotSensors:
     """Sensors of the MJCF that a robot is in; `plant.sensors(...)` makes it.
-
-    Args:
-      robot: the robot.
-      scene: the scene with its MJCF.
-      sensors: the sensors.
 
     Attributes:
       sensors: the sensors, with the file's numbers where none were given.

@@ -36,11 +36,7 @@ class FileSensor(NamedTuple):
 
 
 def file_sensor(model: mujoco.MjModel, name: str, what: str) -> FileSensor:
-    """The sensor of a name.
-
-    Raises:
-      InputError: there is none, or it is of a kind that is not supported.
-    """
+    """The sensor of a name."""
     names = [model.sensor(i).name for i in range(model.nsensor)]
     if not any(names):
         raise InputError(f"{what}: got {name!r}, want a named element of <sensor>, of which the MJCF has none")
@@ -65,7 +61,6 @@ class SensorReader:
     """Computes readings in given states. One is used by one thread.
 
     Args:
-      model: of the MJCF.
       body: id of the body at which forces act.
     """
 

@@ -42,7 +42,6 @@ class Scene:
     """A place for a robot to move in.
 
     Attributes:
-      mjcf: its MJCF.
       world: the obstacles, as the module's docstring defines them.
       geoms: ids of their geoms in the model, in the same order.
     """

@@ -27,7 +27,6 @@ class Obstacle:
     """One primitive, with sizes and axes as in MuJoCo.
 
     Attributes:
-      name: name of the geom in the MJCF.
       kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` computes
         distances.
       position: (3,) in metres.
@@ -248,9 +247,6 @@ class World:
 
         Args:
           points: (..., 3), or (..., 2) in a plane, in metres.
-
-        Raises:
-          InputError: there are no obstacles.
         """
         if not self.obstacles:
             raise InputError("nearest: got a world without obstacles, want at least one")

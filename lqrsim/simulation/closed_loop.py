@@ -68,8 +68,6 @@ def simulate(
         `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
       disturbances: in the order in which they act. Each has its own stream of random numbers. The `Noise` of a problem
         is allowed, too.
-      seed: seed of all random numbers.
-      trials: number of trials.
       first_trial: number of the first trial. Trial `i` of a seed is bit-identical, whatever other trials run with it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or a tenth
         of the distance to the goal if the plan starts within the radius.
@@ -107,7 +105,6 @@ def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **o
     Args:
       plant, plan: as in `simulate`.
       states: (K, n), where the trials begin.
-      knot: number of the knot.
       options: other options of `simulate`, except `trials`. Disturbances that change the start, such as
         `InitialStateError`, are refused. Times of the rollout count from the knot.
 

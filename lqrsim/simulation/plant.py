@@ -41,8 +41,6 @@ class Plant(OneVersion):
     """A robot in a scene, ready to run.
 
     Attributes:
-      robot: the robot, with its dynamics and limits.
-      scene: the scene, with its MJCF and obstacles.
       simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
       shape: the robot's geoms, its balls, or the ball at its position among the obstacles.
       world: the obstacles for it; none for a robot that has neither geoms nor balls nor a position.
@@ -158,7 +156,6 @@ class Plant(OneVersion):
         """Check that a disturbance can change a parameter of the physics.
 
         Args:
-          what: the disturbance.
           parameter: "mass", "inertia" or "thrust"; None for one that only MuJoCo's models have.
 
         Raises:
@@ -174,9 +171,6 @@ class Plant(OneVersion):
 
         Args:
           period: seconds, such as `solution.trajectory.dt`.
-
-        Raises:
-          InputError: the period is not positive.
         """
         period = check_number("control period", period, above=0.0)
         other = copy.copy(self)
@@ -262,9 +256,6 @@ class Plant(OneVersion):
 
         Returns:
           (...), in metres.
-
-        Raises:
-          InputError: the shapes of states and displaced obstacles do not fit together.
         """
         states = vectors_of("states", states, len(self.robot.dynamics.state_coordinates))
         if displaced is not None:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from lqrsim.annotations import Bounds, Count, Line, Positive, Seed, checked
-from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number
+from lqrsim.annotations import Bounds, Count, Line, NonNegative, Positive, Seed, Want, checked
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.plan import Plan
@@ -35,8 +35,6 @@ class PlantCheck:
     """The differences between a robot's dynamics and MuJoCo, or another simulator, over one control period.
 
     Attributes:
-      names: names of the states.
-      units: units of the states.
       errors: (n,) the largest difference of each state over the samples, in its unit.
       changes: (n,) the largest change of each state that the dynamics predict.
       period: control period in seconds.
@@ -45,10 +43,8 @@ class PlantCheck:
       simulated: (n,), the state after this sample in the simulator.
       predicted: (n,), the state after this sample by the dynamics.
       tolerance: largest allowed value of `relative`.
-      samples: number of random states.
       contacts: pairs of geoms that touched, each with its number of samples, the most frequent first. The dynamics may
         not know of these contacts.
-      simulator: name of the simulator.
     """
 
     names: Annotated[tuple[Line, ...], "n"]
@@ -113,11 +109,11 @@ def check_plant(
     scene: Scene,
     *,
     simulator: Simulator | None = None,
-    problem: Problem | None = None,
-    plan: Plan | None = None,
+    problem: Annotated[Problem, Want("a Problem of the robot, such as scenario.problem, or None")] | None = None,
+    plan: Annotated[Plan, Want("a Plan of the robot, such as a Solution, or None")] | None = None,
     period: float | None = None,
     around: npt.ArrayLike | None = None,
-    spread: float | None = None,
+    spread: NonNegative | None = None,
     controls: Limits | None = None,
     settle: float | None = None,
     samples: Annotated[int, Bounds(at_least=1, at_most=100_000)] = 50,
@@ -132,8 +128,6 @@ def check_plant(
     Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:
-      robot: the robot, with its dynamics.
-      scene: a scene whose MJCF has the robot.
       simulator: a simulator to compare the dynamics with, in place of MuJoCo; it does not report contacts.
       problem: a problem of the robot. The random states are about the line from its start to its goal and keep its
         StateBounds, and the controls keep its limits: elsewhere the dynamics need not hold.
@@ -147,13 +141,10 @@ def check_plant(
         Within them controls are equally probable, or normal about those of a plan.
       settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as wheel
         speeds; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
-      samples: number of random states.
       tolerance: largest allowed error, relative to the largest change of the state.
-      seed: seed of all random numbers.
 
     Raises:
-      InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the
-        simulation becomes unstable.
+      InputError: the robot is not in the scene, the controls have no limits, or the simulation becomes unstable.
     """
     plant = Plant(robot, scene, simulator)
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
@@ -219,13 +210,11 @@ class _Region(NamedTuple):
         own = states, inputs = spaces_of(robot.dynamics)
         n, points, middles, seconds = len(states), np.zeros((1, len(states))), None, 0.0
         if problem is not None:
-            check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
             check_same_system("problem", "a problem", spaces_of(problem.dynamics), own, "the robot")
             start, goal, seconds = problem.start, problem.weighed_goal, problem.steps * problem.dt
             start = np.zeros(n) if start is None else start
             points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), LINE)
         if plan is not None:
-            check_kind("plan", plan, Plan, "a Plan of the robot, such as a Solution, or None")
             check_same_system("plan", "a plan", spaces_of(plan.policy), own, "the robot")
             points, middles = plan.trajectory.states[:-1], plan.trajectory.controls
             check_array("plan: trajectory", np.hstack([points, middles]), (None, n + len(inputs)))
@@ -233,7 +222,7 @@ class _Region(NamedTuple):
         if around is not None:
             points, middles = check_array("around", around, (n,))[None], None
         if spread is not None:
-            scale = np.full(n, check_number("spread", spread, at_least=0.0))
+            scale = np.full(n, spread)
         within = _state_range(robot, problem, points[0])
         ranges = _control_range(robot, controls, problem, bounded=middles is None)
         control_spread = np.zeros(len(inputs))

@@ -13,9 +13,6 @@ class Readings:
     """The readings of K trials. A number is NaN where no reading of its sensor arrives, or it got lost.
 
     Args:
-      sensors: the controller's.
-      effects: the disturbances.
-      physics: of the run.
       dt: control period in s.
 
     Raises:
@@ -37,7 +34,6 @@ class Readings:
         """The readings that arrive at a knot, (K, Y).
 
         Args:
-          step: number of the knot.
           held: the controls (K, m) that are in force there; by default those that act already.
         """
         exact = self._sensors.readings(self._physics.sense(held))

@@ -54,9 +54,6 @@ class RunSettings:
       radius: distance from the goal within which it counts as reached, in `Target.unit`.
       passing: the robot's shape among the moving obstacles, where they are at the knot; None without any.
       substeps: physics steps per control period.
-
-    Raises:
-      InputError: as `simulate` does.
     """
 
     _prefix = ""

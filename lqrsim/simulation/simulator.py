@@ -48,9 +48,6 @@ class Simulator(abc.ABC):
     def check(self, robot: Robot) -> None:  # noqa: B027 - a simulator may take any robot
         """Check that the simulator supports this robot.
 
-        Args:
-          robot: the robot of the plant.
-
         Raises:
           InputError: it cannot.
         """
@@ -78,7 +75,6 @@ class Simulator(abc.ABC):
           controls: (K, m), held constant, within the robot's limits.
           wrench: (K, 6), force in N at the centre of mass and torque in N m, along the world's axes.
           wind: (K, 3), in m/s along the world's axes; zero unless `wind` is true.
-          steps: number of timesteps.
         """
 
     @abc.abstractmethod
@@ -98,9 +94,6 @@ class Simulator(abc.ABC):
         Args:
           simulations: what `start` returned; it is changed.
           states: (K, n).
-
-        Raises:
-          InputError: it cannot.
         """
         raise InputError(f"StateNoise: got a plant simulated by {self.name}, want one that overrides `place`")
 

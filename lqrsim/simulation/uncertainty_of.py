@@ -27,11 +27,7 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
     loss of an actuator.
 
     Args:
-      plant: the simulated robot.
       disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
-
-    Raises:
-      InputError: a disturbance does not fit the plant.
     """
     parts = list[Uncertainty]()
     for one in as_disturbances(disturbances, "a list of disturbances"):

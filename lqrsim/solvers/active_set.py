@@ -20,7 +20,6 @@ class ActiveSet:
     """Steps from one plan.
 
     Args:
-      stages: stages of the problem.
       plan: states (T+1, n) and controls (T, m), not necessarily feasible; the first state is the start.
       multipliers: multipliers of the constraints, (T+1, rows) each, or none.
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.

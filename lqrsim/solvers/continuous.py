@@ -224,9 +224,6 @@ def smooth_lq_continuous(
 
     Returns:
       A ContinuousSolution. A problem without a minimum raises no exception; the status says where this was noticed.
-
-    Raises:
-      InputError: an argument is not as described.
     """
     tolerances = tolerances_of(rtol, atol)
 
@@ -321,7 +318,7 @@ def smooth_continuous(
       the solve ended, and the detail where.
 
     Raises:
-      InputError: an argument is not as described; the dynamics or a cost is not finite at the start.
+      InputError: the dynamics or a cost is not finite at the start.
     """
     if isinstance(problem.initial, FixedState):
         raise InputError(

@@ -120,7 +120,6 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
 
     Args:
       problem: the problem, with a weight on rates.
-      solution: its solution.
 
     Raises:
       InputError: the problem has no such weight, the solution is of another problem, or there is no feedback about its

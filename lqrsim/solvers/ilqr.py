@@ -53,24 +53,22 @@ def ilqr(
     fixed: the state of a `FixedState`, or the state at which the initial cost is zero. The cost never rises. Control
     limits are respected; constraints are not supported.
 
+    The other arguments are as in `smooth`.
+
     Args:
       problem: a problem with a start that is given exactly, or by the initial cost.
       stop: as in `smooth`; the gap is zero here, because every iterate is feasible.
       tolerance: tolerance of the relative change of cost, and of the optimality, as in `smooth`.
-      max_iterations: the largest number of iterations.
-      time_limit: as in `smooth`.
       start: controls of the first trajectory: (m,) or (T, m), by default the problem's nominal control; the controls of
         a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
-      callback: as in `smooth`.
       noise: as in `smooth`; with noise this is iLQG.
-      risk: as in `smooth`.
 
     Returns:
       A Solution, as `smooth` returns, but without cost-to-come and inverse policy. A hard problem raises no
       exception.
 
     Raises:
-      InputError: an argument is not as described, or the problem names no start.
+      InputError: the problem names no start.
     """
     settings = Settings(
         stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
@@ -105,7 +103,7 @@ def ilqr_many(
       One Solution per problem, in their order.
 
     Raises:
-      InputError: an argument is not as described; a problem that is refused is named by its place in the list.
+      InputError: a problem that is refused is named by its place in the list.
     """
     settings = settings_from(Settings, "ilqr_many", {"tolerance": TOLERANCE, **options})
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)

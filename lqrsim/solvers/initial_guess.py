@@ -29,7 +29,6 @@ class InitialPrior:
 
     Args:
       weight: (n,) weights, not negative.
-      iterations: the number of iterations in which it acts.
       about: the state (n,), or trajectory (T+1, n), at which the prior is zero.
       obstacles: fractions of the obstacle costs in the first iterations, one per iteration; 1 afterwards.
       controls: the controls (m,) or (T, m) of the first pass; by default the problem's nominal control.
@@ -73,9 +72,6 @@ class InitialPrior:
 
         Returns:
           (n,).
-
-        Raises:
-          InputError: no such step.
         """
         most = None if self.about.ndim == 1 else len(self.about) - 1
         step = check_number("step", step, at_least=0.0, at_most=most)
@@ -89,14 +85,8 @@ class InitialPrior:
     def fitting(self, problem: Problem) -> "InitialPrior":
         """Check that the prior fits a problem.
 
-        Args:
-          problem: the problem to be solved with it.
-
         Returns:
           The prior itself, with one entry per state.
-
-        Raises:
-          InputError: it does not fit.
         """
         n = len(problem.dynamics.state_coordinates)
         check_array("start: InitialPrior: weight", self.weight, (n,))
@@ -204,11 +194,7 @@ def is_function(start: object) -> TypeGuard[Callable[[Problem], Beginning]]:
 
 
 def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess:
-    """The initial guess for a caller's start; by default the problem's nominal controls.
-
-    Raises:
-      InputError: it does not fit the problem.
-    """
+    """The initial guess for a caller's start; by default the problem's nominal controls."""
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
     if isinstance(start, InitialGuess):
         return start

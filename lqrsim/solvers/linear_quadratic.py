@@ -55,9 +55,6 @@ def smooth_lq(
       NOT_POSITIVE_DEFINITE says that there is no unique minimum, or none to working precision; the detail says where.
       If the states of least total cost deviate from the plan by more than ACCURACY, rounding has spoilt the
       cost-to-come, which is then left out.
-
-    Raises:
-      InputError: the arrays do not fit together, or the form does not support them.
     """
     clock = time.perf_counter()
     parts = _parts(stage)

@@ -63,20 +63,17 @@ def prepare(
 ) -> "PreparedSolver":
     """Compile everything that problems of this structure need, so that nothing is compiled while a robot runs.
 
+    The other arguments are as in `smooth`.
+
     Args:
       problem: one of the problems; others may have other states, goals, obstacles and parameters.
       tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, multiplied by the
         control's range and relative to the cost; by default 1e-6, and 1e-2 with limits of forces.
-      gap_tolerance: as in `smooth`.
       constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise,
         the margin of inequalities, by default 1e-3.
-      max_iterations: as in `smooth`.
       finish: as in `smooth`; with None, the augmented Lagrangian method keeps the constraints.
       threads: number of threads that compute derivatives of an MJCF's steps; by default the number of processors. The
         results are the same.
-
-    Raises:
-      InputError: an argument is not as described.
     """
     settings = SmootherSettings(
         tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
@@ -156,9 +153,6 @@ class PreparedSolver(OneVersion):
     def check(self, problem: Problem) -> Problem:
         """Check that a problem needs no compiling: only numbers may differ from the prepared one.
 
-        Args:
-          problem: the problem to be solved.
-
         Raises:
           InputError: the problem would have to be compiled.
         """
@@ -193,9 +187,6 @@ class PreparedSolver(OneVersion):
           after: number of steps that are over; the rest is solved.
           time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
           previous: (m,) the last command before the plan, from which a `control_rate` counts; None if it is free.
-
-        Raises:
-          InputError: an argument is not as described.
         """
         clock = time.perf_counter()
         own = self.problem if problem is None else self.check(problem)
@@ -417,7 +408,6 @@ class _Yielding:
     So those about the first plan serve for all steps that need not be shortened, and are computed anew at the end.
 
     Args:
-      run: a run of the problem.
       plan: states and controls to start from, with the first state of the solve.
       closing: duration of the work after the last iteration, in s.
 

@@ -37,16 +37,13 @@ def sample_costs(
     trial.
 
     Args:
-      problem: a problem with noise.
       solution: a solution of that problem, or of another with as many states, controls and steps.
-      trials: number of runs K.
-      seed: seed of the noise.
 
     Returns:
       (K,) the costs.
 
     Raises:
-      InputError: the problem has no noise, the solution does not fit it, or an argument is not as described.
+      InputError: the problem has no noise, or the solution does not fit it.
     """
     if problem.noise_term is None:
         raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
@@ -74,7 +71,6 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
 
     Args:
       problem: a problem with noise; its own risk does not count.
-      solution: any solution of the problem.
 
     Returns:
       The risk, in units of 1/cost; infinite if no risk is too high.

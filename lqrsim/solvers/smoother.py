@@ -109,9 +109,6 @@ def smooth(
 
     Returns:
       A Solution. A hard problem raises no exception: the status says how the solve ended and what to try.
-
-    Raises:
-      InputError: an argument is not as described.
     """
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
@@ -151,8 +148,8 @@ def smooth_many(
       One Solution per problem, in their order.
 
     Raises:
-      InputError: an argument is not as described; a refused problem is named by its index in the list. A problem that
-        is only not finite at its start ends as NOT_FINITE, and its detail says where.
+      InputError: a refused problem is named by its index in the list. A problem that is only not finite at its start
+        ends as NOT_FINITE, and its detail says where.
     """
     settings = settings_from(SmootherSettings, "smooth_many", options)
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)

@@ -143,7 +143,6 @@ def verify_run(
 
     Args:
       rollout: rollout of `simulate`, with frames.
-      trial: row of the rollout.
       solution: the solution that was run, to check the plan in the rollout.
       progress: called after each frame with the number of finished frames and their total.
 
@@ -389,13 +388,12 @@ def verify_video(
 ) -> Verification:
     """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
 
+    The other arguments are as in `verify_run`.
+
     Args:
       path: a video by `lqrsim render`, whatever else it shows. It needs the camera `top`; for a robot in a vertical
         plane the camera `side`; for a robot that moves in space both.
-      rollout: the run that the video shows.
       trial: row of the rollout; by default the first that the video shows.
-      solution: as for `verify_run`.
-      progress: as for `verify_run`.
 
     Raises:
       InputError: the file was not written by lqrsim, or lacks the necessary panes.
@@ -448,7 +446,6 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
     """Whether the video shows the run of that digest, with frames at their times and marks large enough.
 
     Args:
-      frames: number of frames that were decoded.
       off: largest error of the time of a frame, in seconds.
       area: area of the smallest mark, in pixels.
     """

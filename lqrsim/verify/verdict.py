@@ -113,7 +113,6 @@ class Criterion:
     """One test of a verification.
 
     Attributes:
-      name: name of the test.
       passed: None if it could not be checked.
       detail: the measured value, and the required value.
     """
@@ -141,7 +140,6 @@ class Verification:
       worst: largest distance between seen and actual, in metres.
       shift: shift of the pictures ahead of the run, in seconds.
       scale: scale of the seen motion relative to the actual one.
-      tests: the tests, each with a verdict.
       likely: the likely cause if a test failed; otherwise empty.
     """
 

@@ -156,9 +156,6 @@ def camera_view(
 
     Args:
       beside: trials in the same picture. Those of the same model are seen from the same place, at the same zoom.
-
-    Raises:
-      InputError: there is no view of that name.
     """
     model = recorded.model
     of_model = [model.camera(number).name for number in range(model.ncam) if model.camera(number).name]

@@ -169,7 +169,6 @@ class Overlays:
     Args:
       solution: the solution that was run, for the tube of its cost.
       funnel: a funnel about the plan of the run.
-      segments: largest number of segments of a line.
 
     Attributes:
       drawables: in the order of the legend.

@@ -270,7 +270,6 @@ class Picture:
     """A picture of all runs at any time.
 
     Attributes:
-      runs: the rollouts, each once.
       size: width and height in pixels.
     """
 

@@ -60,7 +60,6 @@ def plot_run(
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
-      trial: row of each rollout.
       style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
     """
     _check(solution, rollouts, trial, world)
@@ -284,7 +283,6 @@ def plot_policy(
     the plan's states are shown instead, without `world` and `radius`.
 
     Args:
-      solution: a solution with a policy.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`; none by default.
       radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle

@@ -213,20 +213,13 @@ def render_still(
 
     With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures.
 
+    The other arguments are as in `render`.
+
     Args:
       runs: one rollout, or several rollouts to be shown side by side.
       path: FILE.png.
       time: seconds after the start; by default the end.
       every: seconds; the robot is also drawn at each multiple of it.
-      trial: as in `render`.
-      camera: as in `render`.
-      insets: as in `render`.
-      titles: as in `render`.
-      overlays: as in `render`.
-      solution: as in `render`.
-      funnel: as in `render`.
-      quality: as in `render`.
-      size: as in `render`.
 
     Returns:
       The path. A notebook shows the picture if the call is a cell's last expression.

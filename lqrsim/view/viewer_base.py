@@ -45,8 +45,6 @@ class Viewer(abc.ABC):
     """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
 
     Args:
-      space: coordinates of the plan's states.
-      body: name of the robot's body in the model.
       balls: with their planned positions, for a robot without a position.
       goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
       push: velocity that a key adds, in m/s.

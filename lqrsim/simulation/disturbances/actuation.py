@@ -110,9 +110,6 @@ class Saturation(Disturbance):
     def limits(self, plant: Plant) -> tuple[Array, Array]:
         """The narrowed limits.
 
-        Args:
-          plant: the plant, with the robot's own limits.
-
         Raises:
           InputError: the robot's own limits do not contain them.
         """

@@ -103,11 +103,7 @@ class Disturbance(abc.ABC):
     _scales: ClassVar[str] = ""  # the field of a dataclass that is proportional to the effect
 
     def describe(self, plant: Plant) -> str:
-        """The disturbance in words and units, for records. By default this is its repr, without addresses of objects.
-
-        Args:
-          plant: the plant that is run.
-        """
+        """The disturbance in words and units, for records; by default its repr, without addresses of objects."""
         return without_addresses(repr(self))
 
     def scaled(self, strength: float) -> "Disturbance":
@@ -129,18 +125,12 @@ class Disturbance(abc.ABC):
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Check that the plant can have this disturbance.
 
-        Args:
-          plant: the plant that is run.
-
         Raises:
           InputError: it cannot.
         """
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """Describe the disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason.
-
-        Args:
-          plant: the plant that is run.
 
         Returns:
           An Uncertainty.
@@ -152,12 +142,7 @@ class Disturbance(abc.ABC):
         """Start a run with one trial per generator. A trial's random numbers must come from its own generator.
 
         Args:
-          plant: the plant that is run.
-          plan: the plan that the policy follows.
           generators: K of them, one per trial.
-
-        Raises:
-          InputError: the disturbance does not fit the plant or the plan.
         """
 
 

@@ -133,7 +133,6 @@ class Payload(Disturbance):
 
     Args:
       mass: mass of the load in kg.
-      body: name of the body that carries it.
     """
 
     mass: NonNegative

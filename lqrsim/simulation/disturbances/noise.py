@@ -228,9 +228,6 @@ class StateNoise(Disturbance):
     """The noise of a problem, `lqrsim.Noise`: the state jumps by M(x, u) w at the end of each control period.
 
     w is drawn anew each time; x is the state at the beginning of the period, u the control that reached the actuators.
-
-    Args:
-      noise: the noise, with its matrix M.
     """
 
     noise: Noise

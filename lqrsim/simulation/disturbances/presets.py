@@ -48,9 +48,6 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     Args:
       name: calm, light, moderate, strong or severe.
       plant: the plant that the disturbances act on.
-
-    Raises:
-      InputError: there is no such preset.
     """
     strength = PRESETS[check_name("preset", name, PRESETS)]
     return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one) and _acts(one)]
