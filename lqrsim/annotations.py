@@ -309,6 +309,8 @@ def _names(said: Declared) -> str:
 def _items(field: str, value: Any, said: Declared, sizes: Sizes | None) -> tuple[Any, ...]:
     """A collection as a tuple, of which each item is as declared."""
     inner = get_args(said.kinds[0])
+    if said.want and inner[0] is int:
+        return tuple(map(int, check_items(field, value, (int, np.integer), said.want)))
     if said.want and _is_class(inner[0]) and inner[0] not in _PLAIN:
         return check_items(field, value, inner[0], said.want, at_most=said.longest or 1_000_000)
     items = check_items(field, value, object, said.want or "a tuple")
@@ -317,9 +319,8 @@ def _items(field: str, value: Any, said: Declared, sizes: Sizes | None) -> tuple
     each = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
     if len(each) != len(items):
         raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
-    names = (field if said.want else f"{field}[{i}]" for i in range(len(items)))
-    each = zip(names, items, map(declared, each), strict=True)
-    return tuple(_checked(name, item, one, sizes) if _is_known(one) else item for name, item, one in each)
+    pairs = enumerate(zip(items, map(declared, each), strict=True))
+    return tuple(_checked(f"{field}[{i}]", item, one, sizes) if _is_known(one) else item for i, (item, one) in pairs)
 
 
 def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:

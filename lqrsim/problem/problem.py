@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Count, Finite, Index, NonNegative, Positive, Want, checked
+from lqrsim.annotations import Bounds, Count, Finite, NonNegative, Positive, Want, checked
 from lqrsim.errors import (
     Array,
     InputError,
@@ -161,7 +161,7 @@ class Problem(OneVersion):
     risk: Finite = 0.0
     duration: tuple[float, float] | None = None
     time_weight: NonNegative = 0.0
-    segments: Annotated[Sequence[Index], Want("knots, which are whole numbers")] = ()
+    segments: Annotated[Sequence[int], Want("knots, which are whole numbers")] = ()
     control_rate: ControlRate | None = None
     accuracy: Annotated[float, Bounds(at_least=ACCURATE)] | None = None
     between_knots: bool = False

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Line, OneOf, Want, checked
-from lqrsim.errors import Array, InputError, check_path, excerpt
+from lqrsim.annotations import Line, checked
+from lqrsim.errors import Array, InputError, check_flag, check_name, check_path, check_text, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -67,15 +67,14 @@ class ExportedC:
         return "\n".join([*lines, *_bounds(self.controls, self.rounding)])
 
 
-@checked
 def export_c(
     policy: Solution | AffinePolicy | OutputFeedbackPolicy,
     folder: str | os.PathLike[str],
     *,
-    number: Annotated[str, OneOf(NUMBERS)] = "float",
-    gains: Annotated[str, OneOf(GAINS)] = "full",
+    number: str = "float",
+    gains: str = "full",
     interpolate: bool = False,
-    name: Annotated[str, 40, Want("text")] = "policy",
+    name: str = "policy",
 ) -> ExportedC:
     """Write a policy as C99 with constant tables, and an example with a CMake file.
 
@@ -103,13 +102,14 @@ def export_c(
     kinds = Solution, AffinePolicy, OutputFeedbackPolicy
     if not isinstance(policy, kinds):
         raise InputError(f"policy: got {_kind_of(policy)}, want {wanted}")
-    folder = check_path("folder", folder, "the path of a folder")
+    folder, number = check_path("folder", folder, "the path of a folder"), check_name("number", number, NUMBERS)
+    gains, name = check_name("gains", gains, GAINS), check_text("name", name, at_most=40)
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):
         raise InputError(f"name: got {excerpt(name)}, want lower-case letters, digits and _, such as policy")
     if name in HEADERS.split():
         raise InputError(f"name: got {excerpt(name)}, the name of a header of C, want another, such as policy")
     law = policy.policy if isinstance(policy, Solution) else policy
-    if interpolate and isinstance(law, OutputFeedbackPolicy):
+    if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
         raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")
     kind = FILTER if isinstance(law, OutputFeedbackPolicy) else FEEDBACK
     measured = law.measured_coordinates if isinstance(law, OutputFeedbackPolicy) else law.state_coordinates

@@ -185,7 +185,7 @@ class PictureOptions:
     solution: Solution | Sequence[Solution | None] | None = None
     funnel: Funnel | Sequence[Funnel | None] | None = None
     quality: Quality = "standard"
-    size: tuple[int, int] | None = None
+    size: Annotated[tuple[int, int], Want("a width and a height in pixels")] | None = None
     speed: float = 1.0
 
     def __post_init__(self) -> None:
