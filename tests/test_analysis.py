@@ -14,7 +14,7 @@ import lqrsim as ls
 from lqrsim.stress import statistics
 from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
 from lqrsim.stress.outcome_table import Outcomes
-from lqrsim.stress.specification import Cell
+from lqrsim.stress.study import Cell
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
-from lqrsim.stress.campaign import run_campaign, run_resolved
+from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.campaign_files import Damaged, unpack
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.specification import Campaign, Cell
+from lqrsim.stress.study import Campaign, Cell
 
 OWN = """
 import dataclasses
@@ -543,10 +543,10 @@ def test_a_scenario_whose_runs_differ_is_refused(
 ) -> None:
     """A function may return another scenario each time. Here the MJCF, the problem and the plans are the same."""
     other, strong = change(quadrotor), (ls.disturbances.MeanWind((3.0, 0.0, 0.0)), ControlNoise(0.5))
-    options = {"workers": 0, "batch": 1, "solution": None, "scheduler": None, "progress": None}
-    run_resolved(CAMPAIGN, quadrotor, reference.folder, **options)  # pyright: ignore[reportArgumentType]
+    of_quadrotor, of_other = (Campaign.from_json(CAMPAIGN.as_json(), scenario) for scenario in (quadrotor, other))
+    run_campaign(of_quadrotor, reference.folder, workers=0, batch=1)
     with pytest.raises(InputError, match="robot, MJCF, choice of obstacles, simulator or goal radius"):
-        run_resolved(CAMPAIGN, other, reference.folder, **options)  # pyright: ignore[reportArgumentType]
+        run_campaign(of_other, reference.folder, workers=0, batch=1)
     plan, near = reference.solution("smooth"), (quadrotor.near_enough(), other.near_enough())
     one, two = (
         ls.simulate(scenario.plant(), plan, disturbances=strong, frames=False, **radius)

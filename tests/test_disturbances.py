@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances import (
     MeasurementNoise,
     Push,
 )
-from lqrsim.stress.specification import disturbances_as_json, disturbances_from_json
+from lqrsim.stress.study import disturbances_as_json, disturbances_from_json
 
 TRIALS = 40
 

@@ -41,7 +41,7 @@ from lqrsim.stress import trials
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.specification import Campaign
+from lqrsim.stress.study import Campaign
 
 ARM = """<mujoco>
   <option timestep="0.01"/>

@@ -52,7 +52,9 @@ def stored(left: ls.Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(left: ls.Solution, tmp_path_factory: pytest.TempPathFactory) -> ls.stress.Results:
-    return ls.stress.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("given") / "here", workers=0, solution=left)
+    return ls.stress.run_campaign(
+        dataclasses.replace(CAMPAIGN, solution=left), tmp_path_factory.mktemp("given") / "here", workers=0
+    )
 
 
 def test_a_campaign_refuses_a_solution_with_other_limits_or_angles(
@@ -65,7 +67,7 @@ def test_a_campaign_refuses_a_solution_with_other_limits_or_angles(
     ):
         other = dataclasses.replace(left, policy=dataclasses.replace(left.policy, **changed))
         with pytest.raises(ls.InputError, match="solution: got another, want "):
-            ls.stress.run_campaign(CAMPAIGN, results.folder, workers=0, solution=other)
+            ls.stress.run_campaign(dataclasses.replace(CAMPAIGN, solution=other), results.folder, workers=0)
 
 
 def test_replanners_are_told_apart_by_what_changes(left: ls.Solution, differential_drive: ls.Scenario) -> None:
@@ -132,7 +134,7 @@ def test_the_trials_of_a_campaign_are_those_of_the_given_solution(
 def test_a_path_and_other_processes_give_the_same_bits(
     results: ls.stress.Results, stored: Path, tmp_path: Path
 ) -> None:
-    again = ls.stress.run_campaign(CAMPAIGN, tmp_path, workers=1, batch=3, solution=stored)
+    again = ls.stress.run_campaign(dataclasses.replace(CAMPAIGN, solution=stored), tmp_path, workers=1, batch=3)
     assert again.manifest["digest"] == results.manifest["digest"]
     assert shards(tmp_path) == shards(results.folder)
 
@@ -205,13 +207,13 @@ def test_the_folder_has_all_that_it_takes_to_replay_and_to_go_on(
 def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution, tmp_path: Path) -> None:
     campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), design_disturbances=None, trials=1)
     solved = ls.stress.run_campaign(campaign, tmp_path / "solved", workers=0)
-    assert solved.given is None
+    assert solved.campaign.solution is None
     with pytest.raises(ls.InputError, match=r"^solution: got another, want none, as .*solved was begun with"):
-        ls.stress.run_campaign(campaign, solved.folder, workers=0, solution=left)
+        ls.stress.run_campaign(dataclasses.replace(campaign, solution=left), solved.folder, workers=0)
     # Even that which it would find itself is something else that was asked for.
     found = solved.solution("smooth")
-    given = ls.stress.run_campaign(campaign, tmp_path / "given", workers=0, solution=found)
-    assert given.given == tmp_path / "given" / "solution.npz"
+    given = ls.stress.run_campaign(dataclasses.replace(campaign, solution=found), tmp_path / "given", workers=0)
+    assert ls.stress.Results(given.folder).campaign.solution == tmp_path / "given" / "solution.npz"
     assert given.manifest["policies"]["smooth"]["digest"] == solved.manifest["policies"]["smooth"]["digest"]
     assert given.manifest["digest"] != solved.manifest["digest"]
 
@@ -222,7 +224,9 @@ def test_the_hash_is_of_all_that_solving_again_begins_with(left: ls.Solution, tm
     assert left.cost_to_go is not None
     steeper = dataclasses.replace(left.cost_to_go, hessian=2 * left.cost_to_go.hessian)
     digests = {
-        ls.stress.run_campaign(campaign, tmp_path / str(number), workers=0, solution=one).manifest["digest"]
+        ls.stress.run_campaign(dataclasses.replace(campaign, solution=one), tmp_path / str(number), workers=0).manifest[
+            "digest"
+        ]
         for number, one in enumerate((left, dataclasses.replace(left, cost_to_go=steeper)))
     }
     assert len(digests) == 2
@@ -362,7 +366,7 @@ def test_what_does_not_fit_is_refused_by_name(
     campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), design_disturbances=None)
     for says, solution in unfit.items():
         with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
-            ls.stress.run_campaign(campaign, tmp_path / "out", workers=0, solution=solution)
+            ls.stress.run_campaign(dataclasses.replace(campaign, solution=solution), tmp_path / "out", workers=0)
         with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
             lqrsim.gym.Environment(DRIVE, solution=solution)
         with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
@@ -370,7 +374,7 @@ def test_what_does_not_fit_is_refused_by_name(
     assert not (tmp_path / "out").exists()
     with pytest.raises(ls.InputError, match=r"^solution: got a solution of smooth with ilqr, want it with smooth"):
         ls.stress.run_campaign(
-            dataclasses.replace(campaign, policies=("ilqr",)), tmp_path / "out", workers=0, solution=stored
+            dataclasses.replace(campaign, policies=("ilqr",), solution=stored), tmp_path / "out", workers=0
         )
     baseline = ls.ilqr(problem, max_iterations=1)
     with pytest.raises(ls.InputError, match=r"^solution: got a solution of ilqr with smooth, want it with ilqr"):

@@ -19,7 +19,7 @@ from lqrsim import machine, versions
 from lqrsim.cli import main
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign
+from lqrsim.stress.study import Campaign
 
 CAMPAIGN = Campaign(
     scenario="differential_drive",

@@ -185,8 +185,8 @@ def test_runs_and_campaigns_on_the_command_line(
 
     wind = ls.disturbances.preset("light", ls.scenarios.quadrotor().plant())[-1:]
     asked: Any = {"sweeps": {"wind": wind}, "strengths": (1.0, 2.0), "policies": ("smooth",), "trials": 2}
-    campaign = ls.stress.Campaign(scenario="quadrotor", **asked)
-    results = ls.stress.run_campaign(campaign, tmp_path / "campaign", workers=0, solution=solution)
+    campaign = ls.stress.Campaign(scenario="quadrotor", solution=solution, **asked)
+    results = ls.stress.run_campaign(campaign, tmp_path / "campaign", workers=0)
     export = ["export", str(tmp_path / "campaign"), "--actions", "controls", "--minari"]
     assert main([*export, "run/all-v0"]) == 0
     assert main([*export, "run/strong-v0", "--cell", "smooth,wind,2"]) == 0

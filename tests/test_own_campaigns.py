@@ -14,7 +14,7 @@ from lqrsim.cli import main
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign, Cell
+from lqrsim.stress.study import Campaign, Cell
 
 OWN = """
 import dataclasses

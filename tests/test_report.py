@@ -18,7 +18,7 @@ from lqrsim.reports.page import report
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign, Cell
+from lqrsim.stress.study import Campaign, Cell
 from lqrsim.view import gl
 
 NASTY = '<script>alert("&")</script>'

@@ -24,7 +24,7 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import InputError
 from lqrsim.simulation.closed_loop import simulate_from
-from lqrsim.stress.specification import disturbances_as_json, disturbances_from_json
+from lqrsim.stress.study import disturbances_as_json, disturbances_from_json
 
 IMU = [
     Sensor("quadrotor_gyro", noise=0.01, bias=0.01, bias_walk=1e-3, rate=200.0),

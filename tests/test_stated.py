@@ -97,7 +97,7 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
 
 
 def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.stress.Results, tmp_path: Path) -> None:
-    assert ls.stress.Campaign.from_json(json.loads(json.dumps(CAMPAIGN.as_json()))) == CAMPAIGN
+    assert ls.stress.Campaign.from_json(CAMPAIGN.as_json(), ls.scenarios.quadrotor()) == CAMPAIGN
     assert results.manifest["campaign"]["design_disturbances"][2] == {
         "kind": "AxleMismatch",
         "settings": {"std": 0.01, "factor": None},

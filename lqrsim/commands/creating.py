@@ -138,7 +138,7 @@ class Export:
         from lqrsim.results import save_load
         from lqrsim.results.rollout import Rollout
         from lqrsim.stress.results import Results, replay
-        from lqrsim.stress.specification import Cell
+        from lqrsim.stress.study import Cell
 
         try:
             from lqrsim.gym import make_env, write_minari

@@ -1,6 +1,6 @@
 """Options that several commands share."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args
@@ -79,18 +79,29 @@ Json = Annotated[
 ]
 
 
+def stated(command: Any, record: type[Any]) -> dict[str, Any]:
+    """The options of a command that are fields of a record, by name."""
+    return {one.name: getattr(command, one.name) for one in fields(record) if hasattr(command, one.name)}
+
+
 @dataclass(frozen=True, kw_only=True)
-class PolicyOptions:
-    """A policy of a scenario under disturbances, for commands that examine one."""
+class SetupOptions:
+    """The options that state a `Setup`, for commands that run a scenario under disturbances."""
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """As in `lqrsim solve`."""
-    strength: Strength = 1.0
-    policy: PolicyName = "smooth"
-    """As in `lqrsim stress`."""
     design_disturbances: DesignSet = None
     solution: SolutionFile = None
     goal_radius: GoalRadius = None
     goal_tolerance: GoalTolerance = None
     seed: Seed = 0
     json: Json = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions(SetupOptions):
+    """The options that state a `Study`, for commands that examine one policy."""
+
+    strength: Strength = 1.0
+    policy: PolicyName = "smooth"
+    """As in `lqrsim stress`."""

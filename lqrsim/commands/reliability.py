@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, Suppress, arg
 
-from lqrsim.commands.options import Folder, Json, OwnScenario, PolicyOptions, optional
+from lqrsim.commands.options import Folder, Json, OwnScenario, StudyOptions, optional, stated
 
 if TYPE_CHECKING:
     from lqrsim.results.funnel import Funnel
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FailureOptions(PolicyOptions):
+class FailureOptions(StudyOptions):
     """Options of `rare`, `break` and `harden`."""
 
     sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
@@ -34,17 +34,7 @@ class FailureOptions(PolicyOptions):
         from lqrsim.scenarios.references import folder_name
         from lqrsim.stress.failure_search import ReliabilityProblem
 
-        problem = ReliabilityProblem(
-            self.scenario,
-            sweep=self.sweep,
-            strength=self.strength,
-            policy=self.policy,
-            design_disturbances=self.design_disturbances,
-            solution=self.solution,
-            failure=self.failure,
-            goal_radius=self.goal_radius,
-            goal_tolerance=self.goal_tolerance,
-        )
+        problem = ReliabilityProblem(**stated(self, ReliabilityProblem))
         folder = self.out or Path("runs") / command / folder_name(problem.resolved)
         console.check_output("--out", folder)
         return problem, folder
@@ -77,7 +67,7 @@ class Rare(FailureOptions):
 
         check_count("shown", self.shown)
         problem, folder = self._begin("rare")
-        options = {"particles": self.particles, "repetitions": self.repetitions, "seed": self.seed}
+        options = {"particles": self.particles, "repetitions": self.repetitions}
 
         def write(rare: "RareFailures") -> int:
             console.say(rare.summary())
@@ -126,7 +116,7 @@ class Break(FailureOptions):
         try:
             with console.keeping(write), console.progress("searching", "round") as progress:
                 smallest = problem.smallest_failure(
-                    rounds=self.rounds, particles=self.particles, seed=self.seed, report=console.say, progress=progress
+                    rounds=self.rounds, particles=self.particles, report=console.say, progress=progress
                 )
         except NoFailure as none:
             return _say_none(none)
@@ -189,7 +179,6 @@ class Harden(FailureOptions):
                 rounds=self.rounds,
                 particles=self.particles,
                 repetitions=self.repetitions,
-                seed=self.seed,
                 report=console.say,
                 progress=progress,
             )
@@ -264,7 +253,7 @@ def _write(found: "RareFailures | SmallestFailure", folder: Path, name: str, **o
 
 
 @dataclass(frozen=True, kw_only=True)
-class FunnelCommand(PolicyOptions):
+class FunnelCommand(StudyOptions):
     """Find from how far off its plan a policy still works.
 
     Prints, for some knots of the plan, the largest ellipsoid about it from which runs under disturbances reach the goal
@@ -295,29 +284,27 @@ class FunnelCommand(PolicyOptions):
     def run(self) -> int:
         from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
-        from lqrsim.scenarios.references import disturbance_set, folder_name, resolve
-        from lqrsim.scenarios.solutions import given
+        from lqrsim.scenarios.references import disturbance_set, folder_name
         from lqrsim.simulation.disturbances import InitialStateError
         from lqrsim.stress.funnels import FunnelOptions, funnel
-        from lqrsim.stress.policies import make_policy
+        from lqrsim.stress.study import Study
         from lqrsim.view.plots import plot_funnel
 
-        scenario = resolve(self.scenario)
+        study = Study(**stated(self, Study))
+        scenario = study.resolved
         folder = self.out or Path("runs/funnel") / folder_name(scenario)
         console.check_output("--out", folder)
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
         knots, states = self.knots or None, self.states or None
         options = self.rate, self.confidence, knots, states, self.failures, None, self.seed
         FunnelOptions.of(space, steps, *options)  # checked before the solve
-        scenario.target_radius(self.goal_radius, self.goal_tolerance)
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
             if isinstance(one, InitialStateError):
                 console.say("without the InitialStateError of the set: runs begin in states of the funnel")
                 one = one.scaled(0.0)  # keeps the other disturbances' random numbers
             disturbances.append(one.scaled(self.strength))
-        stored = None if self.solution is None else given(scenario, self.solution)
-        solution, controller = make_policy(self.policy, scenario, self.design_disturbances, stored)
+        closed_loop = study.closed_loop
 
         def write(found: "Funnel") -> int:
             console.say(found.summary())
@@ -330,10 +317,8 @@ class FunnelCommand(PolicyOptions):
 
         with console.keeping(write), console.progress("looking", "knot") as progress:
             found = funnel(
-                scenario.settled(solution).plant(),
-                solution,
+                **closed_loop,
                 disturbances=disturbances,
-                controller=controller,
                 rate=self.rate,
                 confidence=self.confidence,
                 knots=knots,
@@ -341,6 +326,5 @@ class FunnelCommand(PolicyOptions):
                 failures=self.failures,
                 seed=self.seed,
                 progress=progress,
-                **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         return write(found)

@@ -1,27 +1,17 @@
 """Commands of the stress test."""
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import (
-    CampaignPolicyName,
-    DesignSet,
-    Folder,
-    GoalRadius,
-    GoalTolerance,
-    Json,
-    OwnScenario,
-    SolutionFile,
-    optional,
-)
+from lqrsim.commands.options import CampaignPolicyName, Folder, Json, OwnScenario, SetupOptions, optional, stated
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stress:
+class Stress(SetupOptions):
     """Measure failure rates of policies against disturbance strength.
 
     All policies meet the same trials. After any interruption, rerunning the command resumes with identical results. On
@@ -31,8 +21,6 @@ class Stress:
     Exits with 1 if trials ended with an error.
     """
 
-    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
-    """As in `lqrsim solve`."""
     sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("light",)
     """Disturbances: a preset (calm, light, moderate, strong, severe), or scenario for its demo's disturbances;
     NAME:KIND for one kind alone."""
@@ -43,16 +31,10 @@ class Stress:
     during the run. track: follows the plan of smooth. offset_free: the same, and estimates the state and the
     disturbances. track_per_cell, offset_free_per_cell: these two, designed anew for the disturbances of each
     combination. By default the first four that the scenario allows: ilqr cannot keep constraints."""
-    design_disturbances: DesignSet = None
-    solution: SolutionFile = None
     trials: int = 200
     """Number of trials for each sweep, strength and policy."""
-    seed: int = 0
-    """Seed of all random numbers."""
     replan_every: Annotated[float | None, optional("SECONDS")] = None
     """Time between two solves of replan. By default a tenth of the horizon."""
-    goal_radius: GoalRadius = None
-    goal_tolerance: GoalTolerance = None
     shard: int = 500
     """Trials per file; an interruption loses at most this many per worker."""
     time_limit: Annotated[float, arg(metavar="SECONDS")] = 300.0
@@ -67,44 +49,27 @@ class Stress:
     """Trials that a worker simulates together; affects only time and memory."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786."""
-    json: Json = False
 
     def run(self) -> int:
         from lqrsim.commands import as_json, console
-        from lqrsim.scenarios.references import disturbance_set, folder_name, names_code, resolve
-        from lqrsim.scenarios.solutions import given
-        from lqrsim.stress.campaign import run_resolved
-        from lqrsim.stress.policies import DEFAULT_POLICIES, impossible_policies
+        from lqrsim.scenarios.references import folder_name, names_code
+        from lqrsim.stress.campaign import run_campaign
         from lqrsim.stress.results import Results
-        from lqrsim.stress.specification import Campaign
+        from lqrsim.stress.study import Campaign, Setup
 
-        scenario = resolve(self.scenario)
-        folder = self.out or Path("runs/stress") / folder_name(scenario)
-        solution = None if self.solution is None else given(scenario, self.solution)
+        setup = Setup(**stated(self, Setup))
+        folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
         if self.resume:
-            begun = Results(folder, scenario=self.scenario)
-            begun.resolved = scenario
-            campaign, solution = begun.campaign, solution or begun.given
+            campaign = Results(folder, scenario=self.scenario).campaign
+            campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
         else:
-            impossible, design = impossible_policies(scenario, solution), self.design_disturbances
-            possible = tuple(policy for policy in DEFAULT_POLICIES if policy not in impossible)
-            campaign = Campaign(
-                scenario=self.scenario,
-                sweeps={name: disturbance_set(name, scenario) for name in self.sweep},
-                strengths=self.strengths,
-                policies=self.policies or possible,
-                design_disturbances=None if design is None else disturbance_set(design, scenario),
-                trials=self.trials,
-                seed=self.seed,
-                replan_every=self.replan_every,
-                goal_radius=self.goal_radius,
-                goal_tolerance=self.goal_tolerance,
-                shard=self.shard,
-                time_limit=self.time_limit,
-            )
-        options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler, "solution": solution}
+            campaign = Campaign.of_sets(
+                setup, self.sweep, policies=self.policies, strengths=self.strengths, trials=self.trials,
+                replan_every=self.replan_every, shard=self.shard, time_limit=self.time_limit,
+            )  # fmt: skip
+        options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler}
         with console.progress("stressing", "trial") as progress:
-            results = run_resolved(campaign, scenario, folder, progress=progress, **options)
+            results = run_campaign(campaign, folder, progress=progress, **options)
         console.say(results.summary())
         console.wrote(folder)
         own = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
@@ -138,7 +103,7 @@ class Replay:
         from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.stress.results import Results, differences, replay
-        from lqrsim.stress.specification import Cell
+        from lqrsim.stress.study import Cell
         from lqrsim.versions import changed
 
         console.check_output("--out", self.out.parent, self.out.name)

@@ -29,8 +29,8 @@ from lqrsim.stress import analysis
 from lqrsim.stress.analysis import Success
 from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results, replay
-from lqrsim.stress.specification import Campaign, Cell
 from lqrsim.stress.statistics import Estimate
+from lqrsim.stress.study import Campaign, Cell
 from lqrsim.view import gl, style
 from lqrsim.view.style import RUNS
 

@@ -4,6 +4,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -127,7 +128,11 @@ class Scenario(OneVersion):
         check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:
-        """The robot in its scene, ready to run."""
+        """The robot in its scene, ready to run: one plant, which is made when first needed."""
+        return self._plant
+
+    @cached_property
+    def _plant(self) -> Plant:
         plant = Plant(self.robot, self.scene, self.simulator)
         return plant.for_period(self.problem.dt) if self.fit_timestep else plant
 

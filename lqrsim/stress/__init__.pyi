@@ -16,8 +16,10 @@ from .results import replay as replay
 from .safest import ComparedPlan as ComparedPlan
 from .safest import SafestPlan as SafestPlan
 from .safest import smooth_safest as smooth_safest
-from .specification import Campaign as Campaign
-from .specification import Cell as Cell
+from .study import Campaign as Campaign
+from .study import Cell as Cell
+from .study import Setup as Setup
+from .study import Study as Study
 from .trial_score import TrialScore as TrialScore
 from .trial_score import collision_score as collision_score
 from .trial_score import miss_score as miss_score

@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
 from lqrsim.stress.outcome_table import Outcomes
-from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import (
     CONFIDENCE,
     Estimate,
@@ -25,6 +24,7 @@ from lqrsim.stress.statistics import (
     rate,
     wilson,
 )
+from lqrsim.stress.study import Cell
 
 Table = Mapping[Cell, Outcomes]
 

@@ -9,7 +9,6 @@ the number of workers, the batch size or interruptions.
 
 import contextlib
 import itertools
-import json
 import logging
 import os
 import sys
@@ -32,11 +31,9 @@ from lqrsim.errors import (
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
-from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import executors
 from lqrsim.stress.campaign_files import (
@@ -61,7 +58,7 @@ from lqrsim.stress.policies import (
     solve,
 )
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign, Shard
+from lqrsim.stress.study import Campaign, Shard
 from lqrsim.stress.trials import Job
 from lqrsim.versions import changed, other_lqrsim, versions
 
@@ -77,7 +74,6 @@ def run_campaign(
     *,
     workers: int | None = None,
     batch: int = 256,
-    solution: Solution | str | os.PathLike[str] | None = None,
     scheduler: str | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Results:
@@ -85,12 +81,9 @@ def run_campaign(
 
     Args:
       campaign: the campaign to run.
-      folder: where everything is stored.
+      folder: where everything is stored, the campaign's `solution` too.
       workers: number of processes on this machine; by default one per processor. 0 runs everything in this process.
       batch: number of trials that a worker simulates together; affects only time and memory.
-      solution: a Solution, or the path of one, to run instead of solving the scenario. A solution of `ilqr` replaces
-        the solution of the policy "ilqr"; any other solution replaces the solutions of all other policies. It is stored
-        in the folder.
       scheduler: address of a dask cluster that does the work instead of processes on this machine.
       progress: called with the number of finished trials and the number of all trials, at the start and after each
         shard.
@@ -103,37 +96,20 @@ def run_campaign(
     """
     executors.end_if_started_by_import()
     check_kind("campaign", campaign, Campaign, "a Campaign")
-    options = {"workers": workers, "batch": batch, "scheduler": scheduler, "progress": progress}
-    return run_resolved(campaign, resolve(campaign.scenario), folder, solution=solution, **options)
-
-
-def run_resolved(
-    campaign: Campaign,
-    scenario: Scenario,
-    folder: str | os.PathLike[str],
-    *,
-    workers: int | None,
-    batch: int,
-    solution: Solution | str | os.PathLike[str] | None,
-    scheduler: str | None,
-    progress: Callable[[int, int], object] | None,
-) -> Results:
-    """Run a campaign with its resolved scenario: a user's function may return another scenario each time."""
     folder = check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
     batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
     check_progress(progress)
-    given = None if solution is None else solving.given(scenario, solution)
-    deterministic = _check_runnable(campaign, scenario, given)
+    deterministic = _check_runnable(campaign)
     _check_folder(folder)
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(sole_writer(folder))
-        _write_or_check_manifest(campaign, scenario, folder, given, deterministic)
+        _write_or_check_manifest(campaign, folder, deterministic)
         results = Results(folder, scenario=campaign.scenario)
-        results.resolved = scenario
+        results.campaign = campaign
         unfinished = _unfinished(results)
         if unfinished:
             if others := changed(results.manifest["versions"]):
@@ -142,7 +118,7 @@ def run_resolved(
                     " or another folder"
                 )
             results.trials.warm_up()  # done here first, so that the workers find everything compiled
-        job = Job.of(results.trials, results.manifest["digest"], batch)
+        job = Job.of(results.trials, results.manifest, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
         if progress is not None:
@@ -164,12 +140,13 @@ def run_resolved(
     return results
 
 
-def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> list[tuple[str, float]]:
+def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     """Raise InputError for errors that would occur in every trial, before anything is solved or written.
 
     Returns:
       The sweeps and strengths whose disturbances are lqrsim's own and draw nothing. Others may draw during a run.
     """
+    scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()
     impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:
@@ -182,7 +159,7 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
     if problem.duration is None:
         plant.substeps(problem.dt)
-    scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
+    _ = campaign.near_enough  # checks that
     fixed = {(cell.sweep, cell.strength): True for cell in campaign.cells}
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):
@@ -224,16 +201,11 @@ def _check_folder(folder: Path) -> None:
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
 
 
-def _write_or_check_manifest(
-    campaign: Campaign,
-    scenario: Scenario,
-    folder: Path,
-    given: Solution | None,
-    deterministic: list[tuple[str, float]],
-) -> None:
+def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: list[tuple[str, float]]) -> None:
     """Solve for the policies, store them, and write the manifest; or check an existing manifest."""
+    scenario, given = campaign.resolved, campaign.given
     specification = {
-        "campaign": json.loads(json.dumps(campaign.as_json())),
+        "campaign": campaign.as_json(),
         "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
         "start": solving.digest_of_start(scenario),

@@ -16,7 +16,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from lqrsim.annotations import Line, checked
 from lqrsim.errors import InputError, excerpt
 from lqrsim.results.archive import Other, blamed, canonical, parse, replacing, sha256
 from lqrsim.results.solution import Solution
-from lqrsim.stress.specification import Campaign, Cell, Shard
+from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Cell, Shard
 
 _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
 
@@ -211,12 +211,12 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def _check(manifest: dict[str, Any]) -> None:
     """Raise InputError unless all fields are there, and the hashes fit."""
-    _check_names("manifest", manifest, _Manifest)
+    _check_names("manifest", manifest, [one.name for one in fields(_Manifest)])
     _Manifest(**manifest)
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
     campaign = manifest["campaign"]
-    _check_names("campaign", campaign, Campaign)
+    _check_names("campaign", campaign, CAMPAIGN_FIELDS)
     if canonical(manifest["cells"]) != canonical(_cells(campaign)):
         raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
     pairs = [[sweep, strength] for _, sweep, strength in manifest["cells"]]
@@ -231,9 +231,8 @@ def _check(manifest: dict[str, Any]) -> None:
         raise InputError("digest: got a hash that does not fit the campaign, want an unchanged file")
 
 
-def _check_names(field: str, found: Mapping[str, Any], kind: type[Any]) -> None:
-    """Raise InputError unless an object of JSON has exactly the fields of a dataclass."""
-    names = [one.name for one in fields(kind)]
+def _check_names(field: str, found: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Raise InputError unless an object of JSON has exactly these fields."""
     if wrong := sorted(found.keys() ^ set(names)):
         got = f"{'' if wrong[0] in found else 'none of '}{excerpt(wrong[0])}"
         raise InputError(f"{field}: got {got}, want exactly {', '.join(names)}")

@@ -10,8 +10,8 @@ from lqrsim.errors import InputError, check_items, check_name, excerpt, printabl
 from lqrsim.stress.analysis import Comparison, compared
 from lqrsim.stress.data_table import DataTable, Entry, fraction_format
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import CONFIDENCE
+from lqrsim.stress.study import Cell
 
 # What may differ between two campaigns that are compared: settings, and other fields of the manifest.
 _SETTINGS = ("scenario", "replan_every", "design_disturbances")

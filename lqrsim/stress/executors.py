@@ -26,7 +26,7 @@ from typing import Any
 
 from lqrsim import process
 from lqrsim.errors import InputError, format_error
-from lqrsim.stress.specification import Shard
+from lqrsim.stress.study import Shard
 from lqrsim.stress.trials import Job
 from lqrsim.versions import versions
 

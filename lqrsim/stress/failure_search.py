@@ -10,7 +10,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,15 +23,10 @@ from lqrsim.errors import (
     InputError,
     check_count,
     check_function,
-    check_kind,
     check_name,
-    check_number,
     check_path,
     check_progress,
     check_seed,
-    check_text,
-    keep,
-    keep_positive,
 )
 from lqrsim.machine import description
 from lqrsim.process import keeping
@@ -40,109 +35,45 @@ from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenarios import solutions as solving
-from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import disturbance_set, from_anywhere, resolve
-from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
 from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, check_keep, failure_probability
-from lqrsim.stress.policies import POLICIES, check_designed, make_policy
-from lqrsim.stress.specification import disturbances_as_json
 from lqrsim.stress.statistics import Estimate, rounded
+from lqrsim.stress.study import Study, disturbances_as_json
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
 from lqrsim.versions import versions
 
 FAILURES = {"collision": collision_score, "miss": miss_score}
-ASKED = (  # the fields of a problem that its certificate names
-    "scenario", "sweep", "strength", "policy", "design_disturbances", "failure", "goal_radius", "goal_tolerance",
-)  # fmt: skip
 TIE_EVERY = 5.0  # s between reports while the pilot run draws more at a tie
 Report = Callable[[str], object]
 
 
-@dataclass(frozen=True, eq=False)
-class ReliabilityProblem:
-    """A policy of a scenario under disturbances, and a definition of its failure. It is solved when first needed.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReliabilityProblem(Study):
+    """A study, and a definition of its failure.
 
     Attributes:
-      scenario: as in `lqrsim solve`. Relative paths become absolute.
-      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
-        demo.
-      strength: factor by which they are scaled.
-      policy: as in `Campaign`.
-      design_disturbances: the name of the set for which "track" or "offset_free" is designed; by default as in
-        `Campaign`.
       failure: "collision": the robot collides, or its simulation diverges; "miss": it does not reach its goal.
-      goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
-      goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
-      solution: a Solution, or the path of one, to run instead of solving the scenario, as in `run_campaign`.
     """
 
-    scenario: str
-    _: KW_ONLY
-    sweep: str = "scenario"
-    strength: float = 1.0
-    policy: str = "smooth"
     failure: str = "collision"
-    goal_radius: float | None = None
-    goal_tolerance: float | None = None
-    design_disturbances: str | None = None
-    solution: Solution | str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
-        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
-        keep(self, scenario=from_anywhere(self.scenario))
-        check_text("sweep", self.sweep, "a name, such as 'light'")
-        keep(self, strength=check_number("strength", self.strength, above=0.0))
-        check_name("policy", self.policy, POLICIES)
-        if self.design_disturbances is not None:
-            check_designed((self.policy,))
-            check_text("design_disturbances", self.design_disturbances, "a name, such as 'light'")
+        super().__post_init__()
         check_name("failure", self.failure, FAILURES)
-        kinds = (Solution, str, os.PathLike, type(None))
-        check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
-        keep_positive(self, "goal_radius", "goal_tolerance")
 
     @cached_property
     def score(self) -> TrialScore:
         """The score of trials as a function of their random numbers. Raises InputError if no such failure can occur."""
-        scenario, plant = self.resolved, self.resolved.plant()
-        scenario.target_radius(self.goal_radius, self.goal_tolerance)  # checked before the scenario is solved
-        disturbances = self.disturbances
-        if self.failure == "collision" and not len(plant.world):
+        disturbances = self.disturbances  # checked before the scenario is solved
+        if self.failure == "collision" and not len(self.resolved.plant().world):
             raise InputError(
                 f"failure: got 'collision' for {self.scenario}, which has no obstacles with a distance, want 'miss'"
             )
-        # Whoever has a Solution at hand knows of which problem it is.
-        remark = not isinstance(self.solution, Solution)
-        solution, controller = make_policy(self.policy, scenario, self.design_disturbances, self.given, remark=remark)
-        score = TrialScore(
-            scenario.settled(solution).plant(),
-            solution,
-            disturbances,
-            controller=controller,
-            **scenario.near_enough(self.goal_radius, self.goal_tolerance),
-            failure=FAILURES[self.failure],
-        )
+        score = TrialScore(**self.closed_loop, disturbances=disturbances, failure=FAILURES[self.failure])
         if score.size == 0:
             raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want a random disturbance")
         return score
-
-    @cached_property
-    def resolved(self) -> Scenario:
-        """The scenario that the reference names. Raises InputError if there is none."""
-        return resolve(self.scenario)
-
-    @cached_property
-    def given(self) -> Solution | None:
-        """The solution that was given instead of solving, or None. Raises InputError if the solution does not fit."""
-        return None if self.solution is None else solving.given(self.resolved, self.solution)
-
-    @cached_property
-    def disturbances(self) -> list[Disturbance]:
-        """The disturbances of the set, scaled by the strength. Raises InputError if there is no such set."""
-        return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -170,7 +101,7 @@ class ReliabilityProblem:
         particles: int = 250,
         repetitions: int = 10,
         keep: float = 0.1,
-        seed: int = 0,
+        seed: int | None = None,
         report: Report | None = None,
         progress: Progress | None = None,
     ) -> "RareFailures":
@@ -181,7 +112,7 @@ class ReliabilityProblem:
           repetitions: number of independent estimates, from which the interval follows.
           keep: fraction of the trials that exceeds the next level, at least 2 / `particles`. With 0 there are no
             levels, and failures are counted.
-          seed: seed of all random numbers.
+          seed: seed of all random numbers; by default that of the study.
           report: called with the summary, and with a line for each level that the pilot run finds.
           progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so
             far as text.
@@ -194,7 +125,7 @@ class ReliabilityProblem:
           KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
         options: dict[str, Any] = {
-            "seed": check_seed("seed", seed),
+            "seed": self.seed if seed is None else check_seed("seed", seed),
             "particles": check_count("particles", particles, at_least=20),
             "repetitions": check_count("repetitions", repetitions, at_least=2, at_most=MOST),
             "keep": check_keep(keep, particles),
@@ -209,7 +140,7 @@ class ReliabilityProblem:
         *,
         rounds: int = 40,
         particles: int = 200,
-        seed: int = 0,
+        seed: int | None = None,
         report: Report | None = None,
         progress: Progress | None = None,
     ) -> "SmallestFailure":
@@ -218,7 +149,7 @@ class ReliabilityProblem:
         Args:
           rounds: largest number of rounds.
           particles: number of trials at each level of the splitting that finds first failures.
-          seed: seed of all random numbers.
+          seed: seed of all random numbers; by default that of the study.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
           progress: called with the number of finished rounds, the number of all rounds, and the distance so far as
             text.
@@ -232,7 +163,8 @@ class ReliabilityProblem:
           NoFailure: none was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
-        seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_most=MOST)
+        seed = self.seed if seed is None else check_seed("seed", seed)
+        rounds = check_count("rounds", rounds, at_most=MOST)
         particles = check_count("particles", particles, at_least=20)
         score = self._begin(report, progress)
         before = score.simulations
@@ -354,12 +286,11 @@ class RareFailures:
     def certificate(self) -> FailureCertificate:
         """The probability with everything needed to measure it again; `save` writes it, and `certify` checks it."""
         problem, one = self.problem, self.probability
-        asked = {name: getattr(problem, name) for name in ASKED}
+        stated = {field.name: getattr(problem, field.name) for field in fields(problem)}
+        stated |= {name: self.options[name] for name in ("seed", "particles", "keep")}
         return FailureCertificate(
-            **asked, **problem.facts, solution=problem.score.solution, probability=one.value, low=one.low,
-            high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions,
-            particles=self.options["particles"], seed=self.options["seed"], versions=versions(),
-            keep=self.options["keep"],
+            **{**stated, **problem.facts, "solution": problem.score.solution}, probability=one.value, low=one.low,
+            high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions, versions=versions(),
         )  # fmt: skip
 
     def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout:

@@ -183,7 +183,7 @@ def harden(
     rounds: int = 4,
     particles: int | None = None,
     repetitions: int = 10,
-    seed: int = 0,
+    seed: int | None = None,
     report: Report | None = None,
     progress: Progress | None = None,
 ) -> HardenedPlan:
@@ -198,7 +198,7 @@ def harden(
       particles: as in `ReliabilityProblem.rare_failures`. By default 250; for a `chance` from 0.005 on 10 / `chance`,
         so that failures are counted.
       repetitions: as in `ReliabilityProblem.rare_failures`.
-      seed: seed of the first measurement; the others have the seeds after it.
+      seed: seed of the first measurement, by default that of the problem; the others have the seeds after it.
       report: called with a description of the run, and with a line for each plan.
       progress: called with the number of finished repetitions, the largest possible number, and the result so far as
         text.
@@ -219,7 +219,7 @@ def harden(
         particles = 250 if chance < COUNTED else max(20, ceil(FAILING / chance))
     check_count("particles", particles, at_least=20)
     check_count("repetitions", repetitions, at_least=2)
-    seed = check_seed("seed", seed)
+    seed = problem.seed if seed is None else check_seed("seed", seed)
     check_function("report", report, "a function of a line of text", arguments=1)
     check_progress(progress, text=True)
     options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}

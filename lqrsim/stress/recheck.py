@@ -1,12 +1,12 @@
 """Checking a certificate: the measurement of `RareFailures.certificate` again, as `lqrsim certify`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from lqrsim.errors import InputError, check_count, check_kind
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.scenarios.references import names_code
-from lqrsim.stress.failure_search import ASKED, RareFailures, ReliabilityProblem, Report
+from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report
 from lqrsim.stress.multilevel_splitting import Progress
 from lqrsim.versions import changed
 
@@ -75,20 +75,21 @@ def certify(
     count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
     if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
-    asked: dict[str, Any] = {name: getattr(certificate, name) for name in ASKED} | {"solution": certificate.solution}
+    stated: dict[str, Any] = {one.name: getattr(certificate, one.name) for one in fields(ReliabilityProblem)}
     if scenario is not None:
-        asked["scenario"] = scenario
-    problem = ReliabilityProblem(**asked)
+        stated["scenario"] = scenario
+    problem = ReliabilityProblem(**stated)
     now = problem.facts
     differences = [
         f"{name}: got {value}, want {was}"
         for name, value in now.items()
         if value != (was := getattr(certificate, name))
     ]
-    options: dict[str, Any] = {"particles": certificate.particles, "keep": certificate.keep}
-    options["seed"] = certificate.seed if seed is None else seed
-    measured = problem.rare_failures(repetitions=count, **options, report=report, progress=progress)
-    fresh = f"seed {seed} (was {certificate.seed})" if options["seed"] != certificate.seed else ""
+    measured = problem.rare_failures(
+        particles=certificate.particles, repetitions=count, keep=certificate.keep, seed=seed, report=report,
+        progress=progress,
+    )  # fmt: skip
+    fresh = f"seed {seed} (was {certificate.seed})" if seed not in (None, certificate.seed) else ""
     others, one = fresh or changed(certificate.versions), measured.probability
     if others:
         if one.low > certificate.high or certificate.low > one.high:

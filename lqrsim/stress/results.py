@@ -33,8 +33,8 @@ from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest
 from lqrsim.stress.data_table import DataTable, fraction_format
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
-from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE
+from lqrsim.stress.study import Campaign, Cell, Shard
 from lqrsim.stress.trials import Trials
 
 MOST_REASONS = 5  # largest number of reasons in a summary
@@ -65,26 +65,23 @@ class Results:
                 raise InputError(f"scenario: got {excerpt(scenario)}, want {reference}, which {self.folder} was run on")
 
     @cached_property
-    def resolved(self) -> Scenario:
-        """The campaign's scenario. Raises InputError if it is your own function, and no scenario was given."""
-        return resolve(self.manifest["campaign"]["scenario"], registered_only=self._scenario is None)
-
-    @cached_property
     def campaign(self) -> Campaign:
-        """The specification. Raises InputError if it contains your own disturbances, and no scenario was given."""
-        _ = self.resolved  # resolving the scenario may define disturbances
-        return Campaign.from_json(self.manifest["campaign"])
+        """The campaign. Raises InputError if its scenario is your own function, and no scenario was given."""
+        stated = self.manifest["campaign"]
+        scenario = resolve(stated["scenario"], registered_only=self._scenario is None)
+        given = None if self.manifest["solution"] is None else self.folder / GIVEN
+        return Campaign.from_json(stated, scenario, given)
+
+    @property
+    def resolved(self) -> Scenario:
+        """The campaign's scenario. Raises InputError as `campaign` does."""
+        return self.campaign.resolved
 
     @cached_property
     def trials(self) -> Trials:
         """Runs the campaign's trials. Raises InputError as `campaign` does, or if a policy is damaged."""
         solutions = {policy: self.solution(policy) for policy in self.campaign.policies}
-        return Trials(self.campaign, self.resolved, solutions)
-
-    @property
-    def given(self) -> Path | None:
-        """The file of the solution that was given instead of solving; None if there was none."""
-        return None if self.manifest["solution"] is None else self.folder / GIVEN
+        return Trials(self.campaign, solutions)
 
     @property
     def complete(self) -> bool:

@@ -12,21 +12,20 @@ from lqrsim.errors import format_error
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.stress.campaign_files import Table, pack
 from lqrsim.stress.outcome_table import COLUMNS, Outcomes, outcomes
 from lqrsim.stress.policies import POLICY_KINDS, make_controller
-from lqrsim.stress.specification import Campaign, Cell, Shard
+from lqrsim.stress.study import Campaign, Cell, Shard
 
 
 class Trials:
     """Runs the trials of a campaign's cells, each policy with its solution."""
 
-    def __init__(self, campaign: Campaign, scenario: Scenario, solutions: Mapping[str, Solution]) -> None:
+    def __init__(self, campaign: Campaign, solutions: Mapping[str, Solution]) -> None:
         self.campaign, self.solutions = campaign, solutions
-        self.scenario = scenario.settled(next(iter(solutions.values())))  # all plans have the same duration
+        self.scenario = campaign.resolved.settled(next(iter(solutions.values())))  # all plans have the same duration
         self.plant = self.scenario.plant()
         self._controllers: dict[str | tuple[str, str, float], Controller | AffinePolicy] = {}
 
@@ -37,7 +36,7 @@ class Trials:
             self.solutions[cell.policy],
             controller=self._controller(cell),
             disturbances=self.campaign.disturbances(cell),
-            **self.scenario.near_enough(self.campaign.goal_radius, self.campaign.goal_tolerance),
+            **self.campaign.near_enough,
             seed=self.campaign.seed,
             trials=count,
             first_trial=first,
@@ -105,7 +104,7 @@ class Job:
     """Everything that a worker needs for a campaign.
 
     Attributes:
-      campaign: the campaign as JSON. digest: digest in the campaign's manifest. solutions: solutions by policy.
+      campaign: the campaign as in its manifest. digest: the manifest's. solutions: solutions by policy.
       batch: number of trials to simulate together.
       run: an identifier that differs in every run, even of the same campaign.
     """
@@ -117,18 +116,18 @@ class Job:
     run: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
 
     @classmethod
-    def of(cls, trials: Trials, digest: str, batch: int) -> "Job":
+    def of(cls, trials: Trials, manifest: Mapping[str, Any], batch: int) -> "Job":
         """The job of running these trials elsewhere. Its solutions lack the logs of their solves."""
         unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
         solutions = {policy: replace(solution, **unused) for policy, solution in trials.solutions.items()}
-        return cls(trials.campaign.as_json(), digest, solutions, batch)
+        return cls(manifest["campaign"], manifest["digest"], solutions, batch)
 
     def prepare(self) -> Trials:
         """The trials of this job, kept in this process until there is another job."""
         if self.run not in _prepared:
             _prepared.clear()
-            scenario = resolve(self.campaign["scenario"])  # first, because it may define disturbances
-            trials = Trials(Campaign.from_json(self.campaign), scenario, self.solutions)
+            campaign = Campaign.from_json(self.campaign, resolve(self.campaign["scenario"]))
+            trials = Trials(campaign, self.solutions)
             trials.warm_up()
             _prepared[self.run] = trials
         return _prepared[self.run]

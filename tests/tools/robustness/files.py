@@ -34,7 +34,7 @@ from lqrsim.simulation.disturbances import MeasurementNoise
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.campaign_files import digest_of_rows
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign
+from lqrsim.stress.study import Campaign
 from lqrsim.view.recorded_trial import RecordedTrial
 from robustness import mutations
 from robustness.common import Config, Hang, limited

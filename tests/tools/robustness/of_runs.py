@@ -182,8 +182,9 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     asked = {
         "scenario": reference, "sweeps": {"noise": (ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
         "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "goal_radius": 0.1,
-        "goal_tolerance": None, "shard": 2, "time_limit": 60.0, "design_disturbances": None,
+        "goal_tolerance": None, "shard": 2, "time_limit": 60.0, "design_disturbances": None, "solution": None,
     }  # fmt: skip
+    setup = {name: asked[name] for name in ("scenario", "solution", "goal_radius", "goal_tolerance", "seed")}
     campaign = ls.stress.Campaign(**asked)
     results = ls.stress.run_campaign(campaign, place.folder / "campaign", workers=0)
     score = ls.stress.TrialScore(place.plant, place.solution, [ControlNoise(0.5)], threads=1)
@@ -206,14 +207,19 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     reliability = ls.stress.ReliabilityProblem(reference, policy="open_loop", failure="miss", goal_radius=0.0565)
     certificate = reliability.rare_failures(particles=20, repetitions=2, seed=0).certificate()
     return {
+        "Setup": (setup | {"design_disturbances": None},),
+        "Study": (setup | {"sweep": "light", "strength": 1.0, "policy": "smooth", "design_disturbances": None},),
         "Campaign": (asked,),
+        "Campaign.of_sets": ({
+            "setup": ls.stress.Setup(**setup), "sets": ["scenario"], "policies": ["open_loop"], "trials": 2
+        },),
         "Campaign.disturbances": ({"self": campaign, "cell": cell},),
-        "Campaign.from_json": ({"fields": campaign.as_json()},),
+        "Campaign.from_json": ({"fields": campaign.as_json(), "scenario": campaign.resolved, "solution": None},),
         "Cell": ({"policy": "smooth", "sweep": "noise", "strength": 1.0},),
         "Cell.named": ({"text": "0", "cells": results.cells},),
         "run_campaign": ({
             "campaign": campaign, "folder": place.folder / "campaign", "workers": 0, "batch": 4, "scheduler": None,
-            "solution": None, "progress": print_nothing,
+            "progress": print_nothing,
         }, 0.1),
         "Results": ({"folder": place.folder / "campaign", "scenario": reference},),
         "replay": ({"results": results, "cell": cell, "trial": 0, "frames": False, "contacts": True},),
@@ -250,7 +256,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "ReliabilityProblem": ({
             "scenario": reference, "sweep": "light", "strength": 1.0, "policy": "smooth", "failure": "miss",
-            "goal_radius": 0.1, "goal_tolerance": None, "design_disturbances": None, "solution": None,
+            "goal_radius": 0.1, "goal_tolerance": None, "design_disturbances": None, "solution": None, "seed": 0,
         },),
         **{
             f"ReliabilityProblem.{name}": ({

@@ -1,11 +1,18 @@
-"""The specification of a campaign: plain data that converts to JSON and back."""
+"""What is run: the records that state studies and campaigns. Plain data, which converts to JSON and back.
+
+A study is one policy of a scenario under disturbances; a campaign is many, with trials of each. Both state the same
+`Setup`. A study becomes a plant and a controller in `Study.closed_loop`, a campaign in `trials.Trials`.
+"""
 
 import dataclasses
 import inspect
 import itertools
+import json
+import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,9 +30,20 @@ from lqrsim.errors import (
     keep,
     keep_positive,
 )
-from lqrsim.scenarios.references import from_anywhere
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios import solutions
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenarios.references import disturbance_set, from_anywhere, resolve
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.stress.policies import CAMPAIGN_POLICIES, DEFAULT_POLICIES, check_designed
+from lqrsim.stress.policies import (
+    CAMPAIGN_POLICIES,
+    DEFAULT_POLICIES,
+    POLICIES,
+    check_designed,
+    design_disturbances,
+    impossible_policies,
+    make_policy,
+)
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
 
@@ -90,46 +108,124 @@ class Shard:
         return f"{self.cell:04d}-{self.first:09d}.parquet"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Campaign:
-    """The specification of a stress test.
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What every study of a scenario states, of one policy or of many: the base of `Study` and `Campaign`.
 
     Attributes:
-      scenario: as in `lqrsim solve`.
+      scenario: as in `lqrsim solve`. Relative paths become absolute.
+      solution: a Solution, or the path of one, to run instead of solving the scenario. A solution of `ilqr` replaces
+        that of the policy "ilqr", any other those of all other policies.
+      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of the
+        disturbances in a trial: of a campaign a tuple of them, of a study the name of a set. By default the preset
+        "moderate": one policy serves all strengths, and this preset is in the middle.
+      goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
+      goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
+      seed: seed of all random numbers.
+    """
+
+    scenario: str
+    _: KW_ONLY
+    solution: Solution | str | os.PathLike[str] | None = None
+    design_disturbances: tuple[Disturbance, ...] | str | None = None
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
+        keep(self, scenario=from_anywhere(self.scenario))  # workers and reports may run in other folders
+        kinds = (Solution, str, os.PathLike, type(None))
+        check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
+        keep_positive(self, "goal_radius", "goal_tolerance")
+        keep(self, seed=check_seed("seed", self.seed))
+
+    @cached_property
+    def resolved(self) -> Scenario:
+        """The scenario, made once: a user's function may return another each time."""
+        return resolve(self.scenario)
+
+    @cached_property
+    def given(self) -> Solution | None:
+        """The solution that was given instead of solving, or None. Raises InputError if the solution does not fit."""
+        return None if self.solution is None else solutions.given(self.resolved, self.solution)
+
+    @cached_property
+    def near_enough(self) -> dict[str, Any]:
+        """The goal options of `simulate`. Raises InputError if they do not fit the scenario."""
+        self.resolved.target_radius(self.goal_radius, self.goal_tolerance)
+        return self.resolved.near_enough(self.goal_radius, self.goal_tolerance)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Study(Setup):
+    """A policy of a scenario under disturbances. The scenario is solved when first needed.
+
+    Attributes:
+      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
+        demo.
+      strength: factor by which they are scaled.
+      policy: as in `Campaign`.
+    """
+
+    design_disturbances: str | None = None
+    sweep: str = "scenario"
+    strength: float = 1.0
+    policy: str = "smooth"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_text("sweep", self.sweep, "a name, such as 'light'")
+        keep(self, strength=check_number("strength", self.strength, above=0.0))
+        check_name("policy", self.policy, POLICIES)
+        if self.design_disturbances is not None:
+            check_designed((self.policy,))
+            check_text("design_disturbances", self.design_disturbances, "a name, such as 'light'")
+
+    @cached_property
+    def disturbances(self) -> list[Disturbance]:
+        """The disturbances of the set, scaled by the strength. Raises InputError if there is no such set."""
+        return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
+
+    @cached_property
+    def closed_loop(self) -> dict[str, Any]:
+        """The arguments of `funnel` and `TrialScore` but the disturbances: plant, solution, controller and goal."""
+        near, design = self.near_enough, self.design_disturbances  # checked before the scenario is solved
+        # Whoever has a Solution at hand knows of which problem it is.
+        remark = not isinstance(self.solution, Solution)
+        solution, controller = make_policy(self.policy, self.resolved, design, self.given, remark=remark)
+        plant = self.resolved.settled(solution).plant()
+        return {"plant": plant, "solution": solution, "controller": controller, **near}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Campaign(Setup):
+    """A stress test: trials of policies under disturbances of growing strength.
+
+    Attributes:
       sweeps: name -> disturbances at strength 1.
       strengths: factors by which the disturbances are scaled.
       policies: some of CAMPAIGN_POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is
         the plan of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan
         of smooth, with lqrsim.track and lqrsim.OffsetFree; "track_per_cell", "offset_free_per_cell" are designed anew
         for the disturbances of each cell, which no single policy knows. By default the first four.
-      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of the
-        disturbances in a trial. By default the preset "moderate": one policy serves all strengths, and this preset is
-        in the middle.
       trials: number of trials of each cell.
-      seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
-      goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
-      goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
       shard: trials per file.
       time_limit: seconds after which a shard counts as hung.
     """
 
-    scenario: str
+    design_disturbances: tuple[Disturbance, ...] | None = None
     sweeps: Mapping[str, tuple[Disturbance, ...]]
     strengths: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0)
     policies: tuple[str, ...] = DEFAULT_POLICIES
     trials: int = 200
-    seed: int = 0
     replan_every: float | None = None
-    goal_radius: float | None = None
-    goal_tolerance: float | None = None
     shard: int = 500
     time_limit: float = 300.0
-    design_disturbances: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
-        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
-        keep(self, scenario=from_anywhere(self.scenario))  # workers and reports may run in other folders
+        super().__post_init__()
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
         wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
@@ -159,15 +255,37 @@ class Campaign:
             keep(self, design_disturbances=design)
         for field in ("trials", "shard"):
             keep(self, **{field: check_count(field, getattr(self, field))})
-        keep(self, seed=check_seed("seed", self.seed))
         files = -(-self.trials // self.shard) * len(self.cells)
         if files > _MOST_FILES:
             raise InputError(
                 f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which takes {files}"
                 f" files, want at most {_MOST_FILES}: fewer trials, or larger shards"
             )
-        keep_positive(self, "replan_every", "goal_radius", "goal_tolerance")
+        keep_positive(self, "replan_every")
         keep(self, time_limit=check_number("time_limit", self.time_limit, above=0.0))
+
+    @classmethod
+    def of_sets(cls, setup: Setup, sets: Sequence[str], *, policies: Sequence[str] = (), **options: Any) -> "Campaign":
+        """A campaign whose disturbances are sets by name, as in `lqrsim stress`.
+
+        Args:
+          setup: scenario, solution, goal and seed; its design disturbances are a set, too.
+          sets: names of the sweeps.
+          policies: as in `Campaign`; by default those of the first four that the scenario allows.
+          **options: the other attributes of `Campaign`.
+        """
+        scenario, stated = setup.resolved, {one.name: getattr(setup, one.name) for one in dataclasses.fields(Setup)}
+        if setup.design_disturbances is not None:
+            stated["design_disturbances"] = tuple(design_disturbances(scenario, setup.design_disturbances))
+        impossible = impossible_policies(scenario, setup.given)
+        campaign = cls(
+            **stated,
+            sweeps={name: disturbance_set(name, scenario) for name in sets},
+            policies=tuple(policies) or tuple(one for one in DEFAULT_POLICIES if one not in impossible),
+            **options,
+        )
+        keep(campaign, resolved=scenario, given=setup.given)
+        return campaign
 
     @property
     def cells(self) -> list[Cell]:
@@ -186,36 +304,40 @@ class Campaign:
         return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
     def as_json(self) -> dict[str, Any]:
-        """The campaign as plain data, from which `from_json` makes it again."""
+        """The campaign as plain data without its solution, from which `from_json` makes it again."""
         design = self.design_disturbances
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {
+        fields = {name: getattr(self, name) for name in CAMPAIGN_FIELDS} | {
             "sweeps": {name: disturbances_as_json(disturbances) for name, disturbances in self.sweeps.items()},
             "design_disturbances": None if design is None else disturbances_as_json(design),
-            "strengths": list(self.strengths),
-            "policies": list(self.policies),
         }
+        return json.loads(json.dumps(fields))
 
     @classmethod
-    def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
-        """The campaign that `as_json` describes. Resolve its scenario first, because this may define disturbances.
+    def from_json(
+        cls, fields: Mapping[str, Any], scenario: Scenario, solution: str | os.PathLike[str] | None = None
+    ) -> "Campaign":
+        """The campaign that `as_json` describes.
 
         Args:
           fields: the result of `as_json`.
+          scenario: its scenario, which is resolved before because this may define disturbances.
+          solution: the path of its solution.
         """
         check_kind("campaign", fields, Mapping, "what lqrsim wrote")
         try:
             design = fields["design_disturbances"]
-            return cls(
-                **{
-                    **fields,
-                    "sweeps": {name: disturbances_from_json(some) for name, some in fields["sweeps"].items()},
-                    "design_disturbances": None if design is None else disturbances_from_json(design),
-                }
-            )
+            sweeps = {name: disturbances_from_json(some) for name, some in fields["sweeps"].items()}
+            design = None if design is None else disturbances_from_json(design)
+            campaign = cls(**{**fields, "solution": solution, "sweeps": sweeps, "design_disturbances": design})
         except InputError:
             raise
         except Exception as error:  # a disturbance may raise anything for settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want one that lqrsim wrote ({error})") from None
+        keep(campaign, resolved=check_kind("scenario", scenario, Scenario, "the campaign's Scenario"))
+        return campaign
+
+
+CAMPAIGN_FIELDS = tuple(one.name for one in dataclasses.fields(Campaign) if one.name != "solution")
 
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:
