@@ -1,6 +1,8 @@
 """Options that several commands share."""
 
-from dataclasses import dataclass, fields, replace
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args
@@ -79,9 +81,9 @@ Json = Annotated[
 ]
 
 
-def stated(command: Any, record: type[Any]) -> dict[str, Any]:
-    """The options of a command that are fields of a record, by name."""
-    return {one.name: getattr(command, one.name) for one in fields(record) if hasattr(command, one.name)}
+def stated(command: Any, function: Callable[..., Any]) -> dict[str, Any]:
+    """The options of a command that a function or a record takes, by name."""
+    return {name: getattr(command, name) for name in inspect.signature(function).parameters if hasattr(command, name)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,10 @@
 """Commands that examine how reliable a policy is: rare failures, the smallest failure, and funnels."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, Suppress, arg
 
@@ -28,16 +29,35 @@ class FailureOptions(StudyOptions):
     out: Folder = None
     """Output folder. By default runs/, the name of the command, and the name of the scenario."""
 
-    def _begin(self, command: str) -> "tuple[ReliabilityProblem, Path]":
-        """The problem, and the folder for the results. Raises InputError for a folder that cannot be written."""
+    def run(self) -> int:
         from lqrsim.commands import console
         from lqrsim.scenarios.references import folder_name
         from lqrsim.stress.failure_search import ReliabilityProblem
+        from lqrsim.stress.multilevel_splitting import NoFailure
 
         problem = ReliabilityProblem(**stated(self, ReliabilityProblem))
-        folder = self.out or Path("runs") / command / folder_name(problem.resolved)
+        folder = self.out or Path("runs") / type(self).__name__.lower() / folder_name(problem.resolved)
         console.check_output("--out", folder)
-        return problem, folder
+
+        def write(found: Any) -> int:
+            return self._write(found, folder)
+
+        try:
+            with console.keeping(write), console.progress(*self.SEARCH) as progress:
+                found = self._search(problem, report=console.say, progress=progress)
+        except NoFailure as none:
+            return _say_none(none)
+        return write(found)
+
+    SEARCH: ClassVar[tuple[str, str]]  # what the command does, and in which units, for its progress
+
+    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> Any:
+        """The result of the search, with these callbacks."""
+        raise NotImplementedError
+
+    def _write(self, found: Any, folder: Path) -> int:
+        """Write a result, and print it. Returns the exit code."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,30 +80,22 @@ class Rare(FailureOptions):
     shown: int = 8
     """Number of failures to write."""
 
-    def run(self) -> int:
+    SEARCH = "splitting", "repetition"
+
+    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "RareFailures":
+        _check_shown(self.shown)
+        return problem.rare_failures(**stated(self, problem.rare_failures), **callbacks)
+
+    def _write(self, found: "RareFailures", folder: Path) -> int:
         from lqrsim.commands import console
-        from lqrsim.errors import check_count
-        from lqrsim.stress.multilevel_splitting import NoFailure
 
-        check_count("shown", self.shown)
-        problem, folder = self._begin("rare")
-        options = {"particles": self.particles, "repetitions": self.repetitions}
-
-        def write(rare: "RareFailures") -> int:
-            console.say(rare.summary())
-            failures = len(rare.splitting.failures)
-            written = min(failures, self.shown)
-            console.say(f"the worst of {failures:,} failures, as trial 0, and {written - 1} others:")
-            code = _write(rare, folder, "rare.json", shown=self.shown)
-            console.wrote(folder / "certificate.npz")
-            return code
-
-        try:
-            with console.keeping(write), console.progress("splitting", "repetition") as progress:
-                rare = problem.rare_failures(report=console.say, progress=progress, **options)
-        except NoFailure as none:
-            return _say_none(none)
-        return write(rare)
+        console.say(found.summary())
+        failures = len(found.splitting.failures)
+        others = min(failures, self.shown) - 1
+        console.say(f"the worst of {failures:,} failures, as trial 0, and {others} others:")
+        console.say(found.save(folder, shown=self.shown).summary())
+        _wrote(folder, "rare.json", ("rollout.npz", "rare.json", "certificate.npz"))
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,24 +115,18 @@ class Break(FailureOptions):
     particles: int = 200
     """Number of trials at each level of the splitting that finds first failures."""
 
-    def run(self) -> int:
+    SEARCH = "searching", "round"
+
+    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
+        return problem.smallest_failure(**stated(self, problem.smallest_failure), **callbacks)
+
+    def _write(self, found: "SmallestFailure", folder: Path) -> int:
         from lqrsim.commands import console
-        from lqrsim.stress.multilevel_splitting import NoFailure
 
-        problem, folder = self._begin("break")
-
-        def write(smallest: "SmallestFailure") -> int:
-            console.say(smallest.summary())
-            return _write(smallest, folder, "break.json")
-
-        try:
-            with console.keeping(write), console.progress("searching", "round") as progress:
-                smallest = problem.smallest_failure(
-                    rounds=self.rounds, particles=self.particles, report=console.say, progress=progress
-                )
-        except NoFailure as none:
-            return _say_none(none)
-        return write(smallest)
+        console.say(found.summary())
+        console.say(found.save(folder).summary())
+        _wrote(folder, "break.json", ("rollout.npz", "break.json"))
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,37 +158,24 @@ class Harden(FailureOptions):
     shown: int = 8
     """Number of failures to write."""
 
-    def run(self) -> int:
-        from lqrsim.commands import console
-        from lqrsim.errors import check_count
+    SEARCH = "hardening", "repetition"
+
+    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
         from lqrsim.stress.hardening import harden
 
-        check_count("shown", self.shown)
-        problem, folder = self._begin("harden")
+        _check_shown(self.shown)
+        return harden(problem, **stated(self, harden), **callbacks)
 
-        def write(found: "HardenedPlan") -> int:
-            console.say(found.verdict())
-            shown = found.save(folder, shown=self.shown)
-            written = ["solution.npz", "harden.json"]
-            if shown is not None:
-                console.say(shown.summary())
-                written += ["rollout.npz", "rare.json", "certificate.npz"]
-            for name in written:
-                console.wrote(folder / name)
-            console.result(**json.loads((folder / "harden.json").read_text(encoding="utf-8")))
-            return 0 if found.success else 1
+    def _write(self, found: "HardenedPlan", folder: Path) -> int:
+        from lqrsim.commands import console
 
-        with console.keeping(write), console.progress("hardening", "repetition") as progress:
-            found = harden(
-                problem,
-                chance=self.chance,
-                rounds=self.rounds,
-                particles=self.particles,
-                repetitions=self.repetitions,
-                report=console.say,
-                progress=progress,
-            )
-        return write(found)
+        console.say(found.verdict())
+        shown, files = found.save(folder, shown=self.shown), ["solution.npz", "harden.json"]
+        if shown is not None:
+            console.say(shown.summary())
+            files += ["rollout.npz", "rare.json", "certificate.npz"]
+        _wrote(folder, "harden.json", files)
+        return 0 if found.success else 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,9 +210,7 @@ class Certify:
         console.say(certificate.summary())
         try:
             with console.progress("splitting", "repetition") as progress:
-                found = certify(
-                    certificate, repetitions=self.repetitions, seed=self.seed, scenario=self.scenario, progress=progress
-                )
+                found = certify(certificate, **stated(self, certify), progress=progress)
         except NoFailure as none:
             return _say_none(none)
         console.say(found.summary())
@@ -241,15 +232,19 @@ def _say_none(none: Exception) -> int:
     return 1
 
 
-def _write(found: "RareFailures | SmallestFailure", folder: Path, name: str, **options: int) -> int:
-    """Write the failures, and print where they are. The result for `--json` is the content of the file."""
+def _check_shown(shown: int) -> None:
+    from lqrsim.errors import check_count
+
+    check_count("shown", shown)
+
+
+def _wrote(folder: Path, result: str, files: Sequence[str]) -> None:
+    """Say which files were written. The result for `--json` is the content of one of them."""
     from lqrsim.commands import console
 
-    console.say(found.save(folder, **options).summary())
-    console.wrote(folder / "rollout.npz")
-    console.wrote(folder / name)
-    console.result(**json.loads((folder / name).read_text(encoding="utf-8")))
-    return 0
+    for name in files:
+        console.wrote(folder / name)
+    console.result(**json.loads((folder / result).read_text(encoding="utf-8")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,9 +267,9 @@ class FunnelCommand(StudyOptions):
     """Wanted fraction of runs that reach the goal."""
     confidence: float = 0.95
     """Probability that all levels are right."""
-    knots: Annotated[tuple[int, ...], optional("N ...")] = ()
+    knots: Annotated[tuple[int, ...] | None, optional("N ...")] = None
     """Numbers of the knots at which runs begin. By default five, from the first on."""
-    states: Annotated[tuple[str, ...], optional("NAME ...")] = ()
+    states: Annotated[tuple[str, ...] | None, optional("NAME ...")] = None
     """States that may be off the plan. By default all."""
     failures: int = 3
     """Failures allowed in a test. With more, there are more trials, and levels come out larger."""
@@ -295,16 +290,14 @@ class FunnelCommand(StudyOptions):
         folder = self.out or Path("runs/funnel") / folder_name(scenario)
         console.check_output("--out", folder)
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
-        knots, states = self.knots or None, self.states or None
-        options = self.rate, self.confidence, knots, states, self.failures, None, self.seed
-        FunnelOptions.of(space, steps, *options)  # checked before the solve
+        FunnelOptions.of(space, steps, **stated(self, FunnelOptions.of))  # checked before the solve
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
             if isinstance(one, InitialStateError):
                 console.say("without the InitialStateError of the set: runs begin in states of the funnel")
                 one = one.scaled(0.0)  # keeps the other disturbances' random numbers
             disturbances.append(one.scaled(self.strength))
-        closed_loop = study.closed_loop
+        options = stated(self, funnel) | study.closed_loop | {"disturbances": disturbances}
 
         def write(found: "Funnel") -> int:
             console.say(found.summary())
@@ -316,15 +309,5 @@ class FunnelCommand(StudyOptions):
             return 0 if found.levels.any() else 1
 
         with console.keeping(write), console.progress("looking", "knot") as progress:
-            found = funnel(
-                **closed_loop,
-                disturbances=disturbances,
-                rate=self.rate,
-                confidence=self.confidence,
-                knots=knots,
-                states=states,
-                failures=self.failures,
-                seed=self.seed,
-                progress=progress,
-            )
+            found = funnel(**options, progress=progress)
         return write(found)

@@ -63,13 +63,9 @@ class Stress(SetupOptions):
             campaign = Results(folder, scenario=self.scenario).campaign
             campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
         else:
-            campaign = Campaign.of_sets(
-                setup, self.sweep, policies=self.policies, strengths=self.strengths, trials=self.trials,
-                replan_every=self.replan_every, shard=self.shard, time_limit=self.time_limit,
-            )  # fmt: skip
-        options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler}
+            campaign = Campaign.of_sets(setup, self.sweep, **stated(self, Campaign))
         with console.progress("stressing", "trial") as progress:
-            results = run_campaign(campaign, folder, progress=progress, **options)
+            results = run_campaign(campaign, folder, progress=progress, **stated(self, run_campaign))
         console.say(results.summary())
         console.wrote(folder)
         own = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run

@@ -65,9 +65,6 @@ def mjcf(
       servos: of a URDF, as in `load_scene`: {"shoulder": (200.0, 10.0)}.
       efforts: of a URDF, as in `load_scene`: {"shoulder": 20.0}.
       armature: of a URDF, as in `load_scene`: 0.01.
-
-    Raises:
-      InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """
     keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
     mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None

@@ -97,9 +97,6 @@ class Scenario(OneVersion):
           goal_radius: radius in metres, or None.
           goal_tolerance: a scaled error, or None.
           target: target of a plan; by default, of a plan that starts at the problem's start.
-
-        Raises:
-          InputError: as `simulate` does.
         """
         if target is None:
             space, start = self.problem.dynamics.state_coordinates, self.problem.start
@@ -143,9 +140,6 @@ class Scenario(OneVersion):
 
         Args:
           plan: a solution of the scenario.
-
-        Raises:
-          InputError: it is no Solution.
         """
         check_kind("plan", plan, Solution, "a Solution of the scenario")
         if self.problem.duration is None:
@@ -167,9 +161,6 @@ def get(name: str) -> Scenario:
 
     Args:
       name: one of `names()`.
-
-    Raises:
-      InputError: there is no such scenario.
     """
     return _functions()[check_name("scenario", name, names())]()
 

@@ -39,9 +39,6 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     Args:
       reference: the user's input.
       registered_only: refuse users' functions. For references from a file, which must not choose the code that runs.
-
-    Raises:
-      InputError: there is no such scenario or setting, or the function does not return a Scenario.
     """
     from lqrsim.scenarios.packaged import Scenario
 
@@ -64,11 +61,7 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
 
 
 def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]":
-    """The disturbances of a set at strength 1; see the top of this file for its names.
-
-    Raises:
-      InputError: there is no such set or kind, or the set is empty.
-    """
+    """The disturbances of a set at strength 1; see the top of this file for its names."""
     from lqrsim.simulation.disturbances import PRESETS, preset
 
     whole, colon, kind = name.partition(":")

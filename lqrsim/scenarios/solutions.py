@@ -35,9 +35,6 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
       scenario: the scenario with the problem and the start.
       solver: one of SOLVERS. "ilqr" uses only the controls of a start that is an InitialPrior.
       **options: options of the solver; a `start` among them replaces the scenario's.
-
-    Raises:
-      InputError: as the solver does.
     """
     start, problem = options.pop("start", scenario.start), scenario.problem
     if solver == "ilqr":
@@ -56,9 +53,6 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
 
     Returns:
       The solution, the policy or the plan.
-
-    Raises:
-      InputError: the file contains something else, or is for another system or number of steps.
     """
     found = load(path)
     if isinstance(found, FailureCertificate):
@@ -85,10 +79,6 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     Args:
       scenario: the scenario in which it is to run.
       solution: a Solution, or the path of one.
-
-    Raises:
-      InputError: the solution cannot be read; it is for another system, number of steps, control period or goal; or its
-        plan is not finite.
     """
     stored = isinstance(solution, str | os.PathLike)
     what = str(solution) if stored else "one"

@@ -164,9 +164,6 @@ def comparisons(table: Table) -> list[Comparison]:
 
     Differences are paired by trial. Differences of success have Tango's score interval, differences of errors
     Student's. If nothing was drawn, all trials of a policy are the same run, and there is nothing to test.
-
-    Raises:
-      InputError: two policies have different trials.
     """
     policies = list(dict.fromkeys(cell.policy for cell in _checked_table(table)))
     seconds = ((cell, Cell(other, cell.sweep, cell.strength)) for other in policies[1:] for cell in table)
@@ -189,9 +186,6 @@ def compared(
       pairs: a cell of `firsts` and a cell of `seconds`.
       paired: whether trials of the same number are compared with each other, see `comparisons`. If not, the difference
         of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
-
-    Raises:
-      InputError: two cells have different trials, and are paired.
     """
     found = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
     tested = [place for place, one in enumerate(found) if not np.isnan(one.p_value)]

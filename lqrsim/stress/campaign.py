@@ -89,8 +89,7 @@ def run_campaign(
         shard.
 
     Raises:
-      InputError: the campaign cannot be run; the solution is not of the scenario's robot, horizon and goal; the folder
-        belongs to another campaign, holds other files, is being written by another process or cannot be written; the
+      InputError: the campaign, its solution or the folder's contents do not fit; another process writes the folder; the
         cluster cannot be reached; or a script calls this with workers and without `if __name__ == "__main__":`, so that
         each worker would call it again.
     """

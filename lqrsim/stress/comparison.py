@@ -47,10 +47,6 @@ def compare(
       only first and only second, the trials in which only this one reached the goal; difference, first minus second,
       with low and high; p, adjusted for the number of rows (Holm, 1979). With different seeds, first trials and second
       trials take the place of trials, only first and only second. Failure rates differ by as much, the other way round.
-
-    Raises:
-      InputError: a campaign is not finished, or damaged; there is no such policy; there is one campaign and no
-        policies; the campaigns have no cell in common, or differ in disturbances or goals.
     """
     one = first if isinstance(first, Results) else Results(first)
     other = one if second is None else second if isinstance(second, Results) else Results(second)

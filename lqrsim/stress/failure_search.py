@@ -158,8 +158,6 @@ class ReliabilityProblem(Study):
           The failure, its distance, and the contribution of each disturbance.
 
         Raises:
-          InputError: an option is out of range, the policy fails without any disturbance, or for the reasons of
-            `score`.
           NoFailure: none was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """

@@ -96,14 +96,12 @@ def funnel(
       progress: called with the number of finished knots, the number of all knots, and a text on the current trial.
 
     Raises:
-      InputError: as `simulate`; a disturbance changes the start of a run; an option is out of range; there is no
-        cost-to-go and no shape; or an ellipsoid is flat.
       KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
     """
     trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     check_progress(progress, text=True)
     space, steps = solution.policy.state_coordinates, solution.trajectory.steps
-    asked = FunnelOptions.of(space, steps, rate, confidence, knots, states, failures, largest, seed)
+    asked = FunnelOptions.of(space, steps, rate, confidence, knots, states, failures, seed, largest)
     blank = _blank(trials, asked, shape)
     found: list[FoundLevel] = []
 
@@ -145,7 +143,7 @@ class FunnelOptions(NamedTuple):
     @classmethod
     def of(
         cls, space: Coordinates, steps: int, rate: float, confidence: float, knots: Sequence[int] | None,
-        states: Sequence[str] | None, failures: int, largest: float | None, seed: int,
+        states: Sequence[str] | None, failures: int, seed: int, largest: float | None = None,
     ) -> "FunnelOptions":  # fmt: skip
         """Raises InputError for options that do not fit a plan with this number of steps and these states."""
         starts, names = _knots(knots, steps), _states(states, space)
@@ -262,9 +260,6 @@ def check_funnel(
       goal_radius: as for `funnel`.
       goal_tolerance: as for `funnel`.
       threads: as for `funnel`.
-
-    Raises:
-      InputError: as `funnel`; the seed is the funnel's; or the solution has another plan.
     """
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)

@@ -208,8 +208,6 @@ def harden(
         else the safest one, with `success` False and a `reason`.
 
     Raises:
-      InputError: an option is out of range, or no plan is found for the scenario; or as of `smooth_chance_constrained`
-        and `predict_tube`.
       KeyboardInterrupt: Ctrl-C; its `found` is the HardenedPlan after the rounds that are done, or None.
     """
     check_kind("problem", problem, ReliabilityProblem, "a ReliabilityProblem")

@@ -43,11 +43,7 @@ class LevelTest:
 
 
 def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
-    """The test with the fewest trials that proves the rate with the given confidence if `failures` trials fail.
-
-    Raises:
-      InputError: an argument is out of range, or the test needs more than MOST_TRIALS trials.
-    """
+    """The test with the fewest trials that proves the rate with the given confidence if `failures` trials fail."""
     rate = check_number("rate", rate, above=0.0, below=1.0)
     confidence = check_number("confidence", confidence, above=0.0, below=1.0)
     check_count("failures", failures, at_least=0, at_most=10_000)

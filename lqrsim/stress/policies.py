@@ -102,9 +102,6 @@ def solve(
       design: the disturbances for which "track" and "offset_free" are designed.
       given: a solution from `solutions.given`, in place of the result of its solver.
       remark: whether to warn of plans that have not converged, or are of another problem.
-
-    Raises:
-      InputError: a plan is not finite, or no policy uses the given solution.
     """
     check_used(given, policies)
     plans = {} if given is None else {solver_of(given): given}

@@ -67,7 +67,6 @@ def certify(
       A Recheck.
 
     Raises:
-      InputError: an option is out of range; or the scenario is a user's function, and is not given.
       NoFailure: no failure was found.
     """
     check_kind("certificate", certificate, FailureCertificate, "a FailureCertificate, such as rare.certificate()")

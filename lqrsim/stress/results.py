@@ -100,9 +100,6 @@ class Results:
         Args:
           cell: one of `cells`.
           partial: whether to accept a cell that is not finished.
-
-        Raises:
-          InputError: a file is damaged, no trial has been run, or, without `partial`, a trial is missing.
         """
         tables = [table for _, table in self.tables(cell, partial=partial)]
         if not tables:
@@ -336,9 +333,6 @@ class Results:
 
         Returns:
           An iterator of pairs: a shard and its columns.
-
-        Raises:
-          InputError: a file is damaged, or, without `partial`, missing.
         """
         check_flag("partial", partial)
         for shard in self.shards(cell):
@@ -406,10 +400,6 @@ def replay(
       trials: number of trials.
       frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
-
-    Raises:
-      InputError: there is no such cell or trial, or the scenario is your own function, which was not given to
-        `Results`.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)

@@ -269,21 +269,20 @@ class Campaign(Setup):
         """A campaign whose disturbances are sets by name, as in `lqrsim stress`.
 
         Args:
-          setup: scenario, solution, goal and seed; its design disturbances are a set, too.
+          setup: what it shares with other studies; its design disturbances are a set, too.
           sets: names of the sweeps.
           policies: as in `Campaign`; by default those of the first four that the scenario allows.
           **options: the other attributes of `Campaign`.
         """
-        scenario, stated = setup.resolved, {one.name: getattr(setup, one.name) for one in dataclasses.fields(Setup)}
-        if setup.design_disturbances is not None:
-            stated["design_disturbances"] = tuple(design_disturbances(scenario, setup.design_disturbances))
+        scenario, design = setup.resolved, setup.design_disturbances
         impossible = impossible_policies(scenario, setup.given)
-        campaign = cls(
-            **stated,
-            sweeps={name: disturbance_set(name, scenario) for name in sets},
-            policies=tuple(policies) or tuple(one for one in DEFAULT_POLICIES if one not in impossible),
-            **options,
-        )
+        shared = {one.name: getattr(setup, one.name) for one in dataclasses.fields(Setup)}
+        named = {
+            "design_disturbances": None if design is None else tuple(design_disturbances(scenario, design)),
+            "sweeps": {name: disturbance_set(name, scenario) for name in sets},
+            "policies": tuple(policies) or tuple(one for one in DEFAULT_POLICIES if one not in impossible),
+        }
+        campaign = cls(**options | shared | named)
         keep(campaign, resolved=scenario, given=setup.given)
         return campaign
 
