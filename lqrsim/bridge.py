@@ -119,11 +119,11 @@ def run(
         or its turn and tilt as with `turns_about`, the rates wx, wy, wz (along the body's), and heading, the yaw.
       joints: topic. It has the states NAME and NAME_velocity of each joint, as in a robot from an MJCF.
       names: state -> its name in messages, for states with other names.
-      seconds: how long to run; by default the horizon.
+      seconds: how long to run; by default the plan's horizon.
       lockstep: run one period for each state that arrives, instead of by the clock; for simulations.
-      lost_after: time in s; by default three control periods, in lockstep `patience`.
-      patience: time in s to wait for the robot to appear, and for its first state.
-      domain: the DDS domain; by default ROS_DOMAIN_ID, or 0.
+      lost_after: stop after so long without a state, in s; by default three control periods, in lockstep `patience`.
+      patience: time in s to wait for the other program to appear, and for the first state.
+      domain: domain of DDS; by default ROS_DOMAIN_ID, or 0.
 
     Returns:
       The record of the run.

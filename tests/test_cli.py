@@ -1,5 +1,7 @@
 """The commands, each on what the one before wrote; and bad input: one line, no traceback, a non-zero exit."""
 
+import dataclasses
+import inspect
 import os
 import re
 import shlex
@@ -8,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import av
 import numpy as np
@@ -17,7 +19,8 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
-from lqrsim.commands import COMMANDS, console
+from lqrsim.commands import COMMANDS, console, reliability, solving, stressing
+from lqrsim.commands.options import options_of, stated
 from lqrsim.commands.reproduce import SCRIPTS
 from lqrsim.commands.solving import Solve
 from lqrsim.view import gl
@@ -374,6 +377,35 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out
     assert f"usage: lqrsim {command}".strip() in printed
     assert not re.search(r"\{None\}|\{\[|\[\{|\[\.\.\.\]|NoneType", printed)  # types, as tyro prints them
+
+
+@pytest.mark.parametrize(
+    ("command", "function", "names"),
+    [
+        (reliability.Rare, ls.stress.ReliabilityProblem.rare_failures, "particles repetitions"),
+        (reliability.Break, ls.stress.ReliabilityProblem.smallest_failure, "rounds particles"),
+        (reliability.Harden, ls.stress.harden, "chance rounds particles repetitions"),
+        (reliability.Certify, ls.stress.certify, "repetitions seed"),
+        (reliability.FunnelCommand, ls.funnel, "rate failures"),
+        (stressing.Stress, ls.stress.Campaign, "strengths trials replan_every shard time_limit goal_radius seed"),
+        (stressing.Stress, ls.stress.run_campaign, "workers batch scheduler"),
+        (solving.Simulate, ls.simulate, "seed trials first_trial"),
+    ],
+)
+def test_options_that_are_read_from_source_are_those_that_python_has(command: Any, function: Any, names: str) -> None:
+    """Here the API is imported. Each of these options is passed on."""
+    given, options = inspect.signature(function).parameters, {one.name: one for one in dataclasses.fields(command)}
+    for name in names.split():
+        assert options[name].default == given[name].default
+        assert get_args(options[name].type)[0] == given[name].annotation
+    passed = stated(SimpleNamespace(**dict.fromkeys(options, 0)), function, seed=1)
+    assert {*names.split()} <= {*passed}
+    assert passed["seed"] == 1
+
+
+def test_an_option_that_the_api_does_not_describe_is_refused() -> None:
+    with pytest.raises(AssertionError, match="harden does not say what nothing is"):
+        options_of("stress/hardening.py", "harden", nothing="INT")(type("Command", (), {}))
 
 
 def test_unknown_option_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:

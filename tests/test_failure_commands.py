@@ -212,6 +212,9 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
     assert (rare.probability.value, rare.probability.high) == (numbers["probability"], numbers["high"])
     assert rare.splitting.simulations == numbers["simulations"]
     same_files(command, python, "rare.json")
+    of_study = dataclasses.replace(problem, seed=1).rare_failures(particles=20, repetitions=2).splitting
+    of_call = problem.rare_failures(particles=20, repetitions=2, seed=1).splitting
+    assert of_study.repetitions.tolist() == of_call.repetitions.tolist()
     assert main(["break", reference, "--rounds", "1", "--particles", "30", "--seed", "3", *more]) == 0
     break_says = capsys.readouterr().out
     told.clear()

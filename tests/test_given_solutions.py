@@ -18,6 +18,7 @@ from sampling import examples
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.cli import main
+from lqrsim.commands.options import stated
 from lqrsim.commands.reliability import Break, Rare
 from lqrsim.scenarios.solutions import remarks
 from lqrsim.stress.policies import solve
@@ -149,8 +150,8 @@ def test_the_other_commands_run_it_too(
         raise ls.InputError("viewer: none here")
 
     for kind in (Rare, Break):
-        problem, _ = kind(scenario=DRIVE, solution=stored, policy="track", out=tmp_path)._begin("either")
-        shown.append(problem.score.solution.trajectory)
+        asked = stated(kind(scenario=DRIVE, solution=stored, policy="track"), ls.stress.ReliabilityProblem)
+        shown.append(ls.stress.ReliabilityProblem(**asked).score.solution.trajectory)
     monkeypatch.setattr(viewer, "open_viewer", opened)
     assert main(["view", DRIVE, "--solution", str(stored)]) == 2
     few = ["--rate", "0.5", "--confidence", "0.5", "--knots", "149", "--failures", "0", "--out", str(tmp_path)]

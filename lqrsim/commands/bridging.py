@@ -6,10 +6,11 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from lqrsim.commands.options import Json, optional
+from lqrsim.commands.options import Json, optional, options_of, stated
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("bridge.py", "run", seconds="SECONDS", lost_after="SECONDS", patience="SECONDS", domain="NUMBER")
 class Bridge:
     """Run a policy on a robot, by messages of ROS 2; needs lqrsim[ros].
 
@@ -31,18 +32,11 @@ class Bridge:
     """Names of states in the messages, where they differ: theta=heading."""
     safe: Annotated[tuple[float, ...], optional("CONTROL ...")] = ()
     """The command for a robot that nobody controls any more: one number for each control. There is no default."""
-    seconds: Annotated[float | None, optional("SECONDS", "How long to run. By default the plan's horizon.")] = None
-    lost_after: Annotated[
-        float | None, optional("SECONDS", "Stop after so long without a state. By default three control periods.")
-    ] = None
-    patience: Annotated[float, arg(metavar="SECONDS")] = 10.0
-    """How long to wait for the other program, and for the first state."""
     lockstep: FlagCreatePairsOff[bool] = False
     """Run a control period for each state that arrives, and not by the clock: for simulations."""
     robot: FlagCreatePairsOff[bool] = False
     """Be the robot: MuJoCo runs the solution's scenario with the commands that arrive."""
     scenario: Annotated[str | None, optional("SCENARIO", "With --robot, as in `lqrsim simulate`.")] = None
-    domain: Annotated[int | None, optional("NUMBER", "Domain of DDS. By default ROS_DOMAIN_ID, or 0.")] = None
     json: Json = False
 
     def run(self) -> int:
@@ -56,30 +50,24 @@ class Bridge:
         if any(not (state and equals and name) for state, equals, name in pairs):
             raise InputError(f"--names: got {' '.join(self.names)}, want pairs such as theta=heading")
         names = {state: name for state, _, name in pairs}
-        topics: dict[str, Any] = {
-            "commands": self.commands, "odometry": self.odometry, "joints": self.joints, "names": names,
-            "patience": self.patience, "domain": self.domain,
-        }  # fmt: skip
         if self.robot:
-            return self._be_robot(topics)
+            return self._be_robot(names)
         if not self.safe:
             raise InputError("--safe: got none, want the command for a robot that nobody controls, such as 0 0 0 0")
         policy: Any = save_load.load(self.policy)
-        ran = bridge.run(
-            policy, safe=self.safe, seconds=self.seconds, lost_after=self.lost_after, lockstep=self.lockstep, **topics
-        )
+        ran = bridge.run(policy, **stated(self, bridge.run, names=names))
         console.say(ran.summary())
         numbers = {"held": ran.held, "refused": ran.refused[0], "response": ran.response, "late": ran.late}
         console.result(periods=len(ran.commands), completed=ran.completed, reason=ran.reason, **numbers)
         return 0 if ran.completed else 1
 
-    def _be_robot(self, topics: dict[str, Any]) -> int:
+    def _be_robot(self, names: dict[str, str]) -> int:
         from lqrsim import bridge
         from lqrsim.commands import console
         from lqrsim.simulation.closed_loop import simulate
 
         solution, scenario = console.load_with_scenario(self.policy, self.scenario)
-        with bridge.SimulatedRobot(solution, **topics) as robot:
+        with bridge.SimulatedRobot(solution, **stated(self, bridge.SimulatedRobot, names=names)) as robot:
             rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough())
         console.say(rollout.summary())
         console.say(robot.summary())

@@ -1,19 +1,24 @@
 """Options that several commands share."""
 
+import ast
 import inspect
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+NO_DEFAULT: Any = {"help_behavior_hint": ""}
+Command = TypeVar("Command")
+
 
 def optional(metavar: str, text: str | None = None) -> object:
     """An option whose help text describes its default."""
-    return arg(metavar=metavar, help_behavior_hint="", help=text)
+    return arg(metavar=metavar, help=text, **NO_DEFAULT)
 
 
 RULES = ConstructorRegistry()
@@ -36,6 +41,44 @@ def _value_or_default(info: PrimitiveTypeInfo) -> Any:
     )
 
 
+def options_of(file: str, name: str, **metavars: str) -> Callable[[type[Command]], type[Command]]:
+    """Give a command options of a function or a record of the API, with its types, defaults and help.
+
+    They are read from its source: to import it would take a second, for `--help` too.
+
+    Args:
+      file: path in the package. name: the function or class, or CLASS.METHOD.
+      **metavars: each option with its metavar.
+    """
+    node: Any = ast.parse((Path(__file__).parents[1] / file).read_text(encoding="utf-8"))
+    for part in name.split("."):
+        node = next(one for one in node.body if getattr(one, "name", None) == part)
+    words = ast.get_docstring(node) or ""
+    types, defaults = dict[str, ast.expr](), dict[str, ast.expr]()
+    if isinstance(node, ast.ClassDef):
+        for one in node.body:
+            if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name) and one.value is not None:
+                types[one.target.id], defaults[one.target.id] = one.annotation, one.value
+    else:
+        for one, value in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True):
+            types[one.arg], defaults[one.arg] = one.annotation, value
+
+    def add(command: type[Command]) -> type[Command]:
+        options = dict[str, Any]()
+        for option, metavar in metavars.items():
+            entry = re.search(rf"^  {option}: (.+(?:\n    .+)*)", words, re.MULTILINE)
+            assert entry is not None, f"{name} does not say what {option} is"
+            text = " ".join(entry[1].split())
+            kind, default = eval(ast.unparse(types[option]), {}), ast.literal_eval(defaults[option])
+            shown = arg(metavar=metavar, help=text[0].upper() + text[1:], **{} if default is not None else NO_DEFAULT)
+            options[option] = Annotated[kind, shown]
+            setattr(command, option, default)
+        command.__annotations__ = options | inspect.get_annotations(command)
+        return command
+
+    return add
+
+
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
@@ -56,20 +99,6 @@ SolutionFile = Annotated[
         " horizon and goal.",
     ),
 ]
-GoalRadius = Annotated[
-    float | None,
-    optional(
-        "METRES",
-        "Distance from the goal within which it counts as reached. By default the scenario's or robot's radius.",
-    ),
-]
-GoalTolerance = Annotated[
-    float | None,
-    optional(
-        "SHARE", "The same for goals without a position, relative to each state's way to the goal. By default 0.1."
-    ),
-]
-Seed = Annotated[int, arg(help="Seed of all random numbers. The same seed gives the same output.")]
 Folder = Annotated[Path | None, optional("FOLDER")]
 OwnScenario = Annotated[
     str | None,
@@ -81,12 +110,14 @@ Json = Annotated[
 ]
 
 
-def stated(command: Any, function: Callable[..., Any]) -> dict[str, Any]:
-    """The options of a command that a function or a record takes, by name."""
-    return {name: getattr(command, name) for name in inspect.signature(function).parameters if hasattr(command, name)}
+def stated(command: Any, function: Callable[..., Any], **others: Any) -> dict[str, Any]:
+    """The options of a command that a function or a record takes, by name; and others, in place of those."""
+    names = inspect.signature(function).parameters
+    return {name: getattr(command, name) for name in names if hasattr(command, name)} | others
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/study.py", "Setup", goal_radius="METRES", goal_tolerance="SHARE", seed="INT")
 class SetupOptions:
     """The options that state a `Setup`, for commands that run a scenario under disturbances."""
 
@@ -94,9 +125,6 @@ class SetupOptions:
     """As in `lqrsim solve`."""
     design_disturbances: DesignSet = None
     solution: SolutionFile = None
-    goal_radius: GoalRadius = None
-    goal_tolerance: GoalTolerance = None
-    seed: Seed = 0
     json: Json = False
 
 

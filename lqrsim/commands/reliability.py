@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, Suppress, arg
 
-from lqrsim.commands.options import Folder, Json, OwnScenario, StudyOptions, optional, stated
+from lqrsim.commands.options import Folder, Json, OwnScenario, StudyOptions, optional, options_of, stated
 
 if TYPE_CHECKING:
     from lqrsim.results.funnel import Funnel
@@ -61,6 +61,7 @@ class FailureOptions(StudyOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/failure_search.py", "ReliabilityProblem.rare_failures", particles="INT", repetitions="INT")
 class Rare(FailureOptions):
     """Estimate the probability of a rare failure.
 
@@ -73,10 +74,6 @@ class Rare(FailureOptions):
     Exits with 1 if no failure was found.
     """
 
-    particles: int = 250
-    """Number of trials at each level. More of them give a shorter interval."""
-    repetitions: int = 10
-    """Number of independent repetitions; their spread gives the interval."""
     shown: int = 8
     """Number of failures to write."""
 
@@ -84,7 +81,7 @@ class Rare(FailureOptions):
 
     def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "RareFailures":
         _check_shown(self.shown)
-        return problem.rare_failures(**stated(self, problem.rare_failures), **callbacks)
+        return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
 
     def _write(self, found: "RareFailures", folder: Path) -> int:
         from lqrsim.commands import console
@@ -99,6 +96,7 @@ class Rare(FailureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/failure_search.py", "ReliabilityProblem.smallest_failure", rounds="INT", particles="INT")
 class Break(FailureOptions):
     """Find the smallest disturbance that causes a failure.
 
@@ -110,15 +108,10 @@ class Break(FailureOptions):
     The result does fail; that nothing nearer fails is not proven. Exits with 1 if no failure was found.
     """
 
-    rounds: int = 40
-    """Largest number of rounds; the search ends earlier if less than 1 % is left to gain."""
-    particles: int = 200
-    """Number of trials at each level of the splitting that finds first failures."""
-
     SEARCH = "searching", "round"
 
     def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
-        return problem.smallest_failure(**stated(self, problem.smallest_failure), **callbacks)
+        return problem.smallest_failure(**stated(self, problem.smallest_failure, **callbacks))
 
     def _write(self, found: "SmallestFailure", folder: Path) -> int:
         from lqrsim.commands import console
@@ -130,6 +123,7 @@ class Break(FailureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/hardening.py", "harden", chance="FLOAT", rounds="INT", particles="INT", repetitions="INT")
 class Harden(FailureOptions):
     """Find a plan whose measured probability of failure is low enough.
 
@@ -147,14 +141,6 @@ class Harden(FailureOptions):
     policy: Literal["smooth", "track", "offset_free"] = "offset_free"
     """As in `lqrsim stress`."""
     failure: Suppress[Literal["collision"]] = "collision"
-    chance: float = 1e-3
-    """Wanted probability that the robot collides. The whole interval of the measured probability must be below it."""
-    rounds: int = 4
-    """Largest number of plans."""
-    particles: Annotated[int | None, optional("INT")] = None
-    """As in `lqrsim rare`. By default 250; for a chance from 0.005 on 10 / chance, so that failures are counted."""
-    repetitions: int = 10
-    """As in `lqrsim rare`."""
     shown: int = 8
     """Number of failures to write."""
 
@@ -164,7 +150,7 @@ class Harden(FailureOptions):
         from lqrsim.stress.hardening import harden
 
         _check_shown(self.shown)
-        return harden(problem, **stated(self, harden), **callbacks)
+        return harden(problem, **stated(self, harden, **callbacks))
 
     def _write(self, found: "HardenedPlan", folder: Path) -> int:
         from lqrsim.commands import console
@@ -179,6 +165,7 @@ class Harden(FailureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/recheck.py", "certify", repetitions="INT", seed="INT")
 class Certify:
     """Check a certificate by measuring it again.
 
@@ -192,10 +179,6 @@ class Certify:
 
     file: Annotated[Positional[Path], arg(metavar="FILE.npz")]
     """certificate.npz from `lqrsim rare`."""
-    repetitions: Annotated[int | None, optional("INT")] = None
-    """Number of its repetitions to run, at least 2. By default all."""
-    seed: Annotated[int | None, optional("INT")] = None
-    """Another seed, for fresh random numbers: then the intervals are compared. By default the certificate's seed."""
     scenario: OwnScenario = None
     json: Json = False
 
@@ -210,7 +193,7 @@ class Certify:
         console.say(certificate.summary())
         try:
             with console.progress("splitting", "repetition") as progress:
-                found = certify(certificate, **stated(self, certify), progress=progress)
+                found = certify(certificate, **stated(self, certify, progress=progress))
         except NoFailure as none:
             return _say_none(none)
         console.say(found.summary())
@@ -248,6 +231,7 @@ def _wrote(folder: Path, result: str, files: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/funnels.py", "funnel", rate="FLOAT", failures="INT")
 class FunnelCommand(StudyOptions):
     """Find from how far off its plan a policy still works.
 
@@ -263,16 +247,12 @@ class FunnelCommand(StudyOptions):
 
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ("scenario",)
     """Sets by name, as in `lqrsim simulate`. By default the disturbances of the scenario's demo."""
-    rate: float = 0.99
-    """Wanted fraction of runs that reach the goal."""
     confidence: float = 0.95
     """Probability that all levels are right."""
     knots: Annotated[tuple[int, ...] | None, optional("N ...")] = None
     """Numbers of the knots at which runs begin. By default five, from the first on."""
     states: Annotated[tuple[str, ...] | None, optional("NAME ...")] = None
     """States that may be off the plan. By default all."""
-    failures: int = 3
-    """Failures allowed in a test. With more, there are more trials, and levels come out larger."""
     out: Folder = None
     """Output folder. By default runs/funnel/ and the name of the scenario."""
 
@@ -297,7 +277,7 @@ class FunnelCommand(StudyOptions):
                 console.say("without the InitialStateError of the set: runs begin in states of the funnel")
                 one = one.scaled(0.0)  # keeps the other disturbances' random numbers
             disturbances.append(one.scaled(self.strength))
-        options = stated(self, funnel) | study.closed_loop | {"disturbances": disturbances}
+        options = stated(self, funnel, **study.closed_loop, disturbances=disturbances)
 
         def write(found: "Funnel") -> int:
             console.say(found.summary())

@@ -10,12 +10,11 @@ from lqrsim.commands.options import (
     ControllerName,
     DesignSet,
     Folder,
-    GoalRadius,
-    GoalTolerance,
     Json,
-    Seed,
     Strength,
     optional,
+    options_of,
+    stated,
 )
 
 if TYPE_CHECKING:
@@ -173,6 +172,8 @@ class Solve:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("simulation/closed_loop.py", "simulate", seed="INT", trials="INT", first_trial="INT")
+@options_of("stress/study.py", "Setup", goal_radius="METRES", goal_tolerance="SHARE")
 class Simulate:
     """Run a policy in MuJoCo, in closed loop.
 
@@ -211,14 +212,6 @@ class Simulate:
     """Standard deviation of white noise on each measured state, in its unit: one number per state, or one for all."""
     push: Annotated[tuple[float, float, float, float] | None, optional("X Y Z AT")] = None
     """One push: its impulse in N s along the world's axes, and its time in s."""
-    seed: Seed = 0
-    trials: int = 1
-    """Number of runs."""
-    first_trial: int = 0
-    """Number of the first trial. --first-trial 7 alone gives bit-identical results to trial 7 among others."""
-
-    goal_radius: GoalRadius = None
-    goal_tolerance: GoalTolerance = None
     json: Json = False
 
     def run(self) -> int:
@@ -242,19 +235,10 @@ class Simulate:
         controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
         named = [one for name in self.disturbances for one in disturbance_set(name, scenario)]
         disturbances = [*(one.scaled(self.strength) for one in named), *self._single_disturbances()]
-        plant = scenario.plant()
+        plant, near = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
+        options = stated(self, simulate, controller=controller, disturbances=disturbances, **near)
         with console.progress("simulating", "step") as progress:
-            rollout = simulate(
-                plant,
-                solution,
-                controller=controller,
-                disturbances=disturbances,
-                seed=self.seed,
-                trials=self.trials,
-                first_trial=self.first_trial,
-                progress=progress,
-                **scenario.near_enough(self.goal_radius, self.goal_tolerance),
-            )
+            rollout = simulate(plant, solution, progress=progress, **options)
         console.say(rollout.summary())
         violations = _violations(scenario.problem, rollout)
         for one in (one for one in violations or () if one["trials"]):

@@ -7,10 +7,24 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import CampaignPolicyName, Folder, Json, OwnScenario, SetupOptions, optional, stated
+from lqrsim.commands.options import (
+    CampaignPolicyName,
+    Folder,
+    Json,
+    OwnScenario,
+    SetupOptions,
+    optional,
+    options_of,
+    stated,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/campaign.py", "run_campaign", workers="INT", batch="INT", scheduler="ADDRESS")
+@options_of(
+    "stress/study.py", "Campaign", trials="INT", replan_every="SECONDS", shard="INT", time_limit="SECONDS",
+    strengths="FACTOR ...",
+)  # fmt: skip
 class Stress(SetupOptions):
     """Measure failure rates of policies against disturbance strength.
 
@@ -24,31 +38,15 @@ class Stress(SetupOptions):
     sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("light",)
     """Disturbances: a preset (calm, light, moderate, strong, severe), or scenario for its demo's disturbances;
     NAME:KIND for one kind alone."""
-    strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
-    """Factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate."""
     policies: Annotated[tuple[CampaignPolicyName, ...], optional("POLICY ...")] = ()
     """smooth, ilqr: the policies of these solvers. open_loop: the plan of smooth without feedback. replan: re-plans
     during the run. track: follows the plan of smooth. offset_free: the same, and estimates the state and the
     disturbances. track_per_cell, offset_free_per_cell: these two, designed anew for the disturbances of each
     combination. By default the first four that the scenario allows: ilqr cannot keep constraints."""
-    trials: int = 200
-    """Number of trials for each sweep, strength and policy."""
-    replan_every: Annotated[float | None, optional("SECONDS")] = None
-    """Time between two solves of replan. By default a tenth of the horizon."""
-    shard: int = 500
-    """Trials per file; an interruption loses at most this many per worker."""
-    time_limit: Annotated[float, arg(metavar="SECONDS")] = 300.0
-    """Time after which a shard counts as hung and its trials as errors."""
     out: Folder = None
     """Folder of the campaign. By default runs/stress/ and the name of the scenario."""
     resume: bool = False
     """Resume the campaign in the folder with its own settings instead of the options above."""
-    workers: Annotated[int | None, optional("INT")] = None
-    """Processes on this machine. By default one per processor."""
-    batch: int = 256
-    """Trials that a worker simulates together; affects only time and memory."""
-    scheduler: Annotated[str | None, optional("ADDRESS")] = None
-    """Address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786."""
 
     def run(self) -> int:
         from lqrsim.commands import as_json, console
@@ -65,7 +63,7 @@ class Stress(SetupOptions):
         else:
             campaign = Campaign.of_sets(setup, self.sweep, **stated(self, Campaign))
         with console.progress("stressing", "trial") as progress:
-            results = run_campaign(campaign, folder, progress=progress, **stated(self, run_campaign))
+            results = run_campaign(campaign, folder, **stated(self, run_campaign, progress=progress))
         console.say(results.summary())
         console.wrote(folder)
         own = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
@@ -124,6 +122,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("reports/page.py", "report", videos="INT")
 class Report:
     """Write the report of a stress test: a page, or a table for a paper.
 
@@ -136,8 +135,6 @@ class Report:
     """A folder from `lqrsim stress`."""
     out: Annotated[Path | None, optional("FILE")] = None
     """The page, .html, or the table: .csv, .tex or .md. By default report.html in that folder."""
-    videos: int = 4
-    """Number of the worst trials to repeat and render."""
     scenario: OwnScenario = None
     json: Json = False
 
@@ -158,7 +155,7 @@ class Report:
             from lqrsim.reports.page import report
 
             with console.progress("reporting", "part") as progress:
-                report(results, path, videos=self.videos, progress=progress)
+                report(results, **stated(self, report, out=path, progress=progress))
         console.wrote(path)
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional
+from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional, options_of, stated
 from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("view/render.py", "render", camera="NAME", size="WIDTH HEIGHT", fps="RATE", speed="FLOAT")
 class Render:
     """Render a run as a video or a still.
 
@@ -45,8 +46,6 @@ class Render:
     trial: Annotated[tuple[int, ...] | None, optional("N ...")] = None
     """Row of the rollout, from 0; several rows of one rollout, or one for each of several rollouts. By default 0, and
     all rows for FILE.html."""
-    camera: Annotated[str, arg(metavar="NAME")] = "overview"
-    """overview, chase, top or side, or another camera of the scene."""
     inset: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """More cameras, in panes beside the first. top and side are calibrated, and show a mark on the robot."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
@@ -64,12 +63,6 @@ class Render:
     """Funnel about the plan of the runs, one for all or one each, from `lqrsim funnel`."""
     quality: Quality = "standard"
     """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
-    size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
-    """In pixels. By default the size of the quality, and half of it for a GIF, but not less than 480 x 270."""
-    fps: Annotated[float | None, optional("RATE")] = None
-    """Frames per second of a video. By default 30, and 15 for a GIF."""
-    speed: float = 1.0
-    """Seconds of the run in a second of the video."""
     time: Annotated[float | None, optional("SECONDS")] = None
     """The moment of a still. By default the end."""
     every: Annotated[float | None, optional("SECONDS")] = None
@@ -98,18 +91,17 @@ class Render:
         funnel = _one_or_all([save_load.load(path, Funnel) for path in self.funnel])
         drawn, rows = _one_or_all(runs), 0 if self.trial is None else _one_or_all(self.trial)
         content = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
-        look = {"trial": rows, "camera": self.camera, "insets": self.inset, "titles": self.title}
-        look |= {"quality": self.quality, "size": self.size}
+        look = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
         match out.suffix.lower():
             case ".html":
                 html_file.render_html(drawn, out, trial=self.trial, **content)
             case ".rrd":
                 rerun_file.write(drawn, out, trial=rows, funnel=funnel)
             case ".png":
-                render_still(drawn, out, time=self.time, every=self.every, **content, **look)
+                render_still(drawn, out, **stated(self, render_still, **look))
             case _:
                 with console.progress("rendering", "frame") as progress:
-                    render(drawn, out, fps=self.fps, speed=self.speed, progress=progress, **content, **look)
+                    render(drawn, out, **stated(self, render, **look, progress=progress))
         console.wrote(out)
         return 0
 

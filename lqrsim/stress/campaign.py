@@ -84,7 +84,7 @@ def run_campaign(
       folder: where everything is stored, the campaign's `solution` too.
       workers: number of processes on this machine; by default one per processor. 0 runs everything in this process.
       batch: number of trials that a worker simulates together; affects only time and memory.
-      scheduler: address of a dask cluster that does the work instead of processes on this machine.
+      scheduler: address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786.
       progress: called with the number of finished trials and the number of all trials, at the start and after each
         shard.
 

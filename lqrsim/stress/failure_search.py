@@ -108,8 +108,8 @@ class ReliabilityProblem(Study):
         """Estimate the probability of a rare failure by multilevel splitting: see `failure_probability`.
 
         Args:
-          particles: number of trials at each level.
-          repetitions: number of independent estimates, from which the interval follows.
+          particles: number of trials at each level. More of them give a shorter interval.
+          repetitions: number of independent estimates, whose spread gives the interval.
           keep: fraction of the trials that exceeds the next level, at least 2 / `particles`. With 0 there are no
             levels, and failures are counted.
           seed: seed of all random numbers; by default that of the study.
@@ -147,7 +147,7 @@ class ReliabilityProblem(Study):
         """Find the smallest disturbance that makes the policy fail: see `lqrsim.stress.smallest_failure`.
 
         Args:
-          rounds: largest number of rounds.
+          rounds: largest number of rounds; the search ends earlier if less than 1 % is left to gain.
           particles: number of trials at each level of the splitting that finds first failures.
           seed: seed of all random numbers; by default that of the study.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.

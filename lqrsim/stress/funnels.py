@@ -45,7 +45,6 @@ from lqrsim.versions import versions
 KNOTS = 5  # default number of knots
 FAR = 2.0**20  # largest level, relative to the first level that is tried
 DRAWN = 2**31  # number of the random stream for a trial's start; disturbances use the first streams
-FAILURES = 3
 
 
 def funnel(
@@ -60,7 +59,7 @@ def funnel(
     states: Sequence[str] | None = None,
     shape: Tube | npt.ArrayLike | None = None,
     largest: float | None = None,
-    failures: int = FAILURES,
+    failures: int = 3,
     seed: int = 0,
     goal_radius: float | None = None,
     goal_tolerance: float | None = None,
@@ -81,7 +80,7 @@ def funnel(
       solution: as in `simulate`.
       disturbances: as in `simulate`, without those that change the start of a run, such as `InitialStateError`.
       controller: as in `simulate`; by default the solution's policy.
-      rate: desired success rate, above 0 and below 1.
+      rate: wanted fraction of runs that reach the goal, above 0 and below 1.
       confidence: confidence that all levels are right, at least 0.5 and below 1.
       knots: numbers of the knots at which runs begin; by default 5, from the first on.
       states: names of the states that may be off the plan; by default all.

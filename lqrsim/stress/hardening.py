@@ -193,11 +193,11 @@ def harden(
       problem: scenario, disturbances, policy and failure. The policy is "smooth", "track" or "offset_free"; the failure
         is a collision. Predictions know its `design_disturbances`; by default all that it has. A `solution` is the
         first plan; by default that is the result of `smooth_chance_constrained`.
-      chance: probability of failure, between 0 and 1.
+      chance: wanted probability that the robot collides. The whole interval of the measured probability must be below.
       rounds: largest number of plans.
-      particles: as in `ReliabilityProblem.rare_failures`. By default 250; for a `chance` from 0.005 on 10 / `chance`,
-        so that failures are counted.
-      repetitions: as in `ReliabilityProblem.rare_failures`.
+      particles: number of trials at each level. By default 250; for a chance from 0.005 on 10 / chance, so that
+        failures are counted.
+      repetitions: number of independent estimates, whose spread gives the interval.
       seed: seed of the first measurement, by default that of the problem; the others have the seeds after it.
       report: called with a description of the run, and with a line for each plan.
       progress: called with the number of finished repetitions, the largest possible number, and the result so far as

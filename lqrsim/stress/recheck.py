@@ -58,7 +58,7 @@ def certify(
     Args:
       certificate: from `RareFailures.certificate`, or `ls.load`.
       repetitions: number of its repetitions to run, at least 2; by default all.
-      seed: another seed, for fresh random numbers; by default the seed of the certificate.
+      seed: another seed, for fresh random numbers: then intervals are compared. By default the certificate's.
       scenario: reference to the scenario if it is your own function: files never choose code to run.
       report: as in `ReliabilityProblem.rare_failures`.
       progress: as in `ReliabilityProblem.rare_failures`.

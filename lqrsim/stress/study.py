@@ -204,15 +204,15 @@ class Campaign(Setup):
 
     Attributes:
       sweeps: name -> disturbances at strength 1.
-      strengths: factors by which the disturbances are scaled.
+      strengths: factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate.
       policies: some of CAMPAIGN_POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is
         the plan of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan
         of smooth, with lqrsim.track and lqrsim.OffsetFree; "track_per_cell", "offset_free_per_cell" are designed anew
         for the disturbances of each cell, which no single policy knows. By default the first four.
-      trials: number of trials of each cell.
-      replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
-      shard: trials per file.
-      time_limit: seconds after which a shard counts as hung.
+      trials: number of trials for each sweep, strength and policy.
+      replan_every: seconds between two solves of replan; by default a tenth of the horizon.
+      shard: trials per file; an interruption loses at most this many per worker.
+      time_limit: seconds after which a shard counts as hung and its trials as errors.
     """
 
     design_disturbances: tuple[Disturbance, ...] | None = None
