@@ -25,7 +25,7 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory, drive_solution: ls.Solut
     folder = tmp_path_factory.mktemp("campaigns")
     first = ls.stress.Campaign(
         scenario="differential_drive", sweeps={"noise": NOISE, "late": (ls.disturbances.MeasurementLatency(1),)},
-        strengths=(1.0, 2.0), policies=("smooth", "open_loop"), trials=12,
+        strengths=(1.0, 2.0), policies=("smooth", "open_loop"), trials=12, solution=drive_solution,
     )  # fmt: skip
     problem = ls.scenarios.differential_drive().problem
     plan = ls.smooth(dataclasses.replace(problem, stage_cost=ls.ControlCost((4.0, 4.0)) + problem.obstacle_costs[0]))
@@ -33,14 +33,9 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory, drive_solution: ls.Solut
         "first": first,
         "longer": dataclasses.replace(first, policies=("open_loop",), trials=15),
         "seed": dataclasses.replace(first, seed=1, policies=("smooth",), trials=14),
-        "plan": first,
+        "plan": dataclasses.replace(first, solution=plan),
     }
-    return {
-        name: ls.stress.run_campaign(
-            asked, folder / name, workers=0, solution=plan if name == "plan" else drive_solution
-        )
-        for name, asked in made.items()
-    }
+    return {name: ls.stress.run_campaign(asked, folder / name, workers=0) for name, asked in made.items()}
 
 
 def stated(results: ls.stress.Results, **changed: Any) -> ls.stress.Results:

@@ -41,6 +41,7 @@ from lqrsim.stress.campaign_files import (
     NAME,
     Damaged,
     digest_of_solution,
+    read,
     read_manifest,
     sole_writer,
     write,
@@ -303,10 +304,10 @@ def _unfinished(results: Results) -> list[Shard]:
 
 
 def _is_intact(results: Results, shard: Shard) -> bool:
+    path = results.path(shard)
     try:
-        results.read(shard)
+        read(path, shard, results.manifest["digest"])
     except Damaged as error:
-        path = results.path(shard)
         aside = results.folder / "damaged" / path.name
         for number in itertools.count(1):
             if not aside.exists():

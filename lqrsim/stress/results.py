@@ -101,7 +101,7 @@ class Results:
           cell: one of `cells`.
           partial: whether to accept a cell that is not finished.
         """
-        tables = [table for _, table in self.tables(cell, partial=partial)]
+        tables = list(self.tables(cell, partial=partial))
         if not tables:
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
         names = [name for name in tables[0] if name != "reason"]
@@ -120,7 +120,7 @@ class Results:
           Outcome -> number of trials.
         """
         counts: Counter[str] = Counter()
-        for _, table in self.tables(cell, partial=partial):
+        for table in self.tables(cell, partial=partial):
             counts.update(table["outcome"].tolist())
         return counts
 
@@ -260,7 +260,7 @@ class Results:
         """
         return {
             int(trial): str(reason)
-            for _, table in self.tables(cell, partial=True)
+            for table in self.tables(cell, partial=True)
             for trial, reason in zip(table["trial"], table["reason"], strict=True)
             if reason
         }
@@ -316,31 +316,20 @@ class Results:
         check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
         return self.folder / "shards" / shard.file
 
-    def read(self, shard: Shard) -> Table:
-        """The rows of a shard. Raises Damaged if its file is missing or damaged.
-
-        Args:
-          shard: one of `shards`.
-        """
-        return read(self.path(shard), shard, self.manifest["digest"])
-
-    def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
-        """The tables of a cell, shard by shard.
+    def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[Table]:
+        """The tables of a cell, shard by shard: name -> column.
 
         Args:
           cell: one of `cells`.
           partial: whether to skip shards that are missing.
-
-        Returns:
-          An iterator of pairs: a shard and its columns.
         """
         check_flag("partial", partial)
         for shard in self.shards(cell):
             if self.path(shard).is_file() or not partial:
-                yield shard, self.table(shard)
+                yield self.table(shard)
 
     def table(self, shard: Shard) -> Table:
-        """The rows of a shard; `read` with an InputError.
+        """The rows of a shard.
 
         Args:
           shard: one of `shards`.
@@ -350,7 +339,7 @@ class Results:
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
             raise InputError(f"cell: got {self.cells[shard.cell]} without trials {trials}, run: {self.command}")
         try:
-            return self.read(shard)
+            return read(path, shard, self.manifest["digest"])
         except Damaged as error:
             raise InputError(f"shard: got {path}, which is damaged ({error}), run: {self.command}") from None
 
