@@ -7,9 +7,10 @@
 Each checkout computes in a process of its own, with the packages of this one and a cache of its own. Compared are the
 solutions of the paper's 100 queries of the quadrotor and of the drive, in both forms, with and without the paper's
 start, by smooth and ilqr, with a clearance, limits, noise and a risk, and of a robot from an MJCF: status, iterations,
-cost, plan, policy and cost-to-go; and every column of a small campaign. To the last bit; with a tolerance, the same
-status and iterations, and costs that differ by less than that, relatively. Of the rest it then says the largest
-difference, relative to the largest number of its array.
+cost, plan, policy and cost-to-go; every column of a small campaign; what small searches find for rare failures, the
+smallest failure, a hardened plan and a funnel; a run that re-plans; and a policy as C. To the last bit; with a
+tolerance, the same status and iterations, and costs that differ by less than that, relatively. Of the rest it then says
+the largest difference, relative to the largest number of its array.
 """
 
 import hashlib
@@ -41,7 +42,7 @@ class Config:
     queries: int = 100
     """Of the quadrotor."""
     trials: int = 50
-    """Of each cell of the campaign."""
+    """Of each cell of the campaign, and at each level of a splitting, where they are 20 at least."""
     tolerance: float = 0.0
     """Of costs, relative; 0 for the same bits in everything."""
     quick: bool = False
@@ -145,8 +146,37 @@ def compute(queries: int, trials: int, place: str) -> dict[str, list[Any]]:
             )
             cells = [results.outcomes(cell).columns() for cell in results.campaign.cells]
         lines[f"campaign {name}"] = [_table(cell, f"campaign {name}/{i}", arrays) for i, cell in enumerate(cells)]
+    for name, columns in _searches(max(trials, 20)).items():
+        lines[name] = [_table(columns, name, arrays)]
     np.savez(Path(place) / "arrays.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return lines
+
+
+def _searches(particles: int) -> dict[str, dict[str, np.ndarray]]:
+    """What studies of policies find, a run that re-plans, and the C files of a policy: arrays by name."""
+    study = ls.stress.ReliabilityProblem("quadrotor", sweep="moderate", strength=2.0, policy="track")
+    rare = study.rare_failures(particles=particles, repetitions=2).splitting
+    smallest = study.smallest_failure(rounds=2, particles=particles)
+    study = ls.stress.ReliabilityProblem("quadrotor", sweep="moderate")
+    hard = ls.stress.harden(study, chance=0.3, rounds=1, particles=particles, repetitions=2)
+    drive, noise = ls.scenarios.differential_drive(), [ls.disturbances.ControlNoise(0.05)]
+    plant, plan = drive.plant(), ls.smooth(drive.problem)
+    funnel = ls.funnel(plant, plan, disturbances=noise, rate=0.8, knots=[0], states=["x", "y"], failures=1)
+    replanner = ls.Replanner(drive.problem, plan, every=5.0, deadline=0.0)
+    again = ls.simulate(plant, plan, controller=replanner, disturbances=noise, frames=False)
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(file).read_text(encoding="utf-8") for file in ls.export_c(plan.policy, folder).files]
+    return {
+        "rare failures": {"repetitions": rare.repetitions, "levels": rare.levels, "failures": rare.failures},
+        "smallest failure": {"numbers": smallest.point.numbers, "shares": np.array(smallest.shares)},
+        "hardened plan": {
+            "states": hard.solution.trajectory.states, "hit": np.array([*hard.rounds[0].hit.values()]),
+            "probability": np.array([one.probability.value for one in hard.rounds]),
+        },
+        "funnel": {"levels": funnel.levels, "successes": funnel.successes, "shape": funnel.shape},
+        "re-planned run": {"states": again.states, "applied": again.applied},
+        "policy as C": {"files": np.array(files)},
+    }  # fmt: skip
 
 
 _CART_POLE = """
