@@ -13,6 +13,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,8 @@ def run_campaign(
         each worker would call it again.
     """
     executors.end_if_started_by_import()
-    check_kind("campaign", campaign, Campaign, "a Campaign")
+    # A copy, so that the next run resolves the scenario again: its code may have changed.
+    campaign = copy(check_kind("campaign", campaign, Campaign, "a Campaign"))
     folder = check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
     batch = check_count("batch", batch, at_most=100_000)
@@ -159,7 +161,7 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
     if problem.duration is None:
         plant.substeps(problem.dt)
-    _ = campaign.near_enough  # checks that
+    _ = campaign.goal_options  # raises InputError if they do not fit
     fixed = {(cell.sweep, cell.strength): True for cell in campaign.cells}
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):

@@ -151,7 +151,7 @@ class Setup:
         return None if self.solution is None else solutions.given(self.resolved, self.solution)
 
     @cached_property
-    def near_enough(self) -> dict[str, Any]:
+    def goal_options(self) -> dict[str, Any]:
         """The goal options of `simulate`. Raises InputError if they do not fit the scenario."""
         self.resolved.target_radius(self.goal_radius, self.goal_tolerance)
         return self.resolved.near_enough(self.goal_radius, self.goal_tolerance)
@@ -190,12 +190,12 @@ class Study(Setup):
     @cached_property
     def closed_loop(self) -> dict[str, Any]:
         """The arguments of `funnel` and `TrialScore` but the disturbances: plant, solution, controller and goal."""
-        near, design = self.near_enough, self.design_disturbances  # checked before the scenario is solved
+        goal, design = self.goal_options, self.design_disturbances  # checked before the scenario is solved
         # Whoever has a Solution at hand knows of which problem it is.
         remark = not isinstance(self.solution, Solution)
         solution, controller = make_policy(self.policy, self.resolved, design, self.given, remark=remark)
         plant = self.resolved.settled(solution).plant()
-        return {"plant": plant, "solution": solution, "controller": controller, **near}
+        return {"plant": plant, "solution": solution, "controller": controller, **goal}
 
 
 @dataclass(frozen=True, kw_only=True)

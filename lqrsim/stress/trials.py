@@ -36,7 +36,7 @@ class Trials:
             self.solutions[cell.policy],
             controller=self._controller(cell),
             disturbances=self.campaign.disturbances(cell),
-            **self.campaign.near_enough,
+            **self.campaign.goal_options,
             seed=self.campaign.seed,
             trials=count,
             first_trial=first,

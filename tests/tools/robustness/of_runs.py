@@ -239,7 +239,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "Results.solution": ({"self": results, "policy": "open_loop"},),
         **{
             f"Results.{name}": ({"self": results, "shard": next(results.shards())},)
-            for name in ("path", "read", "table")
+            for name in ("path", "table")
         },
         "TrialScore": ({field: getattr(score, field) for field in fields}, 0.5),
         "TrialScore.__call__": ({"self": score, "numbers": np.zeros((2, score.size))},),
