@@ -7,11 +7,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples, rarely
+from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
+from sympy import cos, sin
 
 import lqrsim as ls
 import lqrsim.gym
@@ -403,11 +406,11 @@ def near(x: Any, u: Any, p: Any) -> Any:
     return p.radius**2 - (x[0] - p.x) ** 2
 
 
-def by_waypoints(places: list[float], knots: list[int], end: float, **options: Any) -> ls.Problem:
+def by_waypoints(places: list[float], knots: list[int], end: float, steps: int = 40, **options: Any) -> ls.Problem:
     """A cart that passes places, within a centimetre, on its way to where it stops."""
     passed = ls.SymbolicConstraint(near, parameters={"x": places, "radius": 0.01}, at=knots, name="waypoint")
     return dataclasses.replace(
-        problem(way=end, steps=40, weight=1e-5), dt=0.2, constraints=[ls.GoalState([end, 0.0]), passed],
+        problem(way=end, steps=steps, weight=1e-5), dt=0.2, constraints=[ls.GoalState([end, 0.0]), passed],
         **{"segments": knots} | options,
     )  # fmt: skip
 
@@ -481,3 +484,89 @@ def test_a_plan_of_other_segments_does_not_settle_a_problem() -> None:
     solution = ls.smooth(problem())
     with pytest.raises(ls.InputError, match="segments"):
         by_waypoints([2.0], [20], -1.0).settled(solution)
+
+
+def through(stated: ls.Problem, places: npt.ArrayLike) -> ls.Trajectory:
+    """Straight lines from waypoint to waypoint, with velocities by differences, which no control follows."""
+    places = np.asarray(places)
+    n, knots, at = (
+        len(stated.dynamics.state_coordinates),
+        [0, *stated.segments, stated.steps],
+        np.arange(stated.steps + 1),
+    )
+    states = np.zeros((stated.steps + 1, n))
+    for i, column in enumerate(places.T):
+        states[:, i] = np.interp(at, knots, column)
+        rate = n // 2 + i
+        states[1:-1, rate] = (states[2:, i] - states[:-2, i]) / (2 * stated.dt)
+    return ls.Trajectory(states, np.tile(stated.nominal_control, (stated.steps, 1)), stated.dt)
+
+
+def test_segments_are_found_from_lines_through_the_waypoints() -> None:
+    """Seven turns by the formula, as above; a plan that keeps the stated knots is not sought first.
+
+    The shortest segment has four steps, so the ends at whole knots cost twice as much as above."""
+    places = [0.1, -2.0, 2.0, -2.0, 0.1, -0.1, 1.0]
+    stated = by_waypoints(places, list(range(15, 120, 15)), 0.0, steps=120, duration=(1.0, 30.0))
+    solution = ls.smooth(stated, start=through(stated, [[0.0], *([place] for place in places), [0.0]]))
+    assert solution.status is Status.CONVERGED, solution.detail
+    turns = [
+        0.0,
+        *(place - 0.01 * np.sign(step) for step, place in zip(np.diff([0.0, *places]), places, strict=True)),
+        0.0,
+    ]
+    seconds = 2 * np.sqrt(np.abs(np.diff(turns))).sum()
+    assert seconds * (1 - 1e-6) <= solution.trajectory.horizon <= 1.01 * seconds
+    assert len(solution.iterations) < 200  # 64; a search by way of plans for the stated knots takes 465
+
+
+@pytest.mark.parametrize(
+    ("places", "weight"),
+    [
+        ([(3.0, 1.0), (-2.0, 2.0), (4.0, -1.0), (1.0, 3.0)], 1e-4),
+        *rarely(([(5.0, 0.0), (5.0, 3.0), (-5.0, 3.0), (-5.0, 0.0), (2.0, 1.0)], 1e-4)),
+    ],
+)
+def test_a_planar_quadrotor_races_through_waypoints(places: list[tuple[float, float]], weight: float) -> None:
+    """Integrated by SciPy with its held controls, the plan passes all waypoints and stops where it began.
+
+    The tolerance is that of four Runge-Kutta steps in a period of 45 ms, in which it turns by up to 0.3 rad.
+    """
+
+    def rates(x: Any, u: Any, p: Any) -> list[Any]:
+        return [x[3], x[4], x[5], -(u[0] + u[1]) * sin(x[2]), (u[0] + u[1]) * cos(x[2]) - 9.81, 60 * (u[1] - u[0])]
+
+    def flight(_: float, x: Any, u: Any) -> list[Any]:
+        return [*x[3:], -sum(u) * np.sin(x[2]), sum(u) * np.cos(x[2]) - 9.81, 60 * (u[1] - u[0])]
+
+    def reached(x: Any, u: Any, p: Any) -> Any:
+        return p.radius**2 - (x.x - p.x) ** 2 - (x.z - p.z) ** 2
+
+    dynamics = ls.Dynamics(
+        rates, states={"x": "m", "z": "m", "tilt": "rad", "vx": "m/s", "vz": "m/s", "spin": "rad/s"},
+        controls={"left": "N/kg", "right": "N/kg"}, position=("x", "z"),
+    ).with_substeps(4)  # fmt: skip
+    knots = [round(100 * k / (len(places) + 1)) for k in range(1, len(places) + 1)]
+    across, up = map(list, zip(*places, strict=True))
+    stated = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=100, initial=ls.FixedState(np.zeros(6)),
+        stage_cost=ls.ControlCost([weight, weight], about=[4.905, 4.905]),
+        final_cost=ls.QuadraticCost(np.zeros(6), about=np.zeros(6)), control_limits=(0.0, 12.0),
+        constraints=[
+            ls.GoalState(np.zeros(6)),
+            ls.SymbolicConstraint(reached, parameters={"x": across, "z": up, "radius": 0.1}, at=knots),
+        ],
+        duration=(1.0, 60.0), time_weight=1.0, segments=knots,
+    )  # fmt: skip
+    solution = ls.smooth(stated, start=through(stated, [(0.0, 0.0), *places, (0.0, 0.0)]))
+    assert solution.status is Status.CONVERGED, solution.detail
+    plan, state = solution.trajectory, np.zeros(6)
+    passed = dict(zip(stated.settled(solution).segments, places, strict=True))
+    for knot, control in enumerate(plan.controls):
+        if knot in passed:
+            assert np.hypot(*(state[:2] - passed[knot])) <= 0.1 + 1e-3
+        assert ((control >= 0) & (control <= 12)).all()
+        moved = solve_ivp(flight, (0.0, plan.dt), state, args=(control,), rtol=1e-10, atol=1e-10)
+        state = moved.y[:, -1]
+    np.testing.assert_allclose(state, 0.0, atol=1e-3)
+    assert plan.horizon < 5  # of the stated 10 s
