@@ -551,3 +551,23 @@ def test_weights_are_tuned_so_that_the_policy_fails_less() -> None:
     rows = result["rows"]
     assert rows["tuned"]["fails"][1][2] < rows["the scenario's"]["fails"][1][1]  # the intervals are apart
     assert "| tuned |" in script.report(result)
+
+
+def test_a_race_says_how_far_off_a_path_passes_the_waypoints() -> None:
+    """Straight lines past them, one of them moved aside; knots are where the lines are not nearest."""
+    race = import_module("race")
+    aside = np.zeros((19, 3))
+    aside[4] = 0.0, 0.0, 0.5  # across a leg from straight above, where the nearest place is on the leg itself
+    aside[9] = 0.0, 0.7, 0.0
+    path = np.vstack([race.START, race.WAYPOINTS + aside, race.GOAL])
+    knots = [10 * k for k in range(1, 20)]
+    at = np.arange(201) / 10
+    states = np.column_stack([np.interp(at, np.arange(21), axis) for axis in path.T])
+    found = race.misses(np.stack([states, states[:, [0, 1, 2]] + [0.0, 0.0, np.nan]]), knots)
+    fine = np.column_stack([np.interp(np.arange(200001) / 10000, np.arange(21), axis) for axis in path.T])
+    nearest = [
+        np.linalg.norm(fine[10000 * k - 5000 : 10000 * k + 5000] - place, axis=1).min()
+        for k, place in enumerate(race.WAYPOINTS, start=1)
+    ]
+    np.testing.assert_allclose(found[0], nearest, rtol=0, atol=2e-3)  # the sampling's: 16 m in 10,000 parts
+    assert not (found[1] <= 1.0).any()  # a run that diverged passes nothing

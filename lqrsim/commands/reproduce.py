@@ -33,6 +33,7 @@ SCRIPTS = (
     "noise_aware",
     "funnels",
     "solver_league",
+    "race",
     "other_simulators",
     "adaptive_quad_bench",
     "export_c",
