@@ -16,19 +16,20 @@ from lqrsim.stress.statistics import independent_difference, paired_difference
 
 fisher: Any = stats.fisher_exact  # whose stubs do not know its result
 Folders = dict[str, ls.stress.Results]
-NOISE = (ls.disturbances.ControlNoise(0.6),)
+NOISE = (ls.disturbances.ForceNoise(0.15),)  # without feedback, some flights fail
 
 
 @pytest.fixture(scope="module")
-def campaigns(tmp_path_factory: pytest.TempPathFactory, drive_solution: ls.Solution) -> Folders:
+def campaigns(
+    tmp_path_factory: pytest.TempPathFactory, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
+) -> Folders:
     """Two policies; the same with more trials of one of them; with another seed; with another plan."""
     folder = tmp_path_factory.mktemp("campaigns")
     first = ls.stress.Campaign(
-        scenario="differential_drive", sweeps={"noise": NOISE, "late": (ls.disturbances.MeasurementLatency(1),)},
-        strengths=(1.0, 2.0), policies=("smooth", "open_loop"), trials=12, solution=drive_solution,
+        scenario="quadrotor", sweeps={"noise": NOISE, "late": (ls.disturbances.MeasurementLatency(1),)},
+        strengths=(1.0, 2.0), policies=("smooth", "open_loop"), trials=12, solution=quadrotor_solution,
     )  # fmt: skip
-    problem = ls.scenarios.differential_drive().problem
-    plan = ls.smooth(dataclasses.replace(problem, stage_cost=ls.ControlCost((4.0, 4.0)) + problem.obstacle_costs[0]))
+    plan = ls.smooth(dataclasses.replace(quadrotor.problem, initial=ls.FixedState(quadrotor.problem.start)))
     made = {
         "first": first,
         "longer": dataclasses.replace(first, policies=("open_loop",), trials=15),

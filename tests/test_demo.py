@@ -7,18 +7,24 @@ from pathlib import Path
 
 import av
 import pytest
+from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.view import gl
 
 
-def test_demo_leaves_everything_it_promises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("asked", [["--robots", "quadrotor"], *rarely([])])
+def test_demo_leaves_everything_it_promises(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By default of both robots."""
     if not gl.available():
         pytest.skip("no OpenGL here")
-    assert main(["demo", "--quick", "--out", str(tmp_path), "--seed", "3"]) == 0
+    assert main(["demo", "--quick", "--out", str(tmp_path), "--seed", "3", *asked]) == 0
     printed = capsys.readouterr().out
-    for name in ("differential_drive", "quadrotor"):
+    assert sorted(path.name for path in tmp_path.iterdir()) == (asked[1:] or ["differential_drive", "quadrotor"])
+    for name in asked[1:] or ("differential_drive", "quadrotor"):
         folder = tmp_path / name
         solution, scenario = ls.load(folder / "solution.npz", ls.Solution), ls.scenarios.get(name)
         assert solution.status is ls.Status.CONVERGED

@@ -398,6 +398,7 @@ def test_an_arm_is_fitted_to_a_run_that_failed() -> None:
     assert max(fitted["off"], true["off"]) < 0.05 * on_paper["off"]
 
 
+@pytest.mark.long
 def test_an_arm_reaches_past_a_shelf() -> None:
     """The first joint alone would hit the divider; plan and run keep the clearance, to the tolerance of constraints."""
     script: Any = import_module("mjcf_shelf")

@@ -7,12 +7,13 @@ import copy
 import dataclasses
 import inspect
 import itertools
+import logging
 import math
 import pkgutil
 import re
 import signal
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sampling import examples
+from sampling import examples, rarely
 
 import lqrsim as ls
 from lqrsim.codegen.language import Group
@@ -62,19 +63,32 @@ def refusal(call: Callable[[], object]) -> str:
     return line
 
 
-def test_a_sample_of_hostile_calls() -> None:
+@pytest.fixture(scope="module")
+def caller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Of the calls of a seed; what it calls takes seconds to make."""
+    logger = logging.getLogger("lqrsim")
+    level = logger.level
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("subjects"))
+        made = api.Caller(Path.cwd(), seed=1)
+        logger.setLevel(level)
+        yield made
+
+
+@pytest.mark.parametrize("apart", [False, *rarely(True)])
+def test_a_sample_of_hostile_calls(caller: Any, apart: bool) -> None:
+    """Here; with the long tests in a process of their own, as the benchmark makes them."""
     count = examples(60)
-    verdicts = list(api.calls(count, seed=1))
+    verdicts = list(api.calls(count, seed=1)) if apart else [caller(number) for number in range(count)]
     assert len(verdicts) == count
     assert not [verdict for verdict in verdicts if verdict.failed]
     kinds = {verdict.kind for verdict in verdicts}
     assert {"accepted", "refused"} <= kinds
 
 
-def test_every_public_callable_is_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_public_callable_is_tried(caller: Any) -> None:
     """What __all__ lists has arguments that are accepted as they are."""
-    monkeypatch.chdir(tmp_path)
-    tried = subjects.subjects(tmp_path)
+    tried = caller.subjects
     assert {name for name, _ in subjects.public()} <= tried.keys()
     for name in ("smooth", "simulate", "Problem", "AffinePolicy.__call__", "Campaign", "render", "rotations.rotate"):
         assert name in tried

@@ -88,7 +88,7 @@ CART = """
     <body><joint name="x" type="slide" axis="1 0 0" damping="{damping}"/><geom size="0.1" mass="2"/></body>
     <body pos="0 1 0"><joint name="turn" type="ball"/><geom size="0.1" pos="0.2 0 0"/></body>
   </worldbody>
-  <actuator><motor name="push" joint="x"/></actuator>
+  <actuator><motor name="push" joint="x"/><motor name="turn" joint="turn" gear="0 0 1"/></actuator>
 </mujoco>
 """
 

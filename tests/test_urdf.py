@@ -427,7 +427,8 @@ def test_it_stands_where_a_scenario_is_named(
     assert rollout.tracking_error.max() < 1e-6  # nothing disturbs it
     assert ls.verify_run(rollout).passed
     if gl.available():
-        assert main(["render", str(tmp_path / "runs" / "rollout.npz"), "--out", str(tmp_path / "arm.mp4")]) == 0
+        few = ["--out", str(tmp_path / "arm.mp4"), "--quality", "draft", "--fps", "5"]
+        assert main(["render", str(tmp_path / "runs" / "rollout.npz"), *few]) == 0
 
 
 def test_a_plant_of_it_agrees_with_it(arm: Path) -> None:
