@@ -6,8 +6,10 @@
 
 The problems are in least time: dynobench's bugtraps and a parking space, and mazes of walls drawn at random, each with
 a door 1 m wide, for a unicycle with accelerations and a planar quadrotor. Trees are grown from one seed after another;
-each way that they find is the start of a solve, and the best plan so far is the answer. Times are those of the
-processor, without compiling. Where a search is not at its end when the time is over, its plan of that time counts.
+each way that they find is the start of a solve, and the best plan so far is the answer. The other searches have the
+time as their limit: they grow trees, too, where their paths lead nowhere, and end with the first plan of those. Times
+are those of the processor, without compiling. Where a search is not at its end when the time is over, its plan of that
+time counts.
 """
 
 import itertools
@@ -92,7 +94,7 @@ Progress = list[tuple[float, float]]  # processor seconds at which a plan was kn
 
 def by_default(problem: ls.Problem, seconds: float, **options: Any) -> tuple[Progress, ls.Trajectory | None]:
     begun = time.process_time()
-    solution = within(seconds, ls.smooth, problem, **options)
+    solution = within(seconds, ls.smooth, problem, time_limit=seconds, **options)
     if not keeps_all(problem, solution):
         return [], None
     return [(time.process_time() - begun, solution.trajectory.horizon)], solution.trajectory

@@ -1,6 +1,7 @@
 """Trees of short plans: their ways by an independent integrator and distance, their metric by dense least squares."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lqrsim as ls
-from lqrsim.solvers.tree import LocalPlanner, grow, in_steps_of
+from lqrsim.solvers.budget import Stop
+from lqrsim.solvers.tree import LocalPlanner, grow, in_steps_of, ways_by_trees
 
 # A room that opens to the left: centres and half sizes of its walls. The start is inside, the goal to the right of it.
 WALLS = np.array([(1.6, 0.0, 0.1, 1.1), (0.6, 1.0, 1.1, 0.1), (0.6, -1.0, 1.1, 0.1)])
@@ -115,6 +117,49 @@ def test_in_the_steps_of_a_problem_a_way_keeps_its_ends_and_mean_controls(way: l
     assert start.horizon == pytest.approx(9.0)
     assert np.array_equal(start.states[[0, -1]], way.states[[0, -1]])
     assert start.controls.mean(axis=0) == pytest.approx(way.controls.mean(axis=0))  # sums, but for rounding
+
+
+def round_walls(x: Any, u: Any, p: Any) -> list[Any]:
+    from sympy import Abs, Max
+
+    return [Max(Abs(x.x - at) - w, Abs(x.y - up) - h) - RADIUS for at, up, w, h in WALLS]
+
+
+@pytest.mark.parametrize(
+    "options", [{"duration": (1.0, 15.0), "time_weight": 1.0}, {}], ids=["free duration", "fixed duration"]
+)
+def test_a_solve_grows_trees_where_no_path_is_known(pushed_trap: ls.Problem, options: dict[str, Any]) -> None:
+    """Without a position there are no shortest paths. In 15 s and 60 steps none is so long that it jumps a wall."""
+    nameless = ls.Dynamics(
+        pushed, states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s^2", "ay": "m/s^2"},
+        control_limits=(-1.0, 1.0),
+    )  # fmt: skip
+    goal_and_bounds = pushed_trap.constraints[:2]
+    problem = dataclasses.replace(
+        trap(PUSHED, 10.0, **options), dynamics=nameless, initial=ls.FixedState([1.0, 0, 0, 0]),
+        constraints=[*goal_and_bounds, ls.SymbolicConstraint(round_walls)],
+    )  # fmt: skip
+    solution = ls.smooth(problem, time_limit=600.0)  # it ends with the first plan
+    assert solution.success
+    assert clearances(solution.trajectory.states).min() >= -1e-6
+    assert np.array_equal(solution.trajectory.states[0], [1.0, 0, 0, 0])
+    assert solution.trajectory.states[-1] == pytest.approx([2.2, 0, 0, 0], abs=1e-6)
+    led = [one.start for one in solution.candidates if one.status is ls.Status.CONVERGED]
+    assert len(led) == 1
+    assert led[0].startswith("trees of short plans, seed ")
+
+
+def test_trees_grow_until_the_time_is_over_and_not_where_they_cannot(pushed_trap: ls.Problem) -> None:
+    stop = Stop()
+    for limit in (0.0, None):
+        stop.begin(limit)
+        assert not list(ways_by_trees(pushed_trap, stop, attentive=False))
+    stop.begin(600.0)
+    seeds = [seed for seed, _ in itertools.islice(ways_by_trees(pushed_trap, stop, attentive=False), 2)]
+    assert len(set(seeds)) == 2
+    inside = dataclasses.replace(pushed_trap, initial=ls.FixedState([1.6, 0, 0, 0]))
+    for problem in (inside, pushed_trap.with_constraints(pushed_trap.constraints[:2])):
+        assert not list(ways_by_trees(problem, stop, attentive=False))
 
 
 def test_headings_reach_their_goals_up_to_whole_turns() -> None:

@@ -32,6 +32,7 @@ from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, MUCH, Barrier
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.tree import ways_by_trees
 from lqrsim.solvers.ways import ways
 
 # The added state, and the parameter to which it is relative; with underscores after them if the system has such names.
@@ -60,14 +61,17 @@ def solve_for_duration(
 
     Without a start from the caller, ways to the goal are sketched, for the stated duration and a longer one. Then comes
     the solution for the stated duration, in whose place a plan `begin` may be. From each of these the search goes to
-    the best duration nearby. `solve` is for problems with a fixed duration, within the time of `stop`; for `attentive`
-    see `Budget`.
+    the best duration nearby. Where none led to a plan, trees grow. `solve` is for problems with a fixed duration,
+    within the time of `stop`; for `attentive` see `Budget`.
     """
     search = DurationSearch(problem, settings, solve, attentive, callback, stop)
-    if begin is None and settings.start is None and settings.safeguard:
+    alone = begin is None and settings.start is None and settings.safeguard
+    if alone:
         search.follow_ways()
-    if not (problem.segments and settings.start is not None and search.follow(settings.start)):
+    if not (problem.segments and settings.start is not None and search.follow_start(settings.start)):
         search.go_on_from(begin)
+    if alone:
+        search.grow_trees()
     return stop.finish(search.solution())
 
 
@@ -115,14 +119,26 @@ class DurationSearch:
         for name, plan in sketches:
             if stop.due:
                 return
-            before = self._total
-            _, ordinary, found = self._find(plan, Budget(self._settings.max_iterations, stop))
-            status = Status.CONVERGED if found.solved else Status.STALLED
-            cost = found.measures.cost if np.isfinite(found.measures.cost) else np.inf
-            end = found.trajectory(ordinary.dt)
-            self.candidates.append(Candidate(name, cost, self._total - before, status, end))
+            self._follow(name, plan)
 
-    def follow(self, start: StartLike | InitialGuess) -> bool:
+    def grow_trees(self) -> None:
+        """Grow trees while no plan is known, and go on from the ways through them."""
+        if self.best is not None or any(one.success for one in self._fixed):
+            return
+        for seed, way in ways_by_trees(self._problem, self._stop, attentive=self._attentive):
+            self._follow(f"trees of short plans, seed {seed}, {way.horizon:.4g} s", way)
+            if self.best is not None:
+                return
+
+    def _follow(self, name: str, plan: Trajectory) -> None:
+        """Go on from a plan that is one of the candidates."""
+        before = self._total
+        _, ordinary, found = self._find(plan, Budget(self._settings.max_iterations, self._stop))
+        status = Status.CONVERGED if found.solved else Status.STALLED
+        cost = found.measures.cost if np.isfinite(found.measures.cost) else np.inf
+        self.candidates.append(Candidate(name, cost, self._total - before, status, found.trajectory(ordinary.dt)))
+
+    def follow_start(self, start: StartLike | InitialGuess) -> bool:
         """Go on from a trajectory of the caller, as it is, and return whether that led to a plan.
 
         Its knots may be far from the best ends of segments, so a plan of the stated duration may be hard to find.

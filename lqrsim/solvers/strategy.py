@@ -19,6 +19,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +60,7 @@ from lqrsim.solvers.multistart import (
 )
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.tree import ways_by_trees
 from lqrsim.solvers.ways import ways
 
 # Controls are idle if they are this close to the nominal controls, relative to their size, which counts as at least 1.
@@ -98,28 +100,32 @@ def solve(
     stop: Stop | None = None,
     refinements: int = REFINEMENTS,
     begin: Solution | None = None,
+    trees: bool = True,
 ) -> Solution:
     """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts.
 
     `stop` is that of a solve of which this one is a part; its time limit is then for both. `refinements` is how often
     constraints that the plan misses within its periods may be refined. A search for a free duration goes on from a plan
-    `begin`.
+    `begin`; its solves for fixed durations have no `trees`, which it grows itself.
     """
     if stop is None:
         stop = Stop()
         stop.begin(settings.time_limit)
 
-    def part(stated: Problem, options: SmootherSettings, last: Solution | None = None) -> Solution:
+    def part(
+        stated: Problem, options: SmootherSettings, last: Solution | None = None, *, trees: bool = True
+    ) -> Solution:
         how = {"attentive": attentive, "threads": threads, "callback": callback, "stop": stop}
-        return solve(stated, options, begin=last, **how)
+        return solve(stated, options, begin=last, trees=trees, **how)
 
     if problem.control_rate is not None:
         return solve_with_rates(problem, settings, part)
     if problem.accuracy is not None or problem.between_knots:
         return solve_between_knots(problem, settings, part, stop)
     if problem.duration is not None:
+        fixed = partial(part, trees=False)
         return solve_for_duration(
-            problem, settings, part, attentive=attentive, callback=callback, stop=stop, begin=begin
+            problem, settings, fixed, attentive=attentive, callback=callback, stop=stop, begin=begin
         )
     before, asked = tuple[Iteration, ...](), settings
     if refinements == REFINEMENTS and any(one._rough for one in problem.constraints):
@@ -135,7 +141,7 @@ def solve(
         ]
     is_plan = settings.start is not None and first.prior is None and first.found is None
     kept = runs[0].given() if is_plan else None
-    search = Search([name for name, _ in given], runs, callback, threads, kept)
+    search = Search([name for name, _ in given], runs, callback, threads, kept, trees=trees)
     with stop.reporting("smooth", attentive):
         search.attempt(ATTEMPTS)
     solution = search.solution()
@@ -270,10 +276,10 @@ class Search:
 
     def __init__(
         self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int,
-        given: RunResult | None = None,
+        given: RunResult | None = None, *, trees: bool = False,
     ) -> None:  # fmt: skip
         self._named = list(zip(names, runs, strict=True))
-        self._callback, self._threads, self._known, self._given = callback, threads, Known(), given
+        self._callback, self._threads, self._known, self._given, self._trees = callback, threads, Known(), given, trees
         self._solving = threads if len(runs) == 1 else 1
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
@@ -454,6 +460,20 @@ class Search:
             run = self._add(policy_of(found, "a plan without what is in the way"))
             self._known.from_start = False
             self._offer(run, self._finish(run, refine))
+
+    @property
+    def may_grow(self) -> bool:
+        """Whether trees may find a way where nothing else did."""
+        return self._trees and self.may_go_on and self.is_barred
+
+    def grow_trees(self) -> None:
+        """Go on from ways through trees until one leads to a plan."""
+        problem, stop = self._problem, self._budget.stop
+        for seed, way in ways_by_trees(problem, stop, attentive=self._budget.attentive):
+            run = self._add(resolve(way, problem), f"trees of short plans, seed {seed}")
+            self._offer(run, self._finish(run, from_states))
+            if self.best[1].success:
+                return
 
     def _motions(self) -> list[tuple[str, Trajectory]]:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
@@ -1002,6 +1022,7 @@ FIRST = (
 )
 ATTEMPTS = (
     *FIRST,
+    Attempt("ways through trees of short plans", lambda search: search.may_grow, Search.grow_trees),
     Attempt("paths to the left and to the right", lambda search: search.touches, Search.look_aside),
     Attempt("a plan beside a saddle", lambda search: search.is_at_saddle, Search.leave_saddles),
     Attempt(

@@ -12,6 +12,7 @@ and controls with which the linearised system is in a state at that step. So it 
     A. Perez, R. Platt, G. Konidaris, L. Kaelbling, T. Lozano-Perez. LQR-RRT*. ICRA 2012.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resampled
+from lqrsim.solvers.multistart import passable
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
@@ -39,6 +41,30 @@ HELD_BACK = 0.5  # share that is kept of an extension that ends in a violation: 
 WORN = 3.0  # cost that is added to a node from which an extension failed, as that of so many steps
 DRAWS = 100  # largest number of states that are drawn until one violates nothing
 TOLERANCE = 1e-6  # of violations, that of a solve
+
+
+def ways_by_trees(problem: Problem, stop: Stop, *, attentive: bool) -> Iterator[tuple[int, Trajectory]]:
+    """Ways from start to goal through one pair of trees after another, in `in_steps_of` the problem, and their seeds.
+
+    They end with the time. Without a time limit there are none: trees know of no end, and a problem that cannot be
+    solved would be told ten times as late. Nor are there any where trees cannot grow, where nothing is in the way, or
+    where start or goal violates what is. For `attentive` see `Budget`.
+    """
+    ends = _ends(problem)
+    if ends is None or not any(passable(problem)) or np.isinf(stop.deadline) or stop.due:
+        return
+    with stop.not_counting():  # compiling
+        planner = LocalPlanner(problem, *ends, min(LONGEST))
+    if not all(planner.free_until(end[None]) for end in ends):
+        return
+    for seed in itertools.count():
+        way = None
+        with stop.reporting("smooth", attentive), stop.heeding():
+            way = grow(problem, seed=seed, stop=stop)
+        if stop.due:
+            return
+        if way is not None:
+            yield seed, in_steps_of(problem, way)
 
 
 def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Stop | None = None) -> Trajectory | None:
@@ -56,13 +82,11 @@ def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Sto
       seed: of the random states. extensions: the largest number of extensions of both trees.
       stop: ends it early.
     """
-    if problem.dynamics.discrete or problem.dynamics.by_mujoco or problem.moving:
+    ends = _ends(problem)
+    if ends is None:
         return None
-    start, goal = problem.start, problem.weighed_goal
-    if start is None or goal is None:
-        return None
-    goal = np.where(np.isnan(goal), start, goal)
-    planner, draws = LocalPlanner(problem, start, goal, LONGEST[seed % 2]), np.random.default_rng(seed)
+    start, goal = ends
+    planner, draws = LocalPlanner(problem, start, goal, LONGEST[seed % len(LONGEST)]), np.random.default_rng(seed)
     turn = np.zeros(len(goal))
     turn[list({i for one in problem.constraints for i in one._turning_states(problem.dynamics)})] = 2 * np.pi
     goals = np.unique([goal, goal + turn, goal - turn], axis=0)
@@ -78,6 +102,14 @@ def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Sto
             forwards, backwards = (node, met) if tree is trees[0] else (met, node)
             return _joined(list(trees[0].branch(forwards)), list(trees[1].branch(backwards)), problem.dt)
     return None
+
+
+def _ends(problem: Problem) -> tuple[Array, Array] | None:
+    """Start and goal between which trees can grow; None if the problem has none, or none that they can."""
+    start, goal = problem.start, problem.weighed_goal
+    if problem.dynamics.discrete or problem.dynamics.by_mujoco or problem.moving or start is None or goal is None:
+        return None
+    return start, np.where(np.isnan(goal), start, goal)
 
 
 def in_steps_of(problem: Problem, way: Trajectory) -> Trajectory:
