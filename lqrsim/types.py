@@ -1,12 +1,12 @@
 """Records that functions return or take, for annotations and extensions."""
 
-from lqrsim.capsules import Capsule
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.chance_constrained import SafePlan
 from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.replan_rule import ReplanRecord
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.control.tubes import Tube
+from lqrsim.outlines import Box, Capsule
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
@@ -34,6 +34,7 @@ from lqrsim.verify.verdict import Verification
 
 __all__ = [
     "BetweenKnots",
+    "Box",
     "Candidate",
     "Capsule",
     "Certificate",

@@ -328,8 +328,8 @@ def with_u(x, u, p):
         (lambda: ls.CollisionSpheres(nobody, [np.nan]), "radii"),
         (lambda: ls.CollisionSpheres(of_another_size, [0.1, 0.1]).bind(ARM.dynamics), "points of 2 and 3 coordinates"),
         (
-            lambda: ls.CollisionSpheres(in_the_plane, [0.1]).bind(ARM.dynamics),
-            "2 coordinates for dynamics with no position",
+            lambda: ls.CollisionSpheres(in_the_plane, [0.1]).bind(ls.Quadrotor().dynamics),
+            "2 coordinates for a position in space",
         ),
         (
             lambda: ls.CollisionSpheres(of_the_unknown, [0.1]).bind(ARM.dynamics),

@@ -894,6 +894,10 @@ def turned(x, p, slopes):
     slopes[1, 0, 2] = -p.speed * np.sin(x[2]) / 5
 
 
+def square(x, p):
+    return [[x[0] + a / 4, x[1] + b / 4] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+
+
 BALLS = {
     "formula": ls.CollisionSpheres(two_balls, [0.1, 0.05]),
     "plain": ls.CollisionSpheres(plainly, [0.1, 0.05], level="plain"),
@@ -902,6 +906,27 @@ BALLS = {
 
 
 class TestParts:
+    def test_hulls_among_boxes_and_others(self) -> None:
+        """Apart and overlapping, of each kind of obstacle in the plane."""
+        kinds = {"plane": np.eye(3)[:, [1, 2, 0]], "sphere": np.eye(3), "box": np.eye(3)}
+        world = ls.World([ls.Obstacle(k, k, np.zeros(3), turn, np.array([0.4, 0.3, 1.0])) for k, turn in kinds.items()])
+        balls = ls.CollisionSpheres(square, 0.05, hulls=[4])
+        for x in (X, 10 * X):
+            of_term(ls.ObstacleCost(world, balls=balls, sharpness=3.0).bind(CART), x)
+            of_constraint(ls.Clearance(world, balls=balls).bind(CART), x=x)
+        corners, count, parts = (
+            np.tile(np.array(square(X, None), dtype=float), (2, 1)),
+            len(world),
+            np.array([0.0, 4.0]),
+        )
+        flat, out, pulls = np.zeros((2, 12)), np.zeros(2 * count), np.zeros((2 * count, 12))
+        flat.reshape(2, 4, 3)[..., :2] = corners.reshape(2, 4, 2)
+        data = np.array(world.table).ravel()
+        replay(
+            source_of(signed_distance), {}, "hull_distances", count, 2, 1, data, parts, 1, flat,
+            np.zeros((2 * count, 3)), out, pulls,
+        )  # fmt: skip
+
     @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])
     def test_obstacles_in_the_plane_and_in_space(self, seed: int) -> None:
         """At random places, inside and outside of all kinds, so that each branch has its turn."""

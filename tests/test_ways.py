@@ -118,7 +118,7 @@ def test_upside_down_a_robot_rights_itself_by_the_shorter_turn_or_the_other() ->
         solution = ls.smooth(problem)
         assert solution.success
         assert solution.violation <= 1e-6
-        assert {one.start for one in solution.candidates} >= {"a line of states, a turn less of a, 6 s"}
+        assert any(one.start.startswith("a line of states, a turn less of a") for one in solution.candidates)
         end = solution.trajectory.states[-1, 2]
         assert end == pytest.approx(2 * np.pi * round(end / (2 * np.pi)), abs=1e-6)
         horizons.append(solution.trajectory.horizon)

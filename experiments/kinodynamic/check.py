@@ -133,20 +133,18 @@ def _wrapped(angle: Any) -> Any:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def frames(robot: str, x: Any, cos: Any = np.cos, sin: Any = np.sin) -> list[tuple[Any, Any, Any, Any]]:
-    """Of each box of a robot in the plane: x and y of its centre, cosine and sine of the angle of its long side."""
+def frames(robot: str, x: Any, cos: Any = np.cos, sin: Any = np.sin) -> list[tuple[Any, Any, Any]]:
+    """Of each box of a robot in the plane: x and y of its centre, and the angle of its long side."""
     if robot == "acrobot_v0":  # the pivot is the origin, and the first link hangs down at 0
         first, second = x[0] - np.pi / 2, x[0] + x[1] - np.pi / 2
-        (c, s), (d, t) = (cos(first), sin(first)), (cos(second), sin(second))
-        return [(c / 2, s / 2, c, s), (c + d / 2, s + t / 2, d, t)]
-    c, s = cos(x[2]), sin(x[2])
-    found = [(x[0], x[1], c, s)]
+        c, s, d, t = cos(first), sin(first), cos(second) / 2, sin(second) / 2
+        return [(c / 2, s / 2, first), (c + d, s + t, second)]
+    found = [(x[0], x[1], x[2])]
     if robot == "car1_v0":
-        c, s = cos(x[3]), sin(x[3])
-        found.append((x[0] - c / 2, x[1] - s / 2, c, s))
+        found.append((x[0] - cos(x[3]) / 2, x[1] - sin(x[3]) / 2, x[3]))
     if robot == "quad2dpole_v0":
-        c, s = sin(x[2] + x[3]), -cos(x[2] + x[3])
-        found.append((x[0] + c / 2, x[1] + s / 2, c, s))
+        angle = x[2] + x[3] - np.pi / 2
+        found.append((x[0] + cos(angle) / 2, x[1] + sin(angle) / 2, angle))
     return found
 
 
@@ -158,7 +156,7 @@ def clearances(case: Case, states: Array) -> Array:
         outside = np.abs(states[:, None, :3] - case.boxes[:, :3]) - case.boxes[:, 3:] / 2
         gaps = np.linalg.norm(np.maximum(outside, 0.0), axis=-1) + np.minimum(outside.max(axis=-1), 0.0)
         return gaps.min(axis=-1) - case.model.radius
-    corners = [_corners(x, y, 1.0, 0.0, *size) for x, y, *size in case.boxes]
+    corners = [_corners(x, y, 0.0, *size) for x, y, *size in case.boxes]
     return np.array([
         min(
             apart(_corners(*frame, *size), box)
@@ -169,8 +167,9 @@ def clearances(case: Case, states: Array) -> Array:
     ])  # fmt: skip
 
 
-def _corners(x: float, y: float, c: float, s: float, length: float, width: float) -> Array:
-    """The corners (4, 2) of a box in the plane, counterclockwise."""
+def _corners(x: float, y: float, angle: float, length: float, width: float) -> Array:
+    """The corners (4, 2) of a box in the plane."""
+    c, s = np.cos(angle), np.sin(angle)
     along, across = np.array([c, s]) * length / 2, np.array([-s, c]) * width / 2
     return np.array([x, y]) + np.array([along + across, across - along, -along - across, along - across])
 

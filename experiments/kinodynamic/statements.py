@@ -8,7 +8,7 @@ import numpy as np
 
 import lqrsim as ls
 from kinodynamic.check import ACCEPTED, frames
-from kinodynamic.data import GRAVITY, MODELS, STEEPEST, Array, Case, Model
+from kinodynamic.data import GRAVITY, MODELS, STEEPEST, Case, Model
 
 Formula = Callable[[Any, Any, Any], Sequence[Any]]
 
@@ -170,60 +170,36 @@ def _quadrotor_step(robot: str, period: float, x: Any, u: Any, p: Any) -> Sequen
 
 
 def clear_of(case: Case, margin: float) -> list[ls.Constraint]:
-    """The robot's shape keeps clear of the boxes by a margin in m, at corners by up to 1.4 times that."""
+    """The robot's shape keeps clear of the boxes by a margin in m."""
     if not len(case.boxes):
         return []
-    if case.model.radius is not None:
-        return [ls.Clearance(_world(case), radius=case.model.radius, margin=margin)]
-    rows: list[ls.Constraint] = [_apart(case.robot, case.boxes, margin)]
-    if case.model.position:
-        # The formula implies this, but says nothing to a search that looks for a way round obstacles.
-        rows.append(ls.Clearance(_world(case), radius=0.45 * min(case.model.boxes[0])))
-    return rows
+    radius = case.model.radius
+    shape: dict[str, Any] = {"balls": outline(case.robot)} if radius is None else {"radius": radius}
+    return [ls.Clearance(_world(case), margin=margin, **shape)]
+
+
+@cache
+def outline(robot: str) -> ls.CollisionSpheres:
+    """The boxes of a robot in the plane."""
+    boxes = [ls.types.Box(*size) for size in MODELS[robot].boxes]
+
+    def corners(x: Any, p: Any) -> list[list[Any]]:
+        from sympy import cos, sin
+
+        places = zip(boxes, frames(robot, x, cos, sin), strict=True)
+        return [corner for box, (*centre, angle) in places for corner in box.corners(centre, angle)]
+
+    return ls.CollisionSpheres(corners, 0.0, hulls=[4] * len(boxes))
 
 
 def _world(case: Case) -> ls.World:
-    places = len(case.low)
+    places = case.boxes.shape[1] // 2
     made = []
     for number, box in enumerate(case.boxes):
         centre, size = np.zeros(3), np.ones(3)
         centre[:places], size[:places] = box[:places], box[places:] / 2
         made.append(ls.Obstacle(f"box {number}", "box", centre, np.eye(3), size))
     return ls.World(made)
-
-
-def _apart(robot: str, boxes: Array, margin: float) -> ls.SymbolicConstraint:
-    """Boxes are apart by a margin along the normal of one of their sides. Numbers are data: nothing compiles again."""
-    sizes = {
-        f"{name}{number}": float(one)
-        for number, box in enumerate(boxes)
-        for name, one in zip(("x", "y", "length", "width"), box, strict=True)
-    }
-    return ls.SymbolicConstraint(apart(robot, len(boxes)), parameters=sizes | {"margin": margin}, name="clearance")
-
-
-@cache
-def apart(robot: str, count: int) -> Formula:
-    """The formula: of each of the robot's boxes and of so many others, the largest gap along a normal of a side."""
-
-    def clearance(x: Any, u: Any, p: Any) -> Sequence[Any]:
-        from sympy import Abs, Max, cos, sin
-
-        rows = []
-        for (cx, cy, c, s), (length, width) in zip(frames(robot, x, cos, sin), MODELS[robot].boxes, strict=True):
-            for number in range(count):
-                ox, oy, a, b = (getattr(p, f"{name}{number}") for name in ("x", "y", "length", "width"))
-                dx, dy, along, across = ox - cx, oy - cy, Abs(c), Abs(s)
-                gaps = (
-                    Abs(dx) - (a + length * along + width * across) / 2,
-                    Abs(dy) - (b + length * across + width * along) / 2,
-                    Abs(dx * c + dy * s) - (length + a * along + b * across) / 2,
-                    Abs(dy * c - dx * s) - (width + a * across + b * along) / 2,
-                )
-                rows.append(Max(*gaps) - p.margin)
-        return rows
-
-    return clearance
 
 
 def _not_folded(x: Any, u: Any, p: Any) -> Sequence[Any]:

@@ -1,5 +1,7 @@
 """Distances of points to the obstacles of a world, by compiled code."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -37,6 +39,34 @@ def distances_with_normals(world_seen: World, points: npt.ArrayLike) -> tuple[Ar
     out, normals = np.empty(len(flat) * count), np.empty((len(flat) * count, 3))
     _distances().each_with_normal(count, len(flat), np.array(world_seen.table).ravel(), flat, out, normals)
     return out.reshape(-1, count), normals.reshape(len(flat), count, 3)[..., : points.shape[1]]
+
+
+def hull_distances(
+    world_seen: World, places: Array, hulls: Sequence[int], displaced: Array | None = None
+) -> tuple[Array, Array]:
+    """Distances of convex polygons to each obstacle, and their derivatives in the polygons' corners.
+
+    Args:
+      world_seen: the obstacles, in the plane of the places.
+      places: (..., B, 2 or 3), the corners, polygon by polygon.
+      hulls: number of corners of each of H polygons.
+      displaced: (K, O, 3) displacements of the obstacles; the first axis of the places is then K.
+
+    Returns:
+      The distances (..., H, O), and the derivatives (..., H, O, C, 3), for C corners of the largest polygon.
+    """
+    many, count, widest = places.shape[:-2], len(world_seen), max(hulls)
+    flat = np.zeros((int(np.prod(many)), places.shape[-2], 3))
+    flat[..., : places.shape[-1]] = places.reshape(-1, *places.shape[-2:])
+    displaced = np.zeros((1, count, 3)) if displaced is None else displaced
+    rows, each = len(flat) * len(hulls) * count, max(1, len(flat) // len(displaced))
+    out, pulls = np.empty(rows), np.zeros((rows, 3 * widest))
+    _distances().hull_distances(
+        count, len(flat), each, np.array(world_seen.table).ravel(), np.cumsum([0, *hulls], dtype=np.float64),
+        len(hulls), flat.reshape(len(flat), -1), np.ascontiguousarray(displaced).reshape(-1, 3), out, pulls,
+    )  # fmt: skip
+    shape = (*many, len(hulls), count)
+    return out.reshape(shape), pulls.reshape(*shape, widest, 3)
 
 
 def _distances() -> CompiledModule:

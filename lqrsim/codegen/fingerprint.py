@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import capsules, rotations
+from lqrsim import outlines, rotations
 from lqrsim.codegen import disk_cache
 from lqrsim.kernels import rotation_ratios
 
@@ -118,7 +118,7 @@ def _versions() -> tuple[str, ...]:
     return (
         sys.version,
         *installed,
-        inspect.getsource(capsules),
+        inspect.getsource(outlines),
         inspect.getsource(rotations),
         inspect.getsource(rotation_ratios),
     )

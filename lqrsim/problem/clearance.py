@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lqrsim.annotations import NonNegative, checked
 from lqrsim.errors import Array, InputError, check_array, check_number, real
 from lqrsim.kernels.declarations import ROW, N, stack
-from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
+from lqrsim.kernels.signed_distance import hull_distance, signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
@@ -89,8 +89,8 @@ class Clearance(KeepsClear, Constraint):
             rows = list(zip(distances.parts, distances.obstacles, strict=True))
             columns = [max(number, 0) % margins.shape[1] for number in distances.obstacles]
             return ConstraintTerm.of_residual(distances, margins, columns, describe)
-        tables, shared = world.tables(times), 0 if shape.centers is None else 3 * len(shape.radii)
-        own = np.array([*margins.shape, len(world), len(tables), *shape.radii, *margins.ravel(), *tables.ravel()])
+        tables, shared = world.tables(times), 0 if shape.centers is None else 3 * shape.balls
+        own = np.array([*margins.shape, len(world), len(tables), *shape.parts, *margins.ravel(), *tables.ravel()])
         source, data, functions = shape.placed(__name__, own)
         return ConstraintTerm(source, data, len(rows), describe, shared=shared, functions=functions)
 
@@ -107,37 +107,49 @@ def _checked_margin(margin: float | npt.ArrayLike) -> float | Array:
 
 
 # The kernel: distances to obstacles minus the required distances. The robot is a point at its position, or a set of
-# balls. For balls, `value` and `slope` take the centres and their Jacobian in place of state and control; see
-# `augmented_lagrangian.py`.
+# parts: balls, or hulls of these. For parts, `value` and `slope` take the centres of all balls and their Jacobian in
+# place of state and control; see `augmented_lagrangian.py`.
 #
 # From AT on, `data` has the numbers below, then the margins and the tables, step by step. The last margins and the last
-# table hold from their step on. There is a row for each obstacle, first for the first ball, then for the next. Its
+# table hold from their step on. There is a row for each obstacle, first for the first part, then for the next. Its
 # margin has the index `row` modulo the number of margins per step. AT is 0 for a point. For balls, the entries before
 # AT are those that `places` reads.
 AT = 0
 # From there on: numbers of steps with margins, of margins at a step, of obstacles, and of steps with a table of these;
-# then the radius of each ball, or of the point.
+# then the radius of each part, or of the point; for hulls the first ball of each, and the end of the last.
 STEPS, EACH, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
 BALLS = 0  # number of balls; 0 for a point
+PARTS = 1  # number of parts
+HULLS = 0  # 1 if parts are hulls
 AXES = (0, 1, 2)  # states that are the position of a point; two in a plane, with third coordinate 0
 
 
 def value(x, u, t, row, data):
-    """The distance of one ball to one obstacle, minus its radius and the margin."""
+    """The distance of one part to one obstacle, minus its radius and the margin."""
+    part, steps, each = part_of(row, data), int(data[AT + STEPS]), int(data[AT + EACH])
+    least = data[AT + RADII + part] + data[margins_from() + min(t, steps - 1) * each + row % each]
+    if HULLS:
+        first, size = corners_of(part, data)
+        return hull_distance(data, obstacle_at(t, row, data), x, first, size, stack(3 * BALLS)) - least
     a, b, c = place(x, row, data)
-    steps, each = int(data[AT + STEPS]), int(data[AT + EACH])
-    margin = data[AT + RADII + max(BALLS, 1) + min(t, steps - 1) * each + row % each]
-    least = data[AT + RADII + ball_of(row, data)] + margin
     return signed_distance(data, obstacle_at(t, row, data), a, b, c) - least
 
 
 def slope(x, u, t, row, data, gradient):
     """Add its gradient (W,)."""
+    if HULLS:
+        pulls = stack(3 * BALLS)
+        first, size = corners_of(part_of(row, data), data)
+        hull_distance(data, obstacle_at(t, row, data), x, first, size, pulls)
+        for i in range(N):
+            for k in range(3 * size):
+                gradient[i] += pulls[k] * u[3 * first + k, i]
+        return
     normal, curve = stack(3), stack(3, 3)
     a, b, c = place(x, row, data)
     signed_distance_derivatives(data, obstacle_at(t, row, data), a, b, c, normal, curve)
     if BALLS:
-        first = 3 * ball_of(row, data)
+        first = 3 * part_of(row, data)
         for i in range(N):
             for j in range(3):
                 gradient[i] += normal[j] * u[first + j, i]
@@ -149,18 +161,29 @@ def slope(x, u, t, row, data, gradient):
 def place(x, row, data):
     """The centre of a row's ball, or the position of a robot that is a point."""
     if BALLS:
-        first = 3 * ball_of(row, data)
+        first = 3 * part_of(row, data)
         return x[first], x[first + 1], x[first + 2]
     return x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0
 
 
-def ball_of(row, data):
-    """The number of the ball that a row is about; 0 for a point."""
+def part_of(row, data):
+    """The number of the part that a row is about; 0 for a point."""
     return row // int(data[AT + OBSTACLES]) if BALLS else 0
+
+
+def corners_of(part, data):
+    """The first ball of a hull, and the number of its balls."""
+    at = AT + RADII + PARTS + part
+    return int(data[at]), int(data[at + 1]) - int(data[at])
+
+
+def margins_from():
+    """The index at which the margins begin."""
+    return AT + RADII + PARTS + HULLS * (PARTS + 1)
 
 
 def obstacle_at(t, row, data):
     """The index at which the numbers of a row's obstacle begin."""
     obstacles, margins = int(data[AT + OBSTACLES]), int(data[AT + STEPS]) * int(data[AT + EACH])
     obstacle = obstacles * min(t, int(data[AT + TABLES]) - 1) + (row % obstacles if BALLS else row)
-    return AT + RADII + max(BALLS, 1) + margins + ROW * obstacle
+    return margins_from() + margins + ROW * obstacle

@@ -1,4 +1,4 @@
-"""The collision shape of a robot: a ball at its position, several balls, or the geoms of an MJCF.
+"""The collision shape of a robot: a ball at its position, several balls or hulls of them, or the geoms of an MJCF.
 
 `ShapeInWorld` is such a shape among obstacles, with the methods that plans, chances of collision and simulations need.
 """
@@ -11,7 +11,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.distances import distances_with_normals, signed_distance, signed_distance_displaced
+from lqrsim.codegen.distances import (
+    distances_with_normals,
+    hull_distances,
+    signed_distance,
+    signed_distance_displaced,
+)
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
@@ -90,8 +95,9 @@ class ShapeInWorld:
 
     Attributes:
       dynamics: the robot's dynamics. world: the obstacles, in the coordinates of the places.
-      radii: radii of the balls in m, (B,); for geoms, the radius of the largest geom.
-      names: names of the balls. centers: their centres; None for one ball at the robot's position.
+      radii: radii of the balls, or hulls, in m, (P,); for geoms, the radius of the largest geom.
+      names: their names. centers: the centres of the balls; None for one ball at the robot's position.
+      hulls: number of balls of each hull; None for balls by themselves.
     """
 
     dynamics: Dynamics
@@ -99,6 +105,7 @@ class ShapeInWorld:
     radii: Array
     names: tuple[str, ...] = ("",)
     centers: SphereCenters | None = None
+    hulls: tuple[int, ...] | None = None
 
     @property
     def moved_by(self) -> tuple[int, ...]:
@@ -119,14 +126,26 @@ class ShapeInWorld:
         centers, axes = self.centers, self.moved_by
         if centers is None:
             return source_of(module, AXES=axes), own, ()
-        kernel = source_of(module, AT=centers.numbers, BALLS=len(self.radii), AXES=axes)
+        kernel = source_of(
+            module, AT=centers.numbers, BALLS=self.balls, PARTS=len(self.radii), AXES=axes, HULLS=int(bool(self.hulls))
+        )
         return centers.filling(kernel), np.concatenate([centers.data, own]), centers.functions
+
+    @property
+    def balls(self) -> int:
+        """The number of balls."""
+        return sum(self.hulls) if self.hulls else len(self.radii)
+
+    @property
+    def parts(self) -> Array:
+        """For the kernels: the radius of each part, and for hulls the first ball of each, and the end of the last."""
+        return np.concatenate([self.radii, np.cumsum([0, *self.hulls])]) if self.hulls else self.radii
 
     def places(self, states: Array) -> Array:
         """The places at states (..., n)."""
         if self.centers is None:
             return states[..., None, list(self.moved_by)]
-        return evaluate(self.centers, len(self.radii), states)
+        return evaluate(self.centers, self.balls, states)
 
     def clearance(self, places: Array, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle, minus the radius, at places: (...) in m; infinite without obstacles.
@@ -136,6 +155,9 @@ class ShapeInWorld:
         """
         if not len(self.world):
             return np.full(places.shape[:-2], np.inf)
+        if self.hulls:
+            distances, _ = hull_distances(self.world, places, self.hulls, displaced)
+            return (distances - self.radii[:, None]).min(axis=(-2, -1))
         if displaced is None:
             return (signed_distance(self.world, places) - self.radii).min(axis=-1)
         flat = places.reshape(len(places), -1, places.shape[-1])
@@ -145,13 +167,23 @@ class ShapeInWorld:
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
         """Clearance of each obstacle at states (K, n), (K, O) in m, and its derivatives in some states, (K, O, p).
 
-        Both belong to the nearest ball.
+        Both belong to the nearest ball, or hull.
         """
-        knots, count, size = np.arange(len(states))[:, None], len(self.radii), states.shape[1]
+        knots, count, size = np.arange(len(states))[:, None], self.balls, states.shape[1]
         if self.centers is None:
             distances, normals = distances_with_normals(self.world, states[:, list(self.moved_by)])
             return distances - self.radii, normals @ np.eye(size)[np.ix_(self.moved_by, along)]
         places, slopes = evaluate_slopes(self.centers, count, states)
+        if self.hulls:
+            clearance, pulls = hull_distances(self.world, places, self.hulls)
+            clearance = clearance - self.radii[:, None]
+            first = np.cumsum([0, *self.hulls[:-1]])
+            moved = np.zeros((*clearance.shape, len(along)))
+            for part, (begin, corners) in enumerate(zip(first, self.hulls, strict=True)):
+                moves = slopes[:, begin : begin + corners][..., list(along)]
+                moved[:, part] = np.einsum("kocd,kcdi->koi", pulls[:, part, :, :corners], moves)
+            nearest, obstacle = clearance.argmin(axis=1), np.arange(len(self.world))
+            return clearance[knots, nearest, obstacle], moved[knots, nearest, obstacle]
         distances, normals = distances_with_normals(self.world, places.reshape(-1, places.shape[-1]))
         clearance = distances.reshape(len(states), count, -1) - self.radii[:, None]
         nearest, obstacle = clearance.argmin(axis=1), np.arange(len(self.world))
@@ -161,6 +193,10 @@ class ShapeInWorld:
 
     def nearest(self, places: Array, displaced: Array) -> int:
         """The number of the obstacle that is nearest at places (B, 2 or 3), when displaced by (O, 3)."""
+        if self.hulls:
+            distances, _ = hull_distances(self.world, places[None], self.hulls, displaced[None])
+            larger = self.radii - self.radii.min()
+            return int((distances[0] - larger[:, None]).min(axis=0).argmin())
         points, table = np.zeros((len(places), 3)), self.world.table.ravel()
         points[:, : places.shape[1]] = places
         found = np.full(len(self.world), np.inf)
@@ -177,21 +213,29 @@ class ShapeInWorld:
 
     def inside(self, state: Array) -> tuple[str, str] | None:
         """The place in an obstacle of a state, which may have NaNs, and the remedy, as texts; None if it is clear."""
-        for name, radius, place in zip(self.names, self.radii, self.places(state), strict=True):
-            if len(self.world) and not np.isnan(place).any():
+        if not len(self.world):
+            return None
+        ends = np.cumsum(self.hulls or (1,) * self.balls)[:-1]
+        for name, radius, corners in zip(self.names, self.radii, np.split(self.places(state), ends), strict=True):
+            if np.isnan(corners).any():
+                continue
+            place = corners.mean(axis=0)
+            if self.hulls:
+                distances = hull_distances(self.world, corners[None], [len(corners)])[0][0, 0] - radius
+            else:
                 distances = self.world.distances(place) - radius
-                if distances.min() < 0:
-                    what, whose = (f"with {name!r} ", "its radius") if self.centers else ("", "the robot's radius")
-                    at, deep = ", ".join(f"{value:g}" for value in place), -distances.min()
-                    obstacle = self.world.names[int(distances.argmin())]
-                    where = f"{what}at ({at}) m, {deep:.3g} m inside obstacle {obstacle!r}"
-                    return where, f" of obstacles by {whose} of {radius:g} m"
+            if distances.min() < 0:
+                what, whose = (f"with {name!r} ", "its radius") if self.centers else ("", "the robot's radius")
+                at, deep = ", ".join(f"{value:g}" for value in place), -distances.min()
+                obstacle = self.world.names[int(distances.argmin())]
+                where = f"{what}at ({at}) m, {deep:.3g} m inside obstacle {obstacle!r}"
+                return where, f" of obstacles by {whose} of {radius:g} m" if radius else " of obstacles"
         return None
 
     def across(self, vectors: Array) -> Array:
         """Convert vectors (..., 3) from the axes of the scene to the axes of `world`."""
         space = self.dynamics.state_coordinates
-        if not self.in_plane:
+        if not self.in_plane or not space.plane:
             return vectors
         normal = np.cross(*np.eye(3)[list(space.world_axes)])
         return np.concatenate([space.of_world(vectors), (vectors @ normal)[..., None]], axis=-1)
@@ -261,7 +305,12 @@ def shape_in(
         return GeomsInWorld(dynamics, world, np.array([geoms.size]), geoms=geoms)
     if balls is not None:
         centers = balls.bind(dynamics)
-        return ShapeInWorld(dynamics, centers.world_seen(world, space), balls.radii, balls.names, centers)
+        seen = centers.world_seen(world, space)
+        if not balls.hulls:
+            return ShapeInWorld(dynamics, seen, balls.radii, balls.names, centers)
+        seen.check_upright()
+        radii = balls.radii[np.cumsum([0, *balls.hulls[:-1]])]
+        return ShapeInWorld(dynamics, seen, radii, balls.names, centers, balls.hulls)
     seen = world.seen_by(space.plane, space.offset) if space.position else World()
     return ShapeInWorld(dynamics, seen, np.array([radius]))
 

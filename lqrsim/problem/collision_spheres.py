@@ -1,4 +1,4 @@
-"""Robots made of several balls: the centre of each as a function of the state, and its radius."""
+"""Robots made of several balls, or of convex hulls of balls: each centre as a function of the state, and its radius."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,9 @@ from lqrsim.errors import (
     InputError,
     brief,
     check_array,
+    check_count,
     check_items,
+    check_number,
     excerpt,
     vectors_of,
 )
@@ -38,6 +40,8 @@ from lqrsim.kernels import differences, sphere_centers, user_functions
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
+
+MOST_CORNERS = 64  # of a polygon; its distances to a box take time in proportion to it
 
 
 @checked
@@ -64,7 +68,7 @@ class SphereCenters(Term):
 
     def world_seen(self, world: World, space: Coordinates) -> World:
         """The obstacles in the coordinates of the places."""
-        return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
+        return world.seen_by(space.plane or "xy", space.offset) if self.in_plane else world.seen_by(SPACE)
 
     def filling(self, kernel: Source) -> Source:
         """The kernel of a cost or a constraint, with these places.
@@ -88,15 +92,32 @@ class CollisionSpheres:
     `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all balls clear. The `balls` of a `Robot`
     are its collision shape in simulation; a robot without balls is one ball at its position. `Capsule` makes chains.
 
+    In a plane, `hulls` makes convex polygons of them, with exact distances, such as the boxes of a car and its trailer:
+
+        car, trailer = ls.types.Box(0.5, 0.25), ls.types.Box(0.3, 0.25)
+
+        def outline(x, p):
+            from sympy import cos, sin
+            behind = (x.px - 0.5 * cos(x.b), x.py - 0.5 * sin(x.b))
+            return [*car.corners((x.px, x.py), x.a), *trailer.corners(behind, x.b)]
+
+        ls.CollisionSpheres(outline, 0.0, hulls=[4, 4], names=["car", "trailer"])
+
+    A hull of two balls is a capsule. Overlapping polygons have the negative length of the shortest move that ends it.
+
     To compute the centres in another way, subclass this class and write `bind`.
 
     Args:
       places: `places(x, p)`, at one of the levels of `Dynamics`; returns the centre of each of K balls, as 3
-        coordinates in the world, in metres. If the robot has a position in a plane, a centre may have 2 coordinates in
-        that plane; obstacles are then seen as for the position, see `World.seen_by`. The parameters of the dynamics are
+        coordinates in the world, in metres. Unless the robot has a position in space, a centre may have 2 coordinates,
+        in the plane of the position or, without one, in the horizontal plane; obstacles are then seen as for the
+        position, see `World.seen_by`. The parameters of the dynamics are
         attributes of p.
-      radii: (K,) radii of the balls, in metres.
-      names: names of the balls in messages; by default "ball 0", "ball 1", ....
+      radii: (K,) radii of the balls, in metres; with hulls also one for all.
+      hulls: number of balls of each hull, in the order of the balls, which is the order of its corners round it, in
+        either direction. Balls of one hull have one radius. By default each ball is by itself. Hulls need places in the
+        plane of the robot's position, and obstacles that stand upright on it.
+      names: names of the balls, or hulls, in messages; by default "ball 0", "ball 1", ..., or "hull 0", ....
       sites: names of sites or geoms in the robot's MJCF, one per ball, or None. A `Plant` checks that each of them has
         its centre where the formula puts the ball.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the nonzero derivatives to slopes
@@ -115,6 +136,7 @@ class CollisionSpheres:
         places: Callable[[Any, Any], Any],
         radii: npt.ArrayLike,
         *,
+        hulls: Sequence[int] | None = None,
         names: Sequence[str] | None = None,
         sites: Sequence[str | None] | None = None,
         jacobian: Callable[..., None] | None = None,
@@ -126,7 +148,7 @@ class CollisionSpheres:
         if jacobian is not None:
             check_derivative("CollisionSpheres: jacobian", jacobian, places, self.level, "x, p, slopes")
         self.function, self.jacobian = places, jacobian
-        self._set_balls(radii, names, sites)
+        self._set_balls(radii, names, sites, hulls)
         self.depends_on = check_depends_on("CollisionSpheres", depends_on, "states")
         if self.depends_on is not None and self.level == "symbolic":
             wanted = "None: they are derived"
@@ -135,8 +157,18 @@ class CollisionSpheres:
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self)} balls, radii {brief(self.radii.tolist())} m)"
 
-    def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
+    def _set_balls(
+        self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None,
+        hulls: Sequence[int] | None = None,
+    ) -> None:  # fmt: skip
         """Check and set the attributes of each ball."""
+        self.hulls = None
+        if hulls is not None:
+            given = check_items("CollisionSpheres: hulls", hulls, (int, np.integer), "the number of balls of each hull")
+            self.hulls = tuple(check_count("CollisionSpheres: hulls", one, at_most=MOST_CORNERS) for one in given)
+            if np.ndim(radii) == 0:  # pyright: ignore[reportArgumentType]
+                radius = check_number("CollisionSpheres: radii", radii, at_least=0.0)
+                radii = np.full(sum(self.hulls), radius)
         self.radii = check_array("CollisionSpheres: radii", radii, (None,))
         count = len(self.radii)
         if not count:
@@ -144,11 +176,18 @@ class CollisionSpheres:
         if (self.radii < 0).any():
             k = int(np.argmax(self.radii < 0))
             raise InputError(f"CollisionSpheres: radii: got {self.radii[k]:g} for ball {k}, want at least 0")
-        wanted = f"{count} different texts, one per ball"
-        self.names = tuple(f"ball {k}" for k in range(count))
+        if self.hulls is not None:
+            if sum(self.hulls) != count:
+                raise InputError(f"CollisionSpheres: hulls: got {sum(self.hulls)} balls in all, want {count}, as radii")
+            for k, own in enumerate(np.split(self.radii, np.cumsum(self.hulls)[:-1])):
+                if np.ptp(own):
+                    raise InputError(f"CollisionSpheres: radii: got {own.tolist()} in hull {k}, want one for all of it")
+        part, parts = ("ball", count) if self.hulls is None else ("hull", len(self.hulls))
+        wanted = f"{parts} different texts, one per {part}"
+        self.names = tuple(f"{part} {k}" for k in range(parts))
         if names is not None:
             self.names = check_items("CollisionSpheres: names", names, str, wanted)
-            if len(set(self.names)) < count or len(self.names) != count:
+            if len(set(self.names)) < parts or len(self.names) != parts:
                 raise InputError(f"CollisionSpheres: names: got {excerpt(self.names)}, want {wanted}")
         self.sites: tuple[str | None, ...] = (None,) * count
         if sites is not None:
@@ -159,6 +198,14 @@ class CollisionSpheres:
 
     def __len__(self) -> int:
         return len(self.radii)
+
+    @property
+    def ball_names(self) -> tuple[str, ...]:
+        """The name of each ball; in a hull, with its number there."""
+        if self.hulls is None:
+            return self.names
+        pairs = zip(self.names, self.hulls, strict=True)
+        return tuple(f"{name}, corner {k}" for name, size in pairs for k in range(size))
 
     @property
     def name(self) -> str:
@@ -221,7 +268,7 @@ class CollisionSpheres:
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
         names, size, own = dynamics.state_coordinates.names, self._size_of(dynamics), dynamics.calling
         axes, unused = axes_of("CollisionSpheres", self.depends_on, names)
-        returned = {"values": size * len(self), "entries": self.names, "columns": size, "unused": unused}
+        returned = {"values": size * len(self), "entries": self.ball_names, "columns": size, "unused": unused}
         functions = with_derivatives(
             self.function, returned, self.jacobian, ((len(self), size, len(names)),),
             level=self.level, states=len(names), controls=0, parameters=tuple(own.parameters), with_control=False,
@@ -247,10 +294,12 @@ class CollisionSpheres:
         return size
 
     def _check_plane(self, size: int, space: Coordinates) -> None:
-        """Raises InputError for points in a plane if the robot has no position in a plane."""
-        if size == 2 and len(space.position) != 2:
-            has = "a position in space" if space.position else "no position"
-            raise InputError(f"{self.name}: got points of 2 coordinates for dynamics with {has}, want 3")
+        """Raises InputError for points in a plane if the robot's position is in space, and for hulls in space."""
+        if size == 3 and self.hulls is not None:
+            wanted = "2 for hulls; in space an MjcfRobot has boxes and meshes, with geoms=robot.geoms"
+            raise InputError(f"{self.name}: got points of 3 coordinates, want {wanted}")
+        if size == 2 and len(space.position) == 3:
+            raise InputError(f"{self.name}: got points of 2 coordinates for a position in space, want 3")
 
     @checked
     def centres(self, dynamics: Dynamics, states: npt.ArrayLike) -> Array:
@@ -265,7 +314,8 @@ class CollisionSpheres:
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         places = self.bind(dynamics)
         found = evaluate(places, len(self), states)
-        return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
+        space = dynamics.state_coordinates
+        return space.in_world(found[..., :2]) if places.in_plane and space.plane else found
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:

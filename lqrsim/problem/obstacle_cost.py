@@ -9,7 +9,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, check_number
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
 from lqrsim.kernels.exponential import exponential
-from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
+from lqrsim.kernels.signed_distance import hull_distance, signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.costs import Cost, CostTerm
@@ -85,7 +85,7 @@ class ObstacleCost(KeepsClear, Cost):
             )
         tables = shape.world.tables(times)
         sizes = self.sharpness, self.weight, len(shape.world), len(tables)
-        numbers = np.concatenate([sizes, shape.radii, tables.ravel()])
+        numbers = np.concatenate([sizes, shape.parts, tables.ravel()])
         source, data, functions = shape.placed(__name__, numbers)
         return CostTerm(
             source, data, nonconvex_in=shape.moved_by or None, factor=len(data) - len(numbers) + WEIGHT,
@@ -99,9 +99,11 @@ class ObstacleCost(KeepsClear, Cost):
 AT = 0
 FARTHEST = 2  # for geoms; see `loss`
 # From there on: sharpness, weight, numbers of obstacles and of steps with a table of these; then the radius of each
-# ball, or of the point.
+# part, or of the point; for hulls the first ball of each, and the end of the last.
 SHARPNESS, WEIGHT, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
 BALLS = 0  # number of balls; 0 for a point
+PARTS = 1  # number of balls, or of hulls
+HULLS = 0  # 1 if the parts are hulls of balls
 AXES = (0, 1, 2)  # states that are the position, two in a plane with third coordinate 0; or states that move the balls
 BLOCK = 8  # number of obstacles whose exponentials are computed together, as vectors
 
@@ -114,9 +116,13 @@ def value(x, u, t, data):
         if BALLS:
             centres = stack(3 * BALLS)
             places(x, data, centres)
-            for k in range(BALLS):
-                c = 3 * k
-                total += cost_of_ball(centres[c], centres[c + 1], centres[c + 2], data[AT + RADII + k], tables, data)
+            if HULLS:
+                for k in range(PARTS):
+                    total += cost_of_hull(centres, k, tables, data)
+            else:
+                for k in range(BALLS):
+                    c, radius = 3 * k, data[AT + RADII + k]
+                    total += cost_of_ball(centres[c], centres[c + 1], centres[c + 2], radius, tables, data)
         else:
             height = x[AXES[2]] if len(AXES) == 3 else 0.0
             total = cost_of_ball(x[AXES[0]], x[AXES[1]], height, data[AT + RADII], tables, data)
@@ -128,25 +134,20 @@ def derivatives(x, u, t, data, hessian, gradient):
     total = 0.0
     if t > 0:
         sharpness, tables = data[AT + SHARPNESS], tables_at(t, data)
-        force, stiffness, product = stack(3), stack(3, 3), stack(3)
+        force, stiffness = stack(3), stack(3, 3)
         if BALLS:
             centres, jacobian = stack(3 * BALLS), zeros(3 * BALLS, N)
             places_jacobian(x, data, centres, jacobian)
-            for k in range(BALLS):
-                c = 3 * k
-                total += derivatives_of_ball(
-                    centres[c], centres[c + 1], centres[c + 2], data[AT + RADII + k], tables, data, force, stiffness
-                )
-                for a in range(len(AXES)):
-                    for j in range(3):
-                        product[j] = 0.0
-                        for m in range(3):
-                            product[j] += sharpness * stiffness[j, m] * jacobian[c + m, AXES[a]]
-                    for j in range(3):
-                        gradient[AXES[a]] += sharpness * force[j] * jacobian[c + j, AXES[a]]
-                    for b in range(len(AXES)):
-                        for j in range(3):
-                            hessian[AXES[a], AXES[b]] += jacobian[c + j, AXES[b]] * product[j]
+            if HULLS:
+                for k in range(PARTS):
+                    total += derivatives_of_hull(centres, jacobian, k, tables, data, hessian, gradient)
+            else:
+                for k in range(BALLS):
+                    c, radius = 3 * k, data[AT + RADII + k]
+                    total += derivatives_of_ball(
+                        centres[c], centres[c + 1], centres[c + 2], radius, tables, data, force, stiffness
+                    )
+                    add_moved(sharpness, force, stiffness, jacobian, c, hessian, gradient)
         else:
             height = x[AXES[2]] if len(AXES) == 3 else 0.0
             total = derivatives_of_ball(
@@ -159,9 +160,54 @@ def derivatives(x, u, t, data, hessian, gradient):
     return total
 
 
+def add_moved(sharpness, force, stiffness, jacobian, first, hessian, gradient):
+    """Add the derivatives in the states of a ball's cost, given those in its centre, divided by the sharpness."""
+    product = stack(3)
+    for a in range(len(AXES)):
+        for j in range(3):
+            product[j] = 0.0
+            for m in range(3):
+                product[j] += sharpness * stiffness[j, m] * jacobian[first + m, AXES[a]]
+        for j in range(3):
+            gradient[AXES[a]] += sharpness * force[j] * jacobian[first + j, AXES[a]]
+        for b in range(len(AXES)):
+            for j in range(3):
+                hessian[AXES[a], AXES[b]] += jacobian[first + j, AXES[b]] * product[j]
+
+
 def tables_at(t, data):
     """The index at which the table of obstacles at step t begins."""
-    return AT + RADII + max(BALLS, 1) + ROW * int(data[AT + OBSTACLES]) * min(t, int(data[AT + TABLES]) - 1)
+    parts = AT + RADII + PARTS + HULLS * (PARTS + 1)
+    return parts + ROW * int(data[AT + OBSTACLES]) * min(t, int(data[AT + TABLES]) - 1)
+
+
+def cost_of_hull(centres, part, table, data):
+    """The cost of a hull, divided by the weight."""
+    at, total, pulls = AT + RADII + PARTS + part, 0.0, stack(3 * max(BALLS, 1))
+    first, size = int(data[at]), int(data[at + 1]) - int(data[at])
+    for k in range(int(data[AT + OBSTACLES])):
+        distance = hull_distance(data, table + ROW * k, centres, first, size, pulls) - data[AT + RADII + part]
+        total += exponential(-data[AT + SHARPNESS] * distance)
+    return total
+
+
+def derivatives_of_hull(centres, jacobian, part, table, data, hessian, gradient):
+    """The cost of a hull; add its derivatives, without the curvature of the distances."""
+    at, total, pulls, moves = AT + RADII + PARTS + part, 0.0, stack(3 * max(BALLS, 1)), stack(len(AXES))
+    first, size, sharpness = int(data[at]), int(data[at + 1]) - int(data[at]), data[AT + SHARPNESS]
+    for k in range(int(data[AT + OBSTACLES])):
+        distance = hull_distance(data, table + ROW * k, centres, first, size, pulls) - data[AT + RADII + part]
+        cost = data[AT + WEIGHT] * exponential(-sharpness * distance)
+        total += cost
+        for a in range(len(AXES)):
+            moves[a] = 0.0
+            for i in range(3 * size):
+                moves[a] += sharpness * pulls[i] * jacobian[3 * first + i, AXES[a]]
+        for a in range(len(AXES)):
+            gradient[AXES[a]] -= cost * moves[a]
+            for b in range(len(AXES)):
+                hessian[AXES[a], AXES[b]] += cost * moves[a] * moves[b]
+    return total
 
 
 def cost_of_ball(a, b, c, radius, table, data):

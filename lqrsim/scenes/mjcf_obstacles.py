@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Finite, checked
-from lqrsim.capsules import Capsule
 from lqrsim.errors import Array
+from lqrsim.outlines import Capsule
 from lqrsim.scenes.mjcf_kinematics import placed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)

@@ -217,6 +217,27 @@ class World:
             ]
         )
 
+    def check_upright(self) -> None:
+        """Raises InputError unless each obstacle of a plane has an outline in it that does not depend on the height."""
+        for one in self.obstacles:
+            axis = np.abs(one.rotation[2])  # how much of each local axis is along the normal of the plane
+            high, flat = abs(one.position[2]), np.flatnonzero(axis < 1e-9)
+            match one.kind:
+                case "plane":
+                    good = bool(axis[2] < 1e-9)
+                case "sphere":
+                    good = not high
+                case "capsule" | "cylinder":
+                    good = bool(axis[2] > 1 - 1e-9) and high <= one.size[1]
+                case _:
+                    good = len(flat) == 2 and bool(np.isfinite(one.size[flat]).all())
+                    good = good and bool(high <= one.size[int(axis.argmax())])
+            if not good:
+                raise InputError(
+                    f"obstacle {one.name!r}: got a {one.kind} across the plane of hulls=, want it upright on the plane,"
+                    " and of finite width; or balls without hulls"
+                )
+
     def distances(self, point: npt.ArrayLike) -> Array:
         """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
 

@@ -193,7 +193,7 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
                 off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
                 raise InputError(
-                    f"{who}: got {balls.names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
+                    f"{who}: got {balls.ball_names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
                     f" MuJoCo has {site!r} at {_point(there)} m; want them in the same place"
                 )
 

@@ -10,10 +10,9 @@ nearest knots. That leaves gaps, which are closed with the duration held: while 
 rather shorten the duration. The duration of the whole is found from there.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,15 +32,17 @@ from lqrsim.solvers.interior_run import LITTLE, MUCH, Barrier
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 from lqrsim.solvers.tree import ways_by_trees
-from lqrsim.solvers.ways import ways
+from lqrsim.solvers.ways import Way, ways
 
 # The added state, and the parameter to which it is relative; with underscores after them if the system has such names.
 STATE, STATED = "duration", "stated_duration"
 MOST = 300  # largest number of iterations
 # Number of shorter durations that are tried, factor between them, and number of iterations for each.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
-# Durations of the sketches, relative to the stated one; the largest number of iterations of a sketch, its tolerance,
-# that of constraints in their units, and that of what is worth going on from, violations and gaps.
+# A sketch with a free duration whose cost is this many times that of the best plan leads to no better one.
+PROMISING = 1.1
+# Fixed durations of the sketches, relative to the stated one; the largest number of iterations of a sketch, its
+# tolerance, that of constraints in their units, and that of what is worth going on from, violations and gaps.
 SKETCHED, SKETCH, ROUGH, KEPT, WORTH = (1.0, 2.0), 100, 1e-2, 1e-4, 1e-2
 FREED = Barrier(1.0, 0.02, near=False)  # beginning of the interior point from another plan
 # Tolerance of the search for durations of segments: their ends go to whole knots, one in some hundred.
@@ -97,29 +98,47 @@ class DurationSearch:
         self._fixed, self._total = list[Solution](), 0
 
     def follow_ways(self) -> None:
-        """Sketch the ways, and go on from the sketches that keep the constraints."""
+        """Sketch the ways, and go on from the sketches that keep the constraints, the cheapest first."""
         problem, stop = self._problem, self._stop
         stated = settled(problem, problem.steps * problem.dt)
         with stop.not_counting():  # compiling
             stages = Stages(stated)
-        known, sketches = list(ways(stated, stages)), list[tuple[str, Trajectory]]()
-        lengths = dict.fromkeys(float(np.clip(share * stated.dt * stated.steps, *self._range)) for share in SKETCHED)
-        for duration, way in itertools.product(lengths, known):
-            fixed = settled(problem, duration)
+            free = with_duration(problem)
+        sketches = list[Sketch]()
+        for way in ways(stated, stages):
             with stop.reporting("smooth", self._attentive), stop.heeding():
-                found, iterations = sketch(fixed, way.over(fixed), self._settings.price, stop)
-                name, plan = f"{way.name}, {duration:g} s", found.trajectory(fixed.dt)
-                if found.measures.violation < WORTH and found.measures.gap < WORTH:
-                    sketches.append((name, plan))
+                made = self._sketched(way, free)
+                self._total += made.iterations
+                if np.isfinite(made.cost):
+                    sketches.append(made)
                 else:
-                    self.candidates.append(Candidate(name, np.inf, iterations, None, plan))
-                self._total += iterations
+                    self.candidates.append(Candidate(made.name, np.inf, made.iterations, None, made.plan))
             if stop.due:
                 return
-        for name, plan in sketches:
+        for made in sorted(sketches, key=lambda one: one.cost):
             if stop.due:
                 return
-            self._follow(name, plan)
+            if self.best is not None and made.settled and made.cost > PROMISING * self.best[1].measures.cost:
+                self.candidates.append(Candidate(made.name, made.cost, made.iterations, None, made.plan))
+            else:
+                self._follow(made.name, made.plan)
+
+    def _sketched(self, way: Way, free: Problem) -> "Sketch":
+        """What a few iterations make of a way: with a free duration or, where this fails, with some fixed ones."""
+        problem, price, stop = self._problem, self._settings.price, self._stop
+        stated = problem.steps * problem.dt
+        fixed = settled(problem, stated)
+        made = sketch(fixed, way.over(fixed), price, stop, free)._replace(name=way.name)
+        for duration in dict.fromkeys(float(np.clip(share * stated, *self._range)) for share in SKETCHED):
+            if np.isfinite(made.cost) or stop.due:
+                break
+            fixed = settled(problem, duration)
+            other = sketch(fixed, way.over(fixed), price, stop)
+            made = other._replace(
+                name=f"{way.name}, {duration:g} s", cost=other.cost + problem.time_weight * duration,
+                iterations=made.iterations + other.iterations,
+            )  # fmt: skip
+        return made
 
     def grow_trees(self) -> None:
         """Grow trees while no plan is known, and go on from the ways through them."""
@@ -263,19 +282,47 @@ class DurationSearch:
         )
 
 
-def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop) -> tuple[Found, int]:
-    """What a few iterations of the interior point make of a way, and their number."""
-    stages, budget = Stages.lent(problem), Budget(SKETCH, stop)
+class Sketch(NamedTuple):
+    """What a few iterations of the interior point make of a way.
+
+    Attributes:
+      plan: the plan. cost: its cost, infinite if it is far from the constraints. iterations: their number.
+      settled: whether the duration was free. name: that of the way.
+    """
+
+    plan: Trajectory
+    cost: float
+    iterations: int
+    settled: bool
+    name: str = ""
+
+
+def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop, free: Problem | None = None) -> Sketch:
+    """Sketch a way in a problem with its duration, or with a free one, `with_duration`."""
+    n, budget, states = way.states.shape[1], Budget(SKETCH, stop), way.states
+    with stop.not_counting():  # compiling
+        stages = Stages.lent(free or problem)
+    prices = np.full(len(stages.owners), price)
+    if free is not None:
+        stages.free[n] = 1.0
+        states = np.column_stack([states, np.full(len(states), way.horizon)])
+        prices[stages.owners == len(problem.constraint_terms)] = np.inf  # the bounds of the duration
     laps = Laps(budget)
 
     def watch(measures: Measures, seconds: float) -> bool:
         measures.record(laps, seconds=seconds)
         return stop.due
 
-    point = InteriorPoint(stages, Motion(*map(in_c_order, (way.states, way.controls))), room=MUCH.room, price=price)
+    point = InteriorPoint(stages, Motion(*map(in_c_order, (states, way.controls))), room=MUCH.room, price=prices)
     found = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=watch)
     stages.give_back()
-    return found, len(budget.log)
+    cost, duration = found.measures.cost, way.horizon
+    if not (found.measures.violation < WORTH and found.measures.gap < WORTH):
+        cost = np.inf
+    elif free is not None:
+        duration = float(found.plan.states[0, n])
+    plan = Trajectory(found.plan.states[:, :n], found.plan.controls, duration / problem.steps)
+    return Sketch(plan, cost, len(budget.log), free is not None)
 
 
 def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:

@@ -1,4 +1,4 @@
-"""Capsules as chains of balls.
+"""Parts of a robot's outline: boxes in the plane by their corners, and capsules as chains of balls.
 
 A capsule is the set of points within `radius` of a segment, such as the link of an arm. Balls of the same radius,
 evenly spaced along the segment, are inside it. Between two balls, `spacing` apart, the capsule protrudes by
@@ -12,6 +12,7 @@ import itertools
 import math
 from collections import namedtuple
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 from lqrsim.errors import InputError, check_number, excerpt
@@ -103,3 +104,37 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
         except Exception as error:  # entries that are not numbers
             given = f"{excerpt(start)} and {excerpt(end)}"
             raise InputError(f"between: got {given} ({type(error).__name__}), want points of expressions") from None
+
+
+class Box(namedtuple("Box", ("length", "width"))):
+    """A box in the plane, for the hulls of `CollisionSpheres`.
+
+    Attributes:
+      length: its extent along the direction of its angle, in metres, above 0.
+      width: its extent across, in metres, above 0.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, length: float, width: float) -> "Box":
+        sizes = {"length": length, "width": width}
+        return super().__new__(cls, *(check_number(f"Box: {name}", one, above=0.0) for name, one in sizes.items()))
+
+    def corners(self, center: Sequence[Any], angle: Any) -> list[list[Any]]:
+        """The four corners, counterclockwise: SymPy expressions, or numbers.
+
+        Args:
+          center: its 2 coordinates in metres.
+          angle: its angle in rad, from the first axis to its length.
+        """
+        if isinstance(angle, Real):
+            from math import cos, sin
+        else:
+            from sympy import cos, sin
+        try:
+            (x, y), c, s = center, cos(angle) / 2, sin(angle) / 2
+            ends = [(a * self.length, b * self.width) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            return [[x + a * c - b * s, y + a * s + b * c] for a, b in ends]
+        except Exception as error:  # entries that are not numbers
+            given = f"{excerpt(center)} and {excerpt(angle)} ({type(error).__name__})"
+            raise InputError(f"corners: got {given}, want 2 coordinates and an angle") from None
