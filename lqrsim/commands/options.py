@@ -5,6 +5,7 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -50,7 +51,7 @@ def options_of(file: str, name: str, **metavars: str) -> Callable[[type[Command]
       file: path in the package. name: the function or class, or CLASS.METHOD.
       **metavars: each option with its metavar.
     """
-    node: Any = ast.parse((Path(__file__).parents[1] / file).read_text(encoding="utf-8"))
+    node: Any = _parsed(file)
     for part in name.split("."):
         node = next(one for one in node.body if getattr(one, "name", None) == part)
     words = ast.get_docstring(node) or ""
@@ -69,7 +70,7 @@ def options_of(file: str, name: str, **metavars: str) -> Callable[[type[Command]
             entry = re.search(rf"^  {option}: (.+(?:\n    .+)*)", words, re.MULTILINE)
             assert entry is not None, f"{name} does not say what {option} is"
             text = " ".join(entry[1].split())
-            kind, default = eval(ast.unparse(types[option]), {}), ast.literal_eval(defaults[option])
+            kind, default = _type_of(types[option]), ast.literal_eval(defaults[option])
             shown = arg(metavar=metavar, help=text[0].upper() + text[1:], **{} if default is not None else NO_DEFAULT)
             options[option] = Annotated[kind, shown]
             setattr(command, option, default)
@@ -77,6 +78,30 @@ def options_of(file: str, name: str, **metavars: str) -> Callable[[type[Command]
         return command
 
     return add
+
+
+def _type_of(annotation: ast.expr) -> Any:
+    """The type that an annotation of the API says, without what `checked` asks of it besides."""
+    kinds = {target.id: one.value for one in _parsed("annotations.py").body if isinstance(one, ast.Assign)
+             for target in one.targets if isinstance(target, ast.Name)}  # fmt: skip
+
+    class Bare(ast.NodeTransformer):
+        def visit_Name(self, node: ast.Name) -> ast.expr:
+            return self.visit(kinds[node.id]) if node.id in kinds else node
+
+        def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+            annotated = isinstance(node.value, ast.Name) and node.value.id == "Annotated"
+            if annotated and isinstance(node.slice, ast.Tuple):
+                return self.visit(node.slice.elts[0])
+            self.generic_visit(node)
+            return node
+
+    return eval(ast.unparse(Bare().visit(annotation)), {"Literal": Literal})
+
+
+@cache
+def _parsed(file: str) -> ast.Module:
+    return ast.parse((Path(__file__).parents[1] / file).read_text(encoding="utf-8"))
 
 
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]

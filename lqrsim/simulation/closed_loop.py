@@ -68,6 +68,8 @@ def simulate(
         `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
       disturbances: in the order in which they act. Each has its own stream of random numbers. The `Noise` of a problem
         is allowed, too.
+      seed: seed of all random numbers.
+      trials: number of trials.
       first_trial: number of the first trial. Trial `i` of a seed is bit-identical, whatever other trials run with it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or a tenth
         of the distance to the goal if the plan starts within the radius.
