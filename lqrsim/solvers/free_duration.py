@@ -60,10 +60,10 @@ def solve_for_duration(
 ) -> Solution:  # fmt: skip
     """Find the best duration, and finish the plan with that duration.
 
-    Without a start from the caller, ways to the goal are sketched, for the stated duration and a longer one. Then comes
-    the solution for the stated duration, in whose place a plan `begin` may be. From each of these the search goes to
-    the best duration nearby. Where none led to a plan, trees grow. `solve` is for problems with a fixed duration,
-    within the time of `stop`; for `attentive` see `Budget`.
+    Without a start from the caller, ways to the goal are sketched. Then comes the solution for the stated duration, in
+    whose place a plan `begin` may be. From each of these the search goes to the best duration nearby. Where none led to
+    a plan, trees grow. `solve` is for problems with a fixed duration, within the time of `stop`; for `attentive` see
+    `Budget`.
     """
     search = DurationSearch(problem, settings, solve, attentive, callback, stop)
     alone = begin is None and settings.start is None and settings.safeguard
