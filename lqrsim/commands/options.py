@@ -82,8 +82,7 @@ def options_of(file: str, name: str, **metavars: str) -> Callable[[type[Command]
 
 def _type_of(annotation: ast.expr) -> Any:
     """The type that an annotation of the API says, without what `checked` asks of it besides."""
-    kinds = {target.id: one.value for one in _parsed("annotations.py").body if isinstance(one, ast.Assign)
-             for target in one.targets if isinstance(target, ast.Name)}  # fmt: skip
+    kinds = _kinds()
 
     class Bare(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.expr:
@@ -97,6 +96,16 @@ def _type_of(annotation: ast.expr) -> Any:
             return node
 
     return eval(ast.unparse(Bare().visit(annotation)), {"Literal": Literal})
+
+
+@cache
+def _kinds() -> dict[str, ast.expr]:
+    """The annotations that have a name in `annotations.py`, such as `Positive`."""
+    found = dict[str, ast.expr]()
+    for one in _parsed("annotations.py").body:
+        if isinstance(one, ast.Assign) and isinstance(one.targets[0], ast.Name):
+            found[one.targets[0].id] = one.value
+    return found
 
 
 @cache

@@ -118,7 +118,7 @@ class DurationSearch:
         for made in sorted(sketches, key=lambda one: one.cost):
             if stop.due:
                 return
-            if self.best is not None and made.settled and made.cost > PROMISING * self.best[1].measures.cost:
+            if self.best is not None and made.free and made.cost > PROMISING * self.best[1].measures.cost:
                 self.candidates.append(Candidate(made.name, made.cost, made.iterations, None, made.plan))
             else:
                 self._follow(made.name, made.plan)
@@ -287,13 +287,13 @@ class Sketch(NamedTuple):
 
     Attributes:
       plan: the plan. cost: its cost, infinite if it is far from the constraints. iterations: their number.
-      settled: whether the duration was free. name: that of the way.
+      free: whether the duration was free. name: that of the way.
     """
 
     plan: Trajectory
     cost: float
     iterations: int
-    settled: bool
+    free: bool
     name: str = ""
 
 
