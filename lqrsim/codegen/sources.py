@@ -343,12 +343,7 @@ def _parse(text: str) -> _Parsed:
     functions, imports, lines, texts = {}, {}, text.splitlines(), []
     try:
         tree = ast.parse(text)
-    except (
-        SyntaxError,
-        ValueError,
-        RecursionError,
-        MemoryError,
-    ) as error:  # as for deep nesting or null characters
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # as for deep nesting or null characters
         raise SubsetError(f"got {excerpt(text)}, which is not valid Python ({error}), want functions") from None
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):

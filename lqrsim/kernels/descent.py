@@ -36,12 +36,7 @@ from lqrsim.kernels.declarations import (
     N,
     stack,
 )
-from lqrsim.kernels.iterations import (
-    failure,
-    relative_improvement,
-    relative_optimality,
-    write_row,
-)
+from lqrsim.kernels.iterations import failure, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.passes import backward_pass, forward_pass, smoothed_states
 from lqrsim.kernels.records import CostToGo, Descent, Linearization, ModelOrder

@@ -11,12 +11,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.distances import (
-    distances_with_normals,
-    hull_distances,
-    signed_distance,
-    signed_distance_displaced,
-)
+from lqrsim.codegen.distances import distances_with_normals, hull_distances, signed_distance, signed_distance_displaced
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError

@@ -14,13 +14,7 @@ import numpy as np
 from lqrsim.annotations import Index, Want, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import Term
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_items,
-    check_kind,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
 from lqrsim.kernels import residual_constraint
 from lqrsim.problem.costs import ProblemPart
 from lqrsim.problem.dynamics import Dynamics

@@ -21,16 +21,7 @@ from lqrsim.codegen.user_functions import (
     name_of,
     with_derivatives,
 )
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_kind,
-    check_name,
-    check_shape,
-    check_text,
-    excerpt,
-    numbers_of,
-)
+from lqrsim.errors import Array, InputError, check_kind, check_name, check_shape, check_text, excerpt, numbers_of
 from lqrsim.kernels import differences, user_functions
 from lqrsim.problem.at_knots import at_knots
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm

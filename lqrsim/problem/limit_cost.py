@@ -22,11 +22,7 @@ class LimitCost(Cost):
 
     @checked
     def __init__(
-        self,
-        low: Mapping[str, float] | None = None,
-        high: Mapping[str, float] | None = None,
-        *,
-        weight: NonNegative,
+        self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None, *, weight: NonNegative
     ) -> None:
         self.weight = weight
         self.bounds = [

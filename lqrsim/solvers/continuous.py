@@ -15,14 +15,7 @@ from scipy.interpolate import PPoly
 
 from lqrsim.annotations import Bounds, Positive, Want, checked
 from lqrsim.codegen.user_functions import UserFunction, interrupt_of, raised_by
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_function,
-    excerpt,
-    real,
-)
+from lqrsim.errors import Array, InputError, check_array, check_function, excerpt, real
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
@@ -338,11 +331,7 @@ def smooth_continuous(
         raise InputError(
             f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"
         )
-    limits = _Limits(
-        tolerance,
-        gap_tolerance,
-        max_iterations,
-    )
+    limits = _Limits(tolerance, gap_tolerance, max_iterations)
     tolerances = tolerances_of(rtol, atol)
     control, prior = _initial_guess(problem, start)
     state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()

@@ -24,12 +24,7 @@ from lqrsim.solvers.engine import RunResult, SolveRun, check_finite_at_start
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import name_risk
-from lqrsim.solvers.settings import (
-    Settings,
-    SmootherSettings,
-    settings_from,
-    warn_of_goal,
-)
+from lqrsim.solvers.settings import Settings, SmootherSettings, settings_from, warn_of_goal
 
 TOLERANCE = 1e-4  # default tolerance
 

@@ -337,11 +337,7 @@ class _Neighbour:
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
-                    self._stages,
-                    copied(self._best.plan),
-                    barrier=LITTLE.parameter,
-                    room=LITTLE.room,
-                    multipliers=known,
+                    self._stages, copied(self._best.plan), barrier=LITTLE.parameter, room=LITTLE.room, multipliers=known
                 )
 
                 def watch(measures: Measures, seconds: float) -> bool:

@@ -7,11 +7,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 
 from lqrsim.annotations import Bounds, OneOf, Positive, checked
-from lqrsim.errors import (
-    InputError,
-    check_function,
-    check_memory,
-)
+from lqrsim.errors import InputError, check_function, check_memory
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function

@@ -15,12 +15,7 @@ from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import StartLike
 from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
-from lqrsim.solvers.settings import (
-    SmootherSettings,
-    check_runs,
-    settings_from,
-    warn_of_goal,
-)
+from lqrsim.solvers.settings import SmootherSettings, check_runs, settings_from, warn_of_goal
 from lqrsim.solvers.strategy import solve
 
 

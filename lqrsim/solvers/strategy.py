@@ -1015,9 +1015,7 @@ FIRST = (
         Search.try_elsewhere,
     ),
     Attempt(
-        "oscillating controls",
-        lambda search: _is_poor(search) and not search.is_guided,
-        Search.try_sinusoidal_controls,
+        "oscillating controls", lambda search: _is_poor(search) and not search.is_guided, Search.try_sinusoidal_controls
     ),
 )
 ATTEMPTS = (
