@@ -213,11 +213,7 @@ class CollisionSpheres:
         return f"{name_of(self.function)}(x, p)"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
-        """Bind the places to a system.
-
-        Args:
-          dynamics: dynamics of the system whose states move the balls.
-        """
+        """Bind the places to the system whose states move the balls."""
         if self.level != "symbolic":
             return self._bind_functions(dynamics)
         own = dynamics.calling
@@ -306,10 +302,6 @@ class CollisionSpheres:
         """The centre of each ball, (..., K, 3), at states (..., n), in the world, in metres.
 
         Centres in a plane that is seen from above have height 0.
-
-        Args:
-          dynamics: dynamics of the system whose states move the balls.
-          states: (..., n).
         """
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         places = self.bind(dynamics)

@@ -115,10 +115,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
-        each control with a `control_rate`.
-
-        Args:
-          dynamics: dynamics of the system without that state.
+        each control with a `control_rate`. `dynamics` are those without that state.
 
         Raises:
           InputError: its kind cannot be stated for one more state.
@@ -198,26 +195,11 @@ class Cost(ProblemPart[CostTerm]):
         return 0.0
 
     def times(self, factor: float) -> "Cost":
-        """The cost times a number. Costs with a state reference or obstacles have it: the search changes their weights.
-
-        Args:
-          factor: the number, not negative.
-
-        Raises:
-          InputError: a cost of another kind.
-        """
+        """The cost times a number. Costs with a reference or obstacles have it: the search changes their weights."""
         raise InputError(f"{self.name}: got no method times, want it to return the cost times a number")
 
     def moved_to(self, state: Array, dynamics: Dynamics) -> "Cost":
-        """The cost with another state as reference. Costs with a state reference have it: a viewer moves goals.
-
-        Args:
-          state: (n,).
-          dynamics: dynamics of the system.
-
-        Raises:
-          InputError: a cost of another kind.
-        """
+        """The cost about another state (n,). Costs with a state reference have it: a viewer moves goals."""
         raise InputError(f"{self.name}: got no method moved_to, want it to return the cost about a state")
 
     def _in(self, dynamics: Dynamics) -> "Cost":

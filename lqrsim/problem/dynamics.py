@@ -208,9 +208,6 @@ class Dynamics:
     def with_parameters(self, **values: float) -> "Dynamics":
         """The same dynamics with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing
         compiles again.
-
-        Args:
-          **values: parameter -> number.
         """
         for name in values:
             check_name("parameters", name, self.parameters)
@@ -230,11 +227,8 @@ class Dynamics:
 
         `Problem(accuracy=)` chooses their number. The control is still held over the period.
 
-        Args:
-          count: number of steps; 1 for the usual one.
-
         Raises:
-          InputError: no such number, or dynamics that are not stated as a rate, such as those of an MJCF.
+          InputError: dynamics that are not stated as a rate, such as those of an MJCF.
         """
         count = check_count("substeps", count)
         if self.discrete or self.level == "jax":
@@ -290,38 +284,21 @@ class Dynamics:
         return text_source(made["source"], f"{self.name}(x, u, p)")
 
     def touches(self, states: Array) -> bool:
-        """Whether a contact or a limit acts in one of some states.
-
-        Args:
-          states: (k, n).
-        """
+        """Whether a contact or a limit acts in one of some states (k, n)."""
         return False
 
     def untouched_body(self, states: Array, state: int) -> str:
-        """The body that a state moves, if nothing that moves touches it along a plan; empty without bodies.
-
-        Args:
-          states: (T+1, n) of the plan.
-          state: the index of the state.
-        """
+        """The body that a state moves, by its index, if nothing that moves touches it along a plan; or empty."""
         return ""
 
     def _cause_of_failure(self, state: Array) -> str | None:
-        """Why a step from a state is not finite, as the end of a message.
-
-        Args:
-          state: (n,).
-
-        Returns:
-          The cause; None if it is unknown.
-        """
+        """Why a step from a state (n,) is not finite, as the end of a message; None if that is unknown."""
         return None
 
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
         """The dynamics with softer contacts and limits, in several degrees with their names, the softest first.
 
-        Args:
-          states: (T+1, n) of a plan. If nothing touches along the plan, there are no softer dynamics.
+        There are none if nothing touches along the plan (T+1, n).
         """
         return iter(())
 
@@ -339,14 +316,7 @@ class Dynamics:
         return iter(())
 
     def contact_modes(self, dt: float) -> "ContactModes | None":
-        """The contact modes of control periods, for dynamics that are smooth only within one mode.
-
-        Args:
-          dt: the control period in seconds.
-
-        Returns:
-          None, except for an MJCF whose switches are all known.
-        """
+        """The contact modes of periods of `dt` seconds; None, except for an MJCF whose switches are all known."""
         return None
 
     @cached_property
@@ -475,14 +445,7 @@ class Dynamics:
 
     @checked
     def period_near(self, dt: Finite) -> float:
-        """The possible duration of steps nearest to `dt`: `dt` itself, or a multiple of `period`.
-
-        Args:
-          dt: seconds.
-
-        Returns:
-          Seconds.
-        """
+        """The possible duration of steps nearest to `dt`, in seconds: `dt` itself, or a multiple of `period`."""
         return dt if self.period is None else round(dt / self.period) * self.period
 
     def _parts_of(self, dt: float, most: int) -> int:
@@ -491,24 +454,14 @@ class Dynamics:
 
     @checked
     def check_period(self, dt: Finite) -> None:
-        """Check that a step can last `dt` seconds: of a map, its period; see `MjcfDynamics` for MuJoCo's steps.
-
-        Args:
-          dt: seconds.
-        """
+        """Check that a step can last `dt` seconds: of a map, its period; see `MjcfDynamics` for MuJoCo's steps."""
         if self.period is not None and abs(dt - self.period) > 1e-9 * self.period:  # rounding, as of 1 / 30
             raise InputError(f"dt: got {dt:g} s, want {self.period:g} s, the period of the map {self.name}")
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
-        """The Runge-Kutta steps of control periods of `dt` seconds.
+        """The duration of the Runge-Kutta steps of periods of `dt` seconds, and df/dx (k, n, n) where these begin.
 
-        Args:
-          states: (k, n), at which each period begins.
-          controls: (k, m).
-          dt: seconds.
-
-        Returns:
-          The duration of a step in seconds, and df/dx (k, n, n); None if the steps are another method's.
+        None if the steps are another method's. The periods begin in states (k, n), under controls (k, m).
         """
         if self.discrete:
             return None
@@ -525,11 +478,7 @@ class Dynamics:
 
     @checked
     def solving(self, threads: Count) -> contextlib.AbstractContextManager[None]:
-        """A context in which a solver works.
-
-        Args:
-          threads: number of threads that the solver may use for one trajectory.
-        """
+        """A context in which a solver works, with this number of threads for one trajectory."""
         return contextlib.nullcontext()
 
     def quiet(self) -> contextlib.AbstractContextManager[None]:
@@ -537,27 +486,14 @@ class Dynamics:
         return contextlib.nullcontext()
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
-        """`xdot` (n,) at one state (n,) and control (m,), in plain Python.
-
-        Args:
-          state: (n,).
-          control: (m,).
-
-        Returns:
-          (n,), per second.
-        """
+        """The rate `xdot` (n,), per second, at one state (n,) and control (m,), in plain Python."""
         x, u = self._check(state, control)
         out = np.zeros(len(x))
         self._plain["rate"](x, u, self._numbers(), out)
         return out
 
     def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
-        """df/dx (n, n) and df/du (n, m) at one state and control, in plain Python.
-
-        Args:
-          state: (n,).
-          control: (m,).
-        """
+        """df/dx (n, n) and df/du (n, m) at one state (n,) and control (m,), in plain Python."""
         x, u = self._check(state, control)
         n, m = len(x), len(u)
         fx, fu = np.zeros((n, n)), np.zeros((n, m))
@@ -565,13 +501,9 @@ class Dynamics:
         return fx, fu
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds (negative: before), control held: the Runge-Kutta step, in plain Python.
-        A map has no step backwards.
+        """The state (n,) after `dt` seconds from a state (n,), with a control (m,) held: one step, in plain Python.
 
-        Args:
-          state: (n,).
-          control: (m,), held over the step.
-          dt: seconds; negative steps lead backwards in time.
+        Negative steps lead backwards in time; a map has none.
         """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
@@ -580,12 +512,11 @@ class Dynamics:
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
-        """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c. Eqs. (24)-(25).
+        """A (n, n), B (n, m) and c (n,) of a step about a state and control: x' = A x + B u + c. Eqs. (24)-(25).
 
         Args:
           state: (n,).
-          control: (m,), held over the step.
-          dt: seconds.
+          control: (m,), held over the step of `dt` seconds.
         """
         x, u = self._check(state, control)
         n, m = len(x), len(u)

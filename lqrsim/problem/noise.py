@@ -135,21 +135,13 @@ class Noise:
         return f"Noise({self.name}, size={self.size}{times})"
 
     def scaled(self, strength: float) -> "Noise":
-        """The same noise with M multiplied by a number. Nothing is compiled again.
-
-        Args:
-          strength: the number, at least 0; strengths of several calls multiply.
-        """
+        """The same noise with M multiplied by a number; strengths of several calls multiply. Nothing compiles again."""
         other = copy.copy(self)
         other.strength = self.strength * check_number("Noise: strength", strength, at_least=0.0)
         return other
 
     def with_parameters(self, **values: float) -> "Noise":
-        """The same noise with other values of some parameters. Nothing is compiled again.
-
-        Args:
-          **values: name of a parameter -> its value.
-        """
+        """The same noise with other values of some parameters. Nothing is compiled again."""
         for name in values:
             check_name("parameters", name, self.parameters)
         other = copy.copy(self)
@@ -158,11 +150,7 @@ class Noise:
 
     @checked
     def bind(self, dynamics: Dynamics) -> NoiseTerm:
-        """The noise for a system.
-
-        Args:
-          dynamics: dynamics of the system, with its states and controls.
-        """
+        """The noise for a system."""
         n = len(dynamics.state_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
         if self.matrix is not None:
@@ -233,13 +221,7 @@ class Noise:
 
     @checked
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
-        """The matrices M (K, n, k) at given states and controls, in the states' units.
-
-        Args:
-          dynamics: dynamics of the system, with its states and controls.
-          states: (K, n).
-          controls: (K, m).
-        """
+        """The matrices M (K, n, k) at states (K, n) and controls (K, m), in the states' units."""
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = check_array("states", states, (None, n), infinite=True)
         u = check_array("controls", controls, (len(x), m), infinite=True)

@@ -56,11 +56,7 @@ class ObstacleCost(KeepsClear, Cost):
         self.weight = weight
 
     def weighing(self, weight: float) -> "ObstacleCost":
-        """The same cost with another weight.
-
-        Args:
-          weight: cost of touching one obstacle, with one ball, for one step.
-        """
+        """The same cost with another weight."""
         other = copy.copy(self)
         other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
         return other

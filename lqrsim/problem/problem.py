@@ -257,12 +257,7 @@ class Problem(OneVersion):
         return None if self.control_rate is None else self.control_rate._after(known)
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
-        """The problem with other costs. It may begin inside an obstacle if this one does; see `from_state`.
-
-        Args:
-          stage_cost: the stage cost, or None for the present one.
-          final_cost: the final cost, or None for the present one.
-        """
+        """The problem with other costs, None for the present ones. It may begin inside an obstacle if this one does."""
         given = {"stage_cost": stage_cost, "final_cost": final_cost}
         costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
         terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
@@ -300,11 +295,7 @@ class Problem(OneVersion):
 
     @checked
     def settled(self, plan: Solution) -> "Problem":
-        """The problem with the duration of a plan: of fixed steps, and with its segments where they are in the plan.
-
-        Raises:
-          InputError: the plan has another number of steps, or is not of this problem's segments.
-        """
+        """The problem with the duration of a plan: of fixed steps, and with its segments where they are in the plan."""
         knots = plan.options.get("segments", self.segments)
         if plan.trajectory.steps != self.steps or not isinstance(knots, Sequence) or len(knots) != len(self.segments):
             got = f"{plan.trajectory.steps} steps, segments at {brief(knots)}"
@@ -444,11 +435,7 @@ class Problem(OneVersion):
         return tuple(kept for part in parts if (kept := part.kept_clear) is not None)
 
     def terms(self, which: str) -> tuple[CostTerm, ...]:
-        """The bound terms of `initial`, `stage_cost` or `final_cost`.
-
-        Args:
-          which: "initial", "stage_cost" or "final_cost".
-        """
+        """The bound terms of "initial", "stage_cost" or "final_cost"."""
         return self._terms[check_name("which", which, self._terms)]
 
     @property
@@ -462,15 +449,7 @@ class Problem(OneVersion):
         return self._noise_term
 
     def driven_by(self, noise: Noise | None, risk: float | None) -> "Problem":
-        """The same problem under other noise or with another risk.
-
-        Args:
-          noise: the noise; None keeps the problem's own.
-          risk: the risk, in units of 1/cost; None keeps the problem's own.
-
-        Returns:
-          Another Problem; this one does not change.
-        """
+        """The same problem under other noise or with another risk, in units of 1/cost; None keeps the problem's own."""
         changed = {name: value for name, value in (("noise", noise), ("risk", risk)) if value is not None}
         return replace(self, **changed) if changed else self
 
@@ -594,12 +573,9 @@ class Problem(OneVersion):
 
     @checked
     def violations(self, rollout: Rollout) -> dict[str, Array]:
-        """By how much runs violate each constraint, other than clearances, which a `Rollout` has itself.
+        """By how much K runs of a plan violate each constraint, other than clearances, which a `Rollout` has itself.
 
         A run's outcome does not count them: a run that reached its goal may have violated any of them.
-
-        Args:
-          rollout: runs of a plan for this problem, K trials.
 
         Returns:
           Name -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in seconds; zeros

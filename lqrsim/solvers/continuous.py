@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -41,9 +41,9 @@ from lqrsim.solvers.riccati_ode import (
 @checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContinuousSolution:
-    """A policy and the value functions as functions of time, in seconds from 0 to the horizon.
+    """A policy and the value functions as functions of the time t, in seconds from 0 to the horizon.
 
-    An array of times may be given in place of a time. The axes of the times then come first in the result.
+    t may be an array of times, whose axes then come first in the result.
 
     Attributes:
       status: how the solve ended; only CONVERGED is success.
@@ -72,82 +72,31 @@ class ContinuousSolution:
         return float(self.total_cost(0.0).minimum())
 
     def policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        """The control (..., m) to apply in the states (..., n) at time t, without saturation. Paper: Eq. (13).
-
-        Args:
-          x: states (..., n).
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          Controls (..., m).
-        """
+        """The control (..., m) to apply in the states x (..., n) at time t, without saturation. Paper: Eq. (13)."""
         return self._law("policy", self._backward, x, t)
 
     def inverse_policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        """The control (..., m) that led to the states (..., n) at time t at least cost. Paper: Eq. (19).
-
-        Args:
-          x: states of arrival (..., n).
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          Controls (..., m).
-        """
+        """The control (..., m) that led to the states x (..., n) at time t at least cost. Paper: Eq. (19)."""
         return self._law("inverse_policy", self._forward, x, t)
 
     def cost_to_go(self, t: npt.ArrayLike) -> Quadratic:
-        """v: the least cost from time t on, as a function of the state at t. Paper: Eqs. (8)-(11).
-
-        Args:
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          The quadratic at each time.
-        """
+        """v: the least cost from time t on, as a function of the state at t. Paper: Eqs. (8)-(11)."""
         return self._value("cost_to_go", self._backward, t)
 
     def cost_to_come(self, t: npt.ArrayLike) -> Quadratic:
-        """vbar: the least cost up to time t, as a function of the state at t. Paper: Eqs. (14)-(17).
-
-        Args:
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          The quadratic at each time.
-        """
+        """vbar: the least cost up to time t, as a function of the state at t. Paper: Eqs. (14)-(17)."""
         return self._value("cost_to_come", self._forward, t)
 
     def total_cost(self, t: npt.ArrayLike) -> Quadratic:
-        """vhat: the least cost of visiting a state at time t. Paper: Eq. (20).
-
-        Args:
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          The quadratic at each time.
-        """
+        """vhat: the least cost of visiting a state at time t. Paper: Eq. (20)."""
         return self.cost_to_go(t) + self.cost_to_come(t)
 
     def x_hat(self, t: npt.ArrayLike) -> Array:
-        """The state (..., n) of least total cost at time t. Paper: Eq. (21).
-
-        Args:
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          States (..., n).
-        """
+        """The state (..., n) of least total cost at time t. Paper: Eq. (21)."""
         return self.total_cost(t).minimizer()
 
     def u_hat(self, t: npt.ArrayLike) -> Array:
-        """The policy's control (..., m) there; at convergence also the inverse policy's. Paper: Eq. (22).
-
-        Args:
-          t: seconds, from 0 to the horizon.
-
-        Returns:
-          Controls (..., m).
-        """
+        """The policy's control (..., m) there; at convergence also the inverse policy's. Paper: Eq. (22)."""
         return self.policy(self.x_hat(t), t)
 
     def summary(self) -> str:
@@ -331,7 +280,6 @@ def smooth_continuous(
         raise InputError(
             f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"
         )
-    limits = _Limits(tolerance, gap_tolerance, max_iterations)
     tolerances = tolerances_of(rtol, atol)
     control, prior = _initial_guess(problem, start)
     state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
@@ -342,7 +290,7 @@ def smooth_continuous(
     for function in functions:
         function.forget()
     solver = _Smoother(problem, state, control, prior, tolerances)
-    iterations, status, detail = _iterate(solver, limits, functions, callback)
+    iterations, status, detail = _iterate(solver, tolerance, gap_tolerance, max_iterations, functions, callback)
     if (error := interrupt_of(functions)) is not None:
         raise error
     raised = raised_by(functions)
@@ -350,14 +298,6 @@ def smooth_continuous(
         status=status, detail=f"{detail}; {raised}" if detail and raised else detail, horizon=solver.system.horizon,
         iterations=tuple(iterations), _backward=solver.backward, _forward=solver.forward,
     )  # fmt: skip
-
-
-class _Limits(NamedTuple):
-    """Conditions for stopping; see `smooth_continuous`."""
-
-    tolerance: float
-    gap_tolerance: float
-    max_iterations: int
 
 
 def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None) -> tuple[Array, InitialPrior | None]:
@@ -372,19 +312,20 @@ def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None)
 
 
 def _iterate(
-    solver: "_Smoother", limits: _Limits, functions: list[UserFunction], callback: Callable[[Iteration], object] | None
-) -> tuple[list[Iteration], Status, str]:
-    """Iterate until convergence or a limit; return the log, the status, and where it failed."""
+    solver: "_Smoother", tolerance: float, gap_tolerance: float, most: int, functions: list[UserFunction],
+    callback: Callable[[Iteration], object] | None,
+) -> tuple[list[Iteration], Status, str]:  # fmt: skip
+    """Iterate until convergence, `most` times at most; return the log, the status, and where it failed."""
     iterations: list[Iteration] = []
-    for number in range(1, limits.max_iterations + 1):
-        clock, last = time.perf_counter(), number == limits.max_iterations
+    for number in range(1, most + 1):
+        clock, last = time.perf_counter(), number == most
         try:
             solver.passes()
         except IntegrationFailure as failure:
             return iterations, failure.status, _at(f"{solver.where} of iteration {number}", failure)
         escape = solver.rollout()
         improvement = solver.improvement(iterations[-1].cost if iterations else math.inf)
-        settled = abs(improvement) < limits.tolerance and solver.gap < limits.gap_tolerance
+        settled = abs(improvement) < tolerance and solver.gap < gap_tolerance
         row = Iteration(
             cost=solver.cost, improvement=improvement, gap=solver.gap,
             optimality=solver.optimality() if settled or last else math.nan, dynamics_residual=math.nan, violation=0.0,
@@ -395,7 +336,7 @@ def _iterate(
             callback(row)
         if (error := interrupt_of(functions)) is not None:
             raise error
-        if settled and row.optimality < limits.tolerance:
+        if settled and row.optimality < tolerance:
             return iterations, Status.CONVERGED, ""
         if last and escape is not None:
             return iterations, Status.DIVERGED, _at(f"rollout of iteration {number}", escape)
