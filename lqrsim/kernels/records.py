@@ -1,17 +1,43 @@
 """Arguments of kernels: named tuples of arrays and numbers, and rows with named fields for states and logs.
 
-T is the number of steps. Kernels see an array as a pointer to blocks of constant shape, and a tuple of vectors as a
-table of addresses; see `codegen/language.py`. An address is a float64, which represents all integers up to 2^53.
+Annotations give the shapes of arrays that `zeros_of` makes: T is the number of steps, R that of the rows of constraints
+and limits at a step, and K = (T+1) R. Kernels see an array as a pointer to blocks of constant shape, and a tuple of
+vectors as a table of addresses; see `codegen/language.py`. An address is a float64, which represents all integers up to
+2^53.
 """
 
+import functools
+from collections.abc import Mapping
 from math import inf
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
 
 Arrays = Any  # an ndarray for Python, a pointer for compiled code
 StructuredArray = npt.NDArray[np.void]  # its dtype is one of those at the end of this file
+Record = TypeVar("Record", bound=tuple[Any, ...])
+
+
+def zeros_of(kind: type[Record], given: Mapping[str, Any] | None = None, /, **sizes: int) -> Record:
+    """A record of what is given, and of arrays of zeros, as large as its annotations say for these sizes."""
+    own = given or {}
+    return kind(*(own[name] if name in own else _zeros(hint, sizes) for name, hint in _hints(kind).items()))
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _zeros(hint: Any, sizes: Mapping[str, int]) -> Any:
+    """An array of zeros; or a record of these, all of one size if the annotation says so."""
+    if get_origin(hint) is not Annotated:
+        return zeros_of(hint, **sizes)
+    kind, (text,) = hint.__origin__, hint.__metadata__
+    pairs = (one.partition("+") for one in text.split())
+    shape = [(int(name) if name.isdigit() else sizes[name]) + int(more or 0) for name, _, more in pairs]
+    return np.zeros(shape) if kind is Arrays else kind(*(np.zeros(shape) for _ in kind._fields))
 
 
 class Limits(NamedTuple):
@@ -97,53 +123,54 @@ class ProblemModel(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """States (T+1, N) and controls (T, M)."""
+    """States and controls."""
 
-    states: Arrays
-    controls: Arrays
+    states: Annotated[Arrays, "T+1 N"]
+    controls: Annotated[Arrays, "T M"]
 
 
 class Policy(NamedTuple):
-    """The policy u = L x + l: gains L (T, M, N) and offsets l (T, M)."""
+    """The policy u = L x + l: gains L and offsets l."""
 
-    gain: Arrays
-    offset: Arrays
+    gain: Annotated[Arrays, "T M N"]
+    offset: Annotated[Arrays, "T M"]
 
 
 class CostToGo(NamedTuple):
-    """1/2 x'S x + s'x + s0: S (T+1, N, N), s (T+1, N) and s0 (T+1,)."""
+    """1/2 x'S x + s'x + s0: S, s and s0."""
 
-    hessian: Arrays
-    gradient: Arrays
-    constant: Arrays
+    hessian: Annotated[Arrays, "T+1 N N"]
+    gradient: Annotated[Arrays, "T+1 N"]
+    constant: Annotated[Arrays, "T+1"]
 
 
 class CostToCome(NamedTuple):
-    """Covariances and means in the dual form, Sbar and sbar in the primal form: (T+1, N, N), (T+1, N), (T+1,)."""
+    """Covariances and means in the dual form, Sbar and sbar in the primal form."""
 
-    matrix: Arrays
-    vector: Arrays
-    constant: Arrays
+    matrix: Annotated[Arrays, "T+1 N N"]
+    vector: Annotated[Arrays, "T+1 N"]
+    constant: Annotated[Arrays, "T+1"]
 
 
 class SmootherGains(NamedTuple):
     """The maps from the smoothed state at t + 1 to the state and control at t.
 
     In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`. In the
-    primal form the control is `control_gain x + control`, the inverse policy, and the others are not used.
+    primal form the control is `control_gain x + control`, the inverse policy, and the others are not used: S is then 1
+    instead of T.
     """
 
-    state_gain: Arrays
-    state: Arrays
-    control_gain: Arrays
-    control: Arrays
+    state_gain: Annotated[Arrays, "S N N"]
+    state: Annotated[Arrays, "S N"]
+    control_gain: Annotated[Arrays, "T M N"]
+    control: Annotated[Arrays, "T M"]
 
 
 class Prior(NamedTuple):
-    """`1/2 (x - about)' diag(weight) (x - about)` at t >= 1: weight (N,), about (T+1, N)."""
+    """`1/2 (x - about)' diag(weight) (x - about)` at t >= 1."""
 
-    weight: Arrays
-    about: Arrays
+    weight: Annotated[Arrays, "N"]
+    about: Annotated[Arrays, "T+1 N"]
 
 
 class Linearization(NamedTuple):
@@ -212,77 +239,77 @@ class StageModels(NamedTuple):
     """Models of all stages at a plan, which need not satisfy the dynamics.
 
     Attributes:
-      hessian: (T+1, W, W) of the Lagrangian. convex: (T+1, W, W) of the cost alone, projected.
-      gradient: (T+1, W) of the cost. jacobian: (T, N, W) of the steps. arrived: (T, N) next states.
-      slopes: ((T+1) size, W) gradients of the constraints' rows.
-      learned: (T+1, W, W) what secants say that the Hessians lack; see `secants.py`.
+      hessian: of the Lagrangian. convex: of the cost alone, projected. gradient: of the cost.
+      jacobian: of the steps. arrived: next states. slopes: gradients of the rows.
+      learned: what secants say that the Hessians lack; see `secants.py`.
     """
 
-    hessian: Arrays
-    convex: Arrays
-    gradient: Arrays
-    jacobian: Arrays
-    arrived: Arrays
-    slopes: Arrays
-    learned: Arrays
+    hessian: Annotated[Arrays, "T+1 W W"]
+    convex: Annotated[Arrays, "T+1 W W"]
+    gradient: Annotated[Arrays, "T+1 W"]
+    jacobian: Annotated[Arrays, "T N W"]
+    arrived: Annotated[Arrays, "T N"]
+    slopes: Annotated[Arrays, "K W"]
+    learned: Annotated[Arrays, "T+1 W W"]
 
 
 class StageRows(NamedTuple):
-    """The rows of all constraints, then those of the control limits, `size` at each step.
+    """The rows of all constraints, then those of the control limits, R at each step.
 
     Attributes:
-      limits: (size, 5) for rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and
-        its value. For rows of constraints: the distance between their bounds, and whether they are linear.
-      first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
-      acts, live: ((T+1) size,) 1 for rows that can act, and for those that do at the plan, else 0.
-      held: ((T+1) size,) what rows do in an active set; see `active_set.py`.
-      kinds: ((T+1) size,) INEQUALITY, LIMIT or EQUALITY. sizes: typical sizes. targets: the values at which rows are
-        held. prices: the largest multipliers, infinite unless the row is elastic.
-      numbers: ((T+1) size,) values. force: multipliers.
+      size: R.
+      limits: for rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and its value.
+        For rows of constraints: the distance between their bounds, and whether they are linear.
+      first: the first row of each constraint, of C. support: 0 where a row does not depend on that entry.
+      acts, live: 1 for rows that can act, and for those that do at the plan, else 0.
+      held: what rows do in an active set; see `active_set.py`.
+      kinds: INEQUALITY, LIMIT or EQUALITY. sizes: typical sizes. targets: the values at which rows are held.
+      prices: the largest multipliers, infinite unless the row is elastic.
+      numbers: values. force: multipliers.
     """
 
     size: int
-    limits: Arrays
-    first: Arrays
-    support: Arrays
-    acts: Arrays
-    live: Arrays
-    held: Arrays
-    kinds: Arrays
-    sizes: Arrays
-    targets: Arrays
-    prices: Arrays
-    numbers: Arrays
-    force: Arrays
+    limits: Annotated[Arrays, "R 5"]
+    first: Annotated[Arrays, "C"]
+    support: Annotated[Arrays, "R W"]
+    acts: Annotated[Arrays, "K"]
+    live: Annotated[Arrays, "K"]
+    held: Annotated[Arrays, "K"]
+    kinds: Annotated[Arrays, "K"]
+    sizes: Annotated[Arrays, "K"]
+    targets: Annotated[Arrays, "K"]
+    prices: Annotated[Arrays, "K"]
+    numbers: Annotated[Arrays, "K"]
+    force: Annotated[Arrays, "K"]
 
 
 class PlanStages(NamedTuple):
     """A problem as stages about a plan: its numbers, its models and rows, and the last step.
 
     Attributes:
-      steps: T. soft: 1 if there is an initial cost. free: (N,) 0 for the states that the start fixes, else 1.
-      jumps: (T+1,) 1 at the knots at which the last state is free again, as the start is: it may jump there. At the
-        start, whether there are any. reset: (T+1, N+1) the law of its change there.
-      reach: (N,) distances from the start to the goal. state_size, control_size: (N,) and (M,) typical sizes.
-      projected: (1,) 1 if the projected Hessians are those of the last plan.
-      keeps: (1,) 1 if models of a plan keep the derivatives of the dynamics that are there.
-      learns: 1 if the dynamics have no second derivatives. slow: (1,) 1 if the Hessians have what is learned of them.
+      steps: T. soft: 1 if there is an initial cost. free: 0 for the states that the start fixes, else 1.
+      jumps: 1 at the knots at which the last state is free again, as the start is: it may jump there. At the start,
+        whether there are any. reset: the law of its change there.
+      reach: distances from the start to the goal. state_size, control_size: typical sizes.
+      projected: 1 if the projected Hessians are those of the last plan.
+      keeps: 1 if models of a plan keep the derivatives of the dynamics that are there.
+      learns: 1 if the dynamics have no second derivatives. slow: 1 if the Hessians have what is learned of them.
       values: a vector for each constraint.
       policy, to_go, changes: see `direction` of `stages.py`.
     """
 
     steps: int
     soft: int
-    free: Arrays
-    jumps: Arrays
-    reset: Arrays
-    reach: Arrays
-    state_size: Arrays
-    control_size: Arrays
-    projected: Arrays
-    keeps: Arrays
+    free: Annotated[Arrays, "N"]
+    jumps: Annotated[Arrays, "T+1"]
+    reset: Annotated[Arrays, "T+1 N+1"]
+    reach: Annotated[Arrays, "N"]
+    state_size: Annotated[Arrays, "N"]
+    control_size: Annotated[Arrays, "M"]
+    projected: Annotated[Arrays, "1"]
+    keeps: Annotated[Arrays, "1"]
     learns: int
-    slow: Arrays
+    slow: Annotated[Arrays, "1"]
     model: ProblemModel
     values: Any
     rows: StageRows
@@ -293,54 +320,54 @@ class PlanStages(NamedTuple):
 
 
 class ActiveSetArrays(NamedTuple):
-    """All arrays of an active set, with K = (T+1) size rows.
+    """All arrays of an active set.
 
     Attributes:
-      plan: the iterate, a Motion. costates: (T+1, N) and gaps: (T, N) there. out, limits: of its rollout.
-      curves, forces: (K,) see `direction` of `stages.py`. pressing: (K,) multipliers after a step.
-      wrong: (K,) relative distance by which a row is on the wrong side after a step, negative; else 0.
-      before, chosen: (K,) the rows that were held before the step, and that convex models choose.
+      plan: the iterate. costates, gaps: there. out, limits: of its rollout.
+      curves, forces: see `direction` of `stages.py`. pressing: multipliers after a step.
+      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
+      before, chosen: the rows that were held before the step, and that convex models choose.
     """
 
     plan: Motion
-    costates: Arrays
-    gaps: Arrays
+    costates: Annotated[Arrays, "T+1 N"]
+    gaps: Annotated[Arrays, "T N"]
     out: Motion
-    limits: Limits
-    curves: Arrays
-    forces: Arrays
-    pressing: Arrays
-    wrong: Arrays
-    before: Arrays
-    chosen: Arrays
+    limits: Annotated[Limits, "T M"]
+    curves: Annotated[Arrays, "K"]
+    forces: Annotated[Arrays, "K"]
+    pressing: Annotated[Arrays, "K"]
+    wrong: Annotated[Arrays, "K"]
+    before: Annotated[Arrays, "K"]
+    chosen: Annotated[Arrays, "K"]
 
 
 class Slacks(NamedTuple):
-    """The two slacks of each row d, or numbers that belong to these: `d = slack - excess`, ((T+1) size,) each.
+    """The two slacks of each row d, or numbers that belong to these: `d = slack - excess`.
 
     A row without a price has no excess, and an equality without a price has neither.
     """
 
-    slack: Arrays
-    excess: Arrays
+    slack: Annotated[Arrays, "K"]
+    excess: Annotated[Arrays, "K"]
 
 
 class PlanPoint(NamedTuple):
-    """A plan, the states at which its steps arrive (T, N), the values of its rows ((T+1) size,), and their slacks."""
+    """A plan, the states at which its steps arrive, the values of its rows, and their slacks."""
 
     plan: Motion
-    arrived: Arrays
-    numbers: Arrays
+    arrived: Annotated[Arrays, "T N"]
+    numbers: Annotated[Arrays, "K"]
     slacks: Slacks
 
 
 class PlanStep(NamedTuple):
-    """A step in plan, slacks and multipliers ((T+1) size,), and the costates (T+1, N) after it."""
+    """A step in plan, slacks and multipliers, and the costates after it."""
 
     changes: Motion
     slacks: Slacks
-    force: Arrays
-    costates: Arrays
+    force: Annotated[Arrays, "K"]
+    costates: Annotated[Arrays, "T+1 N"]
 
 
 class PlanBeginning(NamedTuple):
@@ -362,65 +389,64 @@ class PlanBeginning(NamedTuple):
 
 
 class InteriorArrays(NamedTuple):
-    """All arrays of an interior point, with K = (T+1) size rows.
+    """All arrays of an interior point.
 
     Attributes:
-      now: the iterate. costates: (T+1, N) there. gaps: (T, N) there.
+      now: the iterate. costates, gaps: there.
       tried, closer: trials of a line search. kept, kept_force, kept_costates: a point to go back to.
       step: the step of an iteration. other: another that may take its place.
-      curves, forces: (K,) see `direction` of `stages.py`.
+      curves, forces: see `direction` of `stages.py`.
       corrections, others: corrections of the products of slacks and multipliers.
-      beyond: (K,) further residuals of the rows. wider: (T, N) further gaps.
-      moves, turns: (T+1, W) the last step, and the change of the Lagrangian's gradients by it.
+      beyond: further residuals of the rows. wider: further gaps.
+      moves, turns: the last step, and the change of the Lagrangian's gradients by it.
       active: the arrays of the crossover to an active set. active_memory: (1,) row of `ACTIVE_SET`.
-      filter: (any, 2) violations and merits that a trial must not both exceed. errors: (LATELY,) the last errors.
+      filter: violations and merits that a trial must not both exceed, any number. errors: the last LATELY errors.
     """
 
     now: PlanPoint
-    costates: Arrays
-    gaps: Arrays
+    costates: Annotated[Arrays, "T+1 N"]
+    gaps: Annotated[Arrays, "T N"]
     tried: PlanPoint
     closer: PlanPoint
     kept: PlanPoint
-    kept_force: Arrays
-    kept_costates: Arrays
+    kept_force: Annotated[Arrays, "K"]
+    kept_costates: Annotated[Arrays, "T+1 N"]
     step: PlanStep
     other: PlanStep
-    curves: Arrays
-    forces: Arrays
+    curves: Annotated[Arrays, "K"]
+    forces: Annotated[Arrays, "K"]
     corrections: Slacks
     others: Slacks
-    beyond: Arrays
-    wider: Arrays
-    moves: Arrays
-    turns: Arrays
+    beyond: Annotated[Arrays, "K"]
+    wider: Annotated[Arrays, "T N"]
+    moves: Annotated[Arrays, "T+1 W"]
+    turns: Annotated[Arrays, "T+1 W"]
     active: ActiveSetArrays
     active_memory: Arrays
-    filter: Arrays
-    errors: Arrays
+    filter: Annotated[Arrays, "0 2"]
+    errors: Annotated[Arrays, "LATELY"]
 
 
 class RestorationArrays(NamedTuple):
-    """All arrays of a restoration, with K = (T+1) size rows.
+    """All arrays of a restoration.
 
     Attributes:
-      plan: the iterate, a trajectory. trial: of the line search. limits: of the controls in one step, (T, M) each.
-      costates: (T+1, N). gaps: (T, N) zero. arrived: (T, N) and numbers: (K,) of the trial.
-      curves: (K,) see `direction` of `stages.py`. duals, aims: (K,) multipliers, and those after the whole step.
-      shares: (K,) multipliers relative to the price.
+      plan: the iterate, a trajectory. trial: of the line search. limits: of the controls in one step.
+      gaps: zero. arrived, numbers: of the trial. curves: see `direction` of `stages.py`.
+      duals, aims: multipliers, and those after the whole step. shares: multipliers relative to the price.
     """
 
     plan: Motion
     trial: Motion
-    limits: Limits
-    costates: Arrays
-    gaps: Arrays
-    arrived: Arrays
-    numbers: Arrays
-    curves: Arrays
-    duals: Arrays
-    aims: Arrays
-    shares: Arrays
+    limits: Annotated[Limits, "T M"]
+    costates: Annotated[Arrays, "T+1 N"]
+    gaps: Annotated[Arrays, "T N"]
+    arrived: Annotated[Arrays, "T N"]
+    numbers: Annotated[Arrays, "K"]
+    curves: Annotated[Arrays, "K"]
+    duals: Annotated[Arrays, "K"]
+    aims: Annotated[Arrays, "K"]
+    shares: Annotated[Arrays, "K"]
 
 
 class EliminatedControl(NamedTuple):
@@ -503,15 +529,15 @@ class SmootherArrays(NamedTuple):
     """All arrays of a smoother.
 
     Attributes:
-      start: (N,) the first state. x_hat: (N,) the smoothed state that a pass has reached. x_hats: (T+1, N) all of them.
+      start: the first state. x_hat: the smoothed state that a pass has reached. x_hats: all of them.
       homotopy_scaled: the stage cost of the passes; not the true one in the first iterations of a homotopy.
       given: the trajectory that guides the first pass. best: the best one so far. last: that of the last policy.
       certificate: (1,) row of `CERTIFICATE`.
     """
 
-    start: Arrays
-    x_hat: Arrays
-    x_hats: Arrays
+    start: Annotated[Arrays, "N"]
+    x_hat: Annotated[Arrays, "N"]
+    x_hats: Annotated[Arrays, "T+1 N"]
     policy: Policy
     to_go: CostToGo
     to_come: CostToCome
@@ -724,13 +750,13 @@ class PassWork(NamedTuple):
 
 
 class RiccatiArrays(NamedTuple):
-    """Results of the passes of a linear-quadratic problem; x_hats (T+1, N) are the smoothed states."""
+    """Results of the passes of a linear-quadratic problem; `x_hats` are the smoothed states."""
 
     policy: Policy
     to_go: CostToGo
     to_come: CostToCome
     smoothing: SmootherGains
-    x_hats: Arrays
+    x_hats: Annotated[Arrays, "T+1 N"]
 
 
 class Predictor(NamedTuple):

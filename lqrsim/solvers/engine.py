@@ -14,7 +14,7 @@ import numpy as np
 from lqrsim.codegen.compiled_module import Call, in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels import declarations, records
+from lqrsim.kernels import declarations
 from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import (
     CERTIFICATE,
@@ -30,8 +30,10 @@ from lqrsim.kernels.records import (
     Policy,
     Prior,
     ProblemModel,
+    SmootherArrays,
     SmootherGains,
     StructuredArray,
+    zeros_of,
 )
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of
@@ -775,32 +777,17 @@ class Workspace:
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        n, steps, zeros = len(start), problem.steps, np.zeros
-        m = initial_guess.offset.shape[1]
         self.dual = settings.form == "dual"
         self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
         self._evaluation: Call | None = None
         self._rollout: Call | None = None
-        self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
-        self.memory_rows = zeros(1, MEMORY)
+        self.memory_rows = np.zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
-        kept = steps if self.dual else 1  # the primal form restores the state without it
-
-        def plan() -> Motion:
-            return Motion(zeros((steps + 1, n)), zeros((steps, m)))
-
-        def policy() -> Policy:
-            return Policy(zeros((steps, m, n)), zeros((steps, m)))
-
-        self.arrays = records.SmootherArrays(
-            start=zeros(n), x_hat=zeros(n), x_hats=zeros((steps + 1, n)), policy=policy(),
-            to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
-            to_come=CostToCome(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
-            smoothing=SmootherGains(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
-            homotopy_scaled=None, prior=self.no_prior, given=plan(), best=plan(), last=plan(), last_policy=policy(),
-            certificate=zeros(1, CERTIFICATE),
-        )  # fmt: skip
-        self.start, self.trial = self.arrays.start, plan()
+        sizes = {"T": problem.steps, "N": len(start), "M": initial_guess.offset.shape[1]}
+        self.no_prior = zeros_of(Prior, **sizes)
+        stated = {"homotopy_scaled": None, "prior": self.no_prior, "certificate": np.zeros(1, CERTIFICATE)}
+        self.arrays = zeros_of(SmootherArrays, stated, **sizes, S=problem.steps if self.dual else 1)
+        self.start, self.trial = self.arrays.start, zeros_of(Motion, **sizes)
         self.best, self.last = self.arrays.best, self.arrays.last
         self.begin(problem, settings, initial_guess, start)
 

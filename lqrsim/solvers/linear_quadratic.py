@@ -1,21 +1,13 @@
 """LQR smoothing of linear-quadratic problems: Sec. IV of the paper."""
 
 import time
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
 from lqrsim.annotations import OneOf, Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_memory
-from lqrsim.kernels.records import (
-    CostToCome,
-    CostToGo,
-    LinearStep,
-    Policy,
-    QuadraticStage,
-    RiccatiArrays,
-    SmootherGains,
-)
+from lqrsim.kernels.records import LinearStep, QuadraticStage, RiccatiArrays, zeros_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.archive import sha256
@@ -58,13 +50,13 @@ def smooth_lq(
     """
     clock = time.perf_counter()
     parts = _parts(stage)
-    passes = _passes(parts, initial, final, form)
-    start, detail = _start(passes, initial)
-    states, controls, value = _rollout(parts, passes.law, start)
+    passes, failure = _passes(parts, initial, final, form)
+    start, detail = _start(passes, failure, initial)
+    states, controls, value = _rollout(parts, passes.policy, start)
     value += float(final(states[-1])) + _cost_at(initial, states[0])
     gap, residual, optimality = np.inf, np.inf, np.inf
     if not detail:
-        promised = float(Quadratic(*(part[0] for part in passes.cost_to_go))(start)) + _cost_at(initial, start)
+        promised = float(Quadratic(*(part[0] for part in passes.to_go))(start)) + _cost_at(initial, start)
         with np.errstate(all="ignore"):
             optimality = abs(value - promised) / max(abs(value), 1e-28 * _size(parts, initial, final), 1e-300)
             gap, residual = _off_plan(parts, passes, states)
@@ -74,6 +66,7 @@ def smooth_lq(
     whole = solved and max(gap, residual) < ACCURACY
     if solved and not whole:
         detail = f"the states of least total cost are {gap:.1g} off the plan, so the cost-to-come is left out"
+    exact = dict.fromkeys(("start", "dynamics_residual", "policy_residual", "limits", "violation"), 0.0)  # a rollout
     iteration = Iteration(
         cost=value, improvement=np.inf, gap=gap, optimality=optimality, dynamics_residual=residual, violation=0.0,
         seconds=time.perf_counter() - clock, method="smooth",
@@ -82,23 +75,14 @@ def smooth_lq(
         status=Status.CONVERGED if solved else Status.NOT_POSITIVE_DEFINITE,
         detail=detail,
         remedy="" if solved else Status.NOT_POSITIVE_DEFINITE.remedy,
-        policy=_policy(*passes.law, states[:-1].copy(), dt),
-        inverse_policy=_policy(*passes.inverse_law, states[1:].copy(), dt) if whole and form == "primal" else None,
-        cost_to_go=Quadratic(*passes.cost_to_go) if solved else None,
-        cost_to_come=(Moments if form == "dual" else Quadratic)(*passes.cost_to_come) if whole else None,
+        policy=_policy(*passes.policy, states[:-1].copy(), dt),
+        inverse_policy=_policy(*passes.smoothing[2:], states[1:].copy(), dt) if whole and form == "primal" else None,
+        cost_to_go=Quadratic(*passes.to_go) if solved else None,
+        cost_to_come=(Moments if form == "dual" else Quadratic)(*passes.to_come) if whole else None,
         trajectory=Trajectory(states, controls, dt),
         iterations=(iteration,) if solved else (),
         clearance=None,
-        # The plan is the rollout that was just made.
-        certificate=Certificate(
-            cost=value,
-            start=0.0,
-            dynamics_residual=0.0,
-            policy_residual=0.0,
-            limits=0.0,
-            violation=0.0,
-            optimality=optimality,
-        ),
+        certificate=Certificate(cost=value, optimality=optimality, **exact),
         gap=gap,
         solver="smooth_lq",
         options={"form": form},
@@ -114,26 +98,13 @@ ACCURACY = 1e-6
 _WHICH = ("backward pass", "forward pass", "minimum of the total cost")
 
 
-class _Passes(NamedTuple):
-    """Results of the passes.
+def _passes(
+    parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic, form: str
+) -> tuple[RiccatiArrays, str]:
+    """Do one backward and one forward pass; return also the pass that failed, and the step, or an empty text.
 
-    Attributes:
-      law, inverse_law: gain (T, m, n) and offset (T, m).
-      cost_to_go, cost_to_come: the fields of a `Quadratic`; in the dual form, cost_to_come has the fields of `Moments`.
-      x_hat: (T+1, n), the states of least total cost.
-      failure: the pass that failed, and the step; empty if none failed.
+    Raises InputError for an end cost, or an A, that the form cannot handle.
     """
-
-    law: tuple[Array, Array]
-    inverse_law: tuple[Array, Array]
-    cost_to_go: tuple[Array, Array, Array]
-    cost_to_come: tuple[Array, Array, Array]
-    x_hat: Array
-    failure: str
-
-
-def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic, form: str) -> _Passes:
-    """Do one backward and one forward pass. Raises InputError for an end cost, or an A, that the form cannot handle."""
     A, B, c, Q, P, R, q, r, constant = parts
     steps, n, m = B.shape
     check_memory("stage: steps", steps, 8 * (6 * n * n + 5 * m * n + 3 * m * m))
@@ -141,39 +112,36 @@ def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
     inverse, c_inverse = (jacobian, c.copy()) if form == "dual" else _inverse(A, B, c)
     cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))
     slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
-    go = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-    come = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-    go[0][-1], go[1][-1], go[2][-1] = check_end("final", final, n)
-    come[0][0], come[1][0], come[2][0] = _initial_cost_to_come(initial, n, form)
-    law = np.zeros((steps, m, n)), np.zeros((steps, m))
-    back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
-    x_hat = np.zeros((steps + 1, n))
+    found = zeros_of(RiccatiArrays, T=steps, N=n, M=m, S=steps)
+    for array, end in zip(found.to_go, check_end("final", final, n), strict=True):
+        array[-1] = end
+    for array, begin in zip(found.to_come, _initial_cost_to_come(initial, n, form), strict=True):
+        array[0] = begin
     failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
         steps, LinearStep(jacobian, c.copy()), LinearStep(inverse, c_inverse), QuadraticStage(cost, slope),
-        constant.copy(), RiccatiArrays(Policy(*law), CostToGo(*go), CostToCome(*come), SmootherGains(*back), x_hat),
+        constant.copy(), found,
     )  # fmt: skip
     failure = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
     if failed >= 0 and form == "dual" and which > 0:
         failure += '; form="primal" may do'
-    return _Passes(law, back[2:], go, come, x_hat, failure)
+    return found, failure
 
 
-def _start(passes: _Passes, initial: Quadratic | FixedState) -> tuple[Array, str]:
+def _start(passes: RiccatiArrays, failure: str, initial: Quadratic | FixedState) -> tuple[Array, str]:
     """The state of least total cost at step 0, and a reason if there is none, else an empty text."""
-    if passes.failure or isinstance(initial, FixedState):
-        return passes.x_hat[0], passes.failure
+    if failure or isinstance(initial, FixedState):
+        return passes.x_hats[0], failure
     # If every step of the cost-to-go is definite, this alone ensures a unique minimum.
-    hessian, gradient = passes.cost_to_go[0][0], passes.cost_to_go[1][0]
-    curve = initial.hessian + hessian
+    curve = initial.hessian + passes.to_go.hessian[0]
     if not np.linalg.eigvalsh(curve)[0] > 0:
-        return passes.x_hat[0], "minimum of the total cost, step 0"
-    return -np.linalg.solve(curve, initial.gradient + gradient), ""
+        return passes.x_hats[0], "minimum of the total cost, step 0"
+    return -np.linalg.solve(curve, initial.gradient + passes.to_go.gradient[0]), ""
 
 
-def _off_plan(parts: tuple[Array, ...], passes: _Passes, states: Array) -> tuple[float, float]:
-    """Gap and dynamics residual of x_hat; see `Iteration`."""
+def _off_plan(parts: tuple[Array, ...], passes: RiccatiArrays, states: Array) -> tuple[float, float]:
+    """Gap and dynamics residual of the states of least total cost; see `Iteration`."""
     A, B, c = parts[:3]
-    x_hat, (gain, offset) = passes.x_hat, passes.law
+    x_hat, (gain, offset) = passes.x_hats, passes.policy
     scale = np.maximum(np.ptp(states, axis=0), 1.0)
     gap = float((np.abs(x_hat - states) / scale).max())
     u_hat = np.einsum("tij,tj->ti", gain, x_hat[:-1]) + offset

@@ -8,7 +8,7 @@ to do with the rows: the interior point, the active set, and the restoration.
 import functools
 import threading
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,21 +24,14 @@ from lqrsim.kernels.records import (
     MEASURES,
     RESTORATION,
     ActiveSetArrays,
-    CostToGo,
     InteriorArrays,
-    Limits,
     Motion,
     PlanBeginning,
-    PlanPoint,
     PlanStages,
-    PlanStep,
-    Policy,
-    ProblemModel,
     RestorationArrays,
-    Slacks,
-    StageModels,
     StageRows,
     StructuredArray,
+    zeros_of,
 )
 from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, RANGE, SIDE, SIGN, STRAIGHT
 from lqrsim.problem.problem import FixedState, Problem
@@ -71,32 +64,22 @@ class Stages:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._shape = self.n, self.m, steps, counts, lower, upper = _shape(problem)
-        n, m = self.n, self.m
+        self._shape = n, m, steps, counts, lower, upper = _shape(problem)
+        rows, self.n, self.m = sum(counts) + len(lower) + len(upper), n, m
+        self._lengths = {"T": steps, "N": n, "M": m, "W": n + m, "R": rows, "K": (steps + 1) * rows, "C": len(counts)}
         self._module = module_of(source_of(kernel), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
-        zeros, unread, rows = np.zeros, cast(ProblemModel, None), sum(counts) + len(lower) + len(upper)
-        self.slopes, self.numbers = zeros((steps + 1, rows, n + m)), zeros((steps + 1, rows))
-        of_rows = [zeros((steps + 1, rows)) for _ in range(8)]
-        self._acts, self._live, self.held, self._kinds, self._sizes, self._targets, self._prices, self.force = of_rows
-        self.models = StageModels(
-            zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m)),
-            zeros((steps, n, n + m)), zeros((steps, n)), self.slopes.reshape(-1, n + m),
-            zeros((steps + 1, n + m, n + m)),
-        )  # fmt: skip
-        self.about = PlanStages(
-            steps, 0, zeros(n), zeros(steps + 1), zeros((steps + 1, n + 1)), zeros(n), np.ones(n), np.ones(m), zeros(1),
-            zeros(1), 0, zeros(1), unread,
-            tuple(zeros((steps + 1) * count) for count in counts),
-            StageRows(
-                rows, np.full((rows, 5), np.inf), np.cumsum([0, *counts])[:-1].astype(np.float64),
-                zeros((rows, n + m)),
-                *(one.reshape(-1) for one in (*of_rows[:-1], self.numbers, self.force)),
-            ),
-            self.models, Policy(zeros((steps, m, n)), zeros((steps, m))),
-            CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
-            Motion(zeros((steps + 1, n)), zeros((steps, m))),
-        )  # fmt: skip
+        own = zeros_of(StageRows, {"size": rows}, **self._lengths)
+        own.limits[...], own.first[...] = np.inf, np.cumsum([0, *counts])[:-1]
+        values = tuple(np.zeros((steps + 1) * count) for count in counts)
+        stated = {"steps": steps, "soft": 0, "learns": 0, "model": None, "values": values, "rows": own}
+        self.about = zeros_of(PlanStages, stated, **self._lengths)
+        self.about.state_size[...], self.about.control_size[...] = 1.0, 1.0
+        self.models = self.about.models
+        self.slopes = self.models.slopes.reshape(steps + 1, rows, n + m)
+        by_step = (one.reshape(steps + 1, rows) for one in own[4:])
+        self._acts, self._live, self.held, self._kinds, self._sizes, self._targets, self._prices, *others = by_step
+        self.numbers, self.force = others
         self._take(problem)
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign
@@ -269,55 +252,21 @@ class Stages:
 
     # The memory of the methods; solves of one structure use it in turn.
 
-    def _motion(self) -> Motion:
-        return Motion(np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m)))
-
-    def _rows(self, count: int) -> tuple[Array, ...]:
-        return tuple(np.zeros(self.live.size) for _ in range(count))
-
-    def _knots(self) -> tuple[Array, Array]:
-        """Costates and gaps."""
-        return np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.n))
-
-    def _bounds(self) -> Limits:
-        return Limits(np.zeros((self.steps, self.m)), np.zeros((self.steps, self.m)))
-
     @functools.cached_property
     def active_set(self) -> tuple[ActiveSetArrays, StructuredArray]:
         """Arrays of an active set, and its state between calls."""
-        arrays = ActiveSetArrays(self._motion(), *self._knots(), self._motion(), self._bounds(), *self._rows(6))
-        return arrays, np.zeros(1, ACTIVE_SET)
+        return zeros_of(ActiveSetArrays, **self._lengths), np.zeros(1, ACTIVE_SET)
 
     @functools.cached_property
     def interior(self) -> tuple[InteriorArrays, StructuredArray]:
         """The same of an interior point."""
-
-        def point() -> PlanPoint:
-            return PlanPoint(self._motion(), self._knots()[1], self._rows(1)[0], Slacks(*self._rows(2)))
-
-        def step() -> PlanStep:
-            return PlanStep(self._motion(), Slacks(*self._rows(2)), self._rows(1)[0], self._knots()[0])
-
-        costates, gaps = self._knots()
-        kept_costates, wider = self._knots()
-        curves, forces, kept_force, beyond = self._rows(4)
-        active, active_memory = self.active_set
-        arrays = InteriorArrays(
-            now=point(), costates=costates, gaps=gaps, tried=point(), closer=point(), kept=point(),
-            kept_force=kept_force, kept_costates=kept_costates, step=step(), other=step(), curves=curves, forces=forces,
-            corrections=Slacks(*self._rows(2)), others=Slacks(*self._rows(2)), beyond=beyond, wider=wider,
-            moves=np.zeros_like(self.models.gradient), turns=np.zeros_like(self.models.gradient),
-            active=active, active_memory=active_memory, filter=np.zeros((0, 2)), errors=np.zeros(LATELY),
-        )  # fmt: skip
-        return arrays, np.zeros(1, INTERIOR)
+        crossover = dict(zip(("active", "active_memory"), self.active_set, strict=True))
+        return zeros_of(InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(1, INTERIOR)
 
     @functools.cached_property
     def restoration(self) -> tuple[RestorationArrays, StructuredArray]:
         """The same of a restoration."""
-        arrays = RestorationArrays(
-            self._motion(), self._motion(), self._bounds(), *self._knots(), self._knots()[1], *self._rows(5)
-        )
-        return arrays, np.zeros(1, RESTORATION)
+        return zeros_of(RestorationArrays, **self._lengths), np.zeros(1, RESTORATION)
 
 
 _Shape = tuple[int, int, int, tuple[int, ...], tuple[int, ...], tuple[int, ...]]
