@@ -1,10 +1,10 @@
 """Newton steps with an active set, to a nearby constrained optimum: after a small change of a problem, or a barrier.
 
-Written in the kernels' subset. Each step solves the quadratic problem of second-order models about the plan, with
-linearised dynamics and constraints; gaps between the steps of the plan close on the way. Most active rows are known,
-and are held at their targets. Pivoting finds the others: rows with a multiplier of the wrong sign are released, and
-violated rows are held. Of neighbouring steps only the worst row is held, because holding it usually satisfies them all.
-If the number of wrong rows does not decrease, rows change one at a time, which terminates for convex models.
+Each step solves the quadratic problem of second-order models about the plan, with linearised dynamics and constraints;
+gaps between the steps of the plan close on the way. Most active rows are known, and are held at their targets. Pivoting
+finds the others: rows with a multiplier of the wrong sign are released, and violated rows are held. Of neighbouring
+steps only the worst row is held, because holding it usually satisfies them all. If the number of wrong rows does not
+decrease, rows change one at a time, which terminates for convex models.
 
 Second-order models have a minimum only if the right rows are held. If the known rows are not enough, convex models
 choose the rows first. The step itself uses the largest fraction of the second-order terms with which a minimum exists.
@@ -15,7 +15,7 @@ A row whose price is too low to keep it does not press more than its price: it s
 from math import copysign, inf, isfinite, nan
 
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy, fill
+from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
 from lqrsim.kernels.rollouts import larger
 from lqrsim.kernels.stages import (
@@ -243,8 +243,8 @@ def take_step(violation, stages, work, mem):
     for at in range(rows.size * (stages.steps + 1)):
         force = work.pressing[at]
         rows.force[at] = force if rows.kinds[at] == EQUALITY else max(force, 0.0)
+    copy_matrix(stages.to_go.gradient, stages.steps + 1, N, work.costates)
     for t in range(stages.steps + 1):
-        copy(stages.to_go.gradient[t], N, work.costates[t])
         for i in range(N):
             work.plan.states[t, i] += changes.states[t, i]
         if t < stages.steps:
@@ -265,7 +265,7 @@ def roll_out(stages, work, mem):
     """
     rows, policy, limits = stages.rows, stages.policy, stages.model.limits
     hold(mem.scale / SOFTNESS, FIRMNESS * mem.scale, stages, work)
-    rung = regularised_direction(0, stages, work.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
+    rung = regularised_direction(stages, work.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
     for t in range(stages.steps):
         for i in range(M):
             policy.offset[t, i] = 0.0

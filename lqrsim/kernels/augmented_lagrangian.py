@@ -1,4 +1,4 @@
-"""The augmented Lagrangian: the cost that is added for a constraint. Written in the kernels' subset.
+"""The augmented Lagrangian: the cost that is added for a constraint.
 
 For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 

@@ -1,4 +1,4 @@
-"""Certification of a plan, computed from the problem on a separate, short path. Written in the kernels' subset.
+"""Certification of a plan, computed from the problem on a separate, short path.
 
 It uses only the problem's functions, their derivatives and a Cholesky factor: nothing from the passes, rollouts and
 line searches that found the plan. The cost is the value that comes with the derivatives, not the sum from rollouts.

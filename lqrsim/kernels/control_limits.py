@@ -1,4 +1,4 @@
-"""Limits of the controls. Written in the kernels' subset.
+"""Limits of the controls.
 
 A control that is at a limit and would go beyond it is *fixed*: a constant in step and cost, without a gain.
 The backward pass determines which controls are fixed, by minimising within the limits at the expected state. The

@@ -1,7 +1,5 @@
 """The dual form: a Kalman filter for the moments of the cost-to-come, in which the control acts as process noise.
 
-Written in the kernels' subset.
-
 The cost-to-come is `1/2 (x - mean)' covariance^-1 (x - mean) + constant`. The covariance may be singular, and is zero
 at a fixed start; neither inverse dynamics nor an invertible A is needed. In the backward pass the costate, the gradient
 of the cost-to-go at the smoothed state, is propagated from each step to the previous step (the modified Bryson-Frazier

@@ -1,4 +1,4 @@
-"""The primal form of the paper: the cost-to-come as a quadratic, by inverse dynamics. Written in the kernels' subset.
+"""The primal form of the paper: the cost-to-come as a quadratic, by inverse dynamics.
 
 `cost_to_come_dual.py` has functions of the same names; `passes.py` is written against either. Paper: Eqs. (14)-(21).
 """

@@ -1,4 +1,4 @@
-"""One step of the Riccati recursion, from the cost-to-go at t + 1 to t. Written in the kernels' subset.
+"""One step of the Riccati recursion, from the cost-to-go at t + 1 to t.
 
 Paper: Eqs. (9)-(13), in discrete time. The step is linear and the cost quadratic in z = (x, u):
 

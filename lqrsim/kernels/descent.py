@@ -1,4 +1,4 @@
-"""Steps from a plan that lower its merit: the cost plus the augmented Lagrangian. Written in the kernels' subset.
+"""Steps from a plan that lower its merit: the cost plus the augmented Lagrangian.
 
 Newton's method and damped smoothing are one loop, `descend`; a `Descent` says which.
 

@@ -1,4 +1,4 @@
-"""Central differences, for functions that come without derivatives. Written in the kernels' subset.
+"""Central differences, for functions that come without derivatives.
 
 The step for first derivatives is the cube root of the machine precision: truncation and rounding errors are then both
 about 1e-10 of the function's size. The step for second derivatives of values is its fourth root.

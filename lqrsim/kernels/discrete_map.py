@@ -1,4 +1,4 @@
-"""The step of dynamics that are stated as a map, in place of a Runge-Kutta step. Written in the kernels' subset.
+"""The step of dynamics that are stated as a map, in place of a Runge-Kutta step.
 
 Here `rate` is the next state F(x, u). A map has no inverse: backwards in time the result is NaN, as by MuJoCo's steps.
 """

@@ -1,4 +1,4 @@
-"""The functions that Python calls: one for each solver, and single passes and rollouts. Written in the kernels' subset.
+"""The functions that Python calls: one for each solver, and single passes and rollouts.
 
 All code that a solve can need is compiled together, before the solve begins. Code that its parts share is compiled
 once.

@@ -1,4 +1,4 @@
-"""The steps of a Kalman filter for many trials at once, and derivatives along a plan. Written in the kernels' subset.
+"""The steps of a Kalman filter for many trials at once, and derivatives along a plan.
 
 An estimate is one row of Z numbers: the state x (N), the actuators' lagging controls (LAG: M numbers, or none), and the
 states of the unknowns' model (D). `output` times these are the unknowns: of P parameters of the dynamics, and of the

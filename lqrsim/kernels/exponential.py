@@ -1,4 +1,4 @@
-"""exp, computed by arithmetic alone. Written in the kernels' subset.
+"""exp, computed by arithmetic alone.
 
 Loops over it vectorise, which calls of the C library do not; and its bits are the same with every C library.
 """

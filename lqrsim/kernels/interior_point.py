@@ -1,11 +1,11 @@
 """Constraints by a primal-dual interior point with exact second derivatives, on states and controls at once.
 
-Written in the kernels' subset. Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a
-logarithmic barrier, subject to the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are
-closed on the way. The barrier parameter is reduced by Mehrotra's rule if the last step was long and the measures
-decrease. Otherwise it is reduced when the barrier problem is nearly solved. A filter decides how much of a step is
-taken (Waechter and Biegler, 2006). Corrections with the same models then reduce the residuals of a long step. If a
-model has no minimum, the ladder of `stages.py` gives it one.
+Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
+the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
+parameter is reduced by Mehrotra's rule if the last step was long and the measures decrease. Otherwise it is reduced
+when the barrier problem is nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006).
+Corrections with the same models then reduce the residuals of a long step. If a model has no minimum, the ladder of
+`stages.py` gives it one.
 
 A row d of an inequality means d >= 0, a row of an equality d = 0. Control limits are rows, too. The multiplier y of a
 row lies between a lower and an upper bound, and `d = s - p` has two slacks. The product of s and y - lower is the
@@ -33,7 +33,7 @@ from lqrsim.kernels.active_set import (
     take_step,
 )
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy
+from lqrsim.kernels.linear_algebra import copy, copy_matrix
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
@@ -65,10 +65,8 @@ REACH, FURTHER, OUTLIER = 0.5, 0.1, 10.0
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
 LEVELS = 4  # largest number of reductions of the barrier parameter at once
 NEARLY = 10.0  # residuals of a barrier problem that is nearly solved, relative to the parameter
-LOWER, POWER = (
-    0.2,
-    1.5,
-)  # factor by which the parameter then falls at least, and power of the parameter, if that is less
+# Factor by which the parameter then falls at least, and power of the parameter, if that is less.
+LOWER, POWER = 0.2, 1.5
 HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
 LEAST = 0.1  # least barrier parameter, relative to the tolerance
 HALF = 0.5  # the same where there is no crossover: of all rows together
@@ -419,7 +417,7 @@ def models_with_barrier(stages, work, mem):
                     width += slacks.excess[at] / below(at, rows)
             work.curves[at] = 1 / width
     pull_rows(False, work.corrections, stages, work, mem)
-    rung = regularised_direction(0, stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
+    rung = regularised_direction(stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
     if rung < 0:
         return False
     mem.rung, mem.share = float(rung), share_of(rung)
@@ -461,8 +459,8 @@ def complete(beyond, corrections, out, stages, work, mem):
     """Complete the step in `stages` by slacks and multipliers, (PlanStep)."""
     rows, slacks = stages.rows, work.now.slacks
     copy_plan(stages.steps, stages.changes, out.changes)
+    copy_matrix(stages.to_go.gradient, stages.steps + 1, N, out.costates)
     for t in range(stages.steps + 1):
-        copy(stages.to_go.gradient[t], N, out.costates[t])
         for row in range(rows.size):
             at = rows.size * t + row
             out.force[at], out.slacks.slack[at], out.slacks.excess[at] = 0.0, 0.0, 0.0
@@ -551,8 +549,7 @@ def centre(stages, work, mem):
         copy_slacks(count, work.other.slacks, step.slacks)
         copy(work.other.force, count, step.force)
         copy_plan(stages.steps, work.other.changes, step.changes)
-        for t in range(stages.steps + 1):
-            copy(work.other.costates[t], N, step.costates[t])
+        copy_matrix(work.other.costates, stages.steps + 1, N, step.costates)
 
 
 def lacking(product, mem):
@@ -863,8 +860,7 @@ def copy_point(source, target, stages):
     """Copy a point."""
     count = stages.rows.size * (stages.steps + 1)
     copy_plan(stages.steps, source.plan, target.plan)
-    for t in range(stages.steps):
-        copy(source.arrived[t], N, target.arrived[t])
+    copy_matrix(source.arrived, stages.steps, N, target.arrived)
     copy(source.numbers, count, target.numbers)
     copy_slacks(count, source.slacks, target.slacks)
 
@@ -874,8 +870,7 @@ def go_to(point, cost, least, stages, work, mem):
     """Go to a point of this cost; its multipliers up to `least` count as zero in the models."""
     copy_point(point, work.now, stages)
     mem.cost = cost
-    for t in range(stages.steps):
-        copy(point.arrived[t], N, stages.models.arrived[t])
+    copy_matrix(point.arrived, stages.steps, N, stages.models.arrived)
     look(stages, work.now.plan, work.costates, least)
     take_measures(stages, work, mem)
 
@@ -893,8 +888,7 @@ def go_back(stages, work, mem):
     """Go back to the point that was kept."""
     stages.keeps[0], mem.age = 0.0, 0.0
     copy(work.kept_force, stages.rows.size * (stages.steps + 1), stages.rows.force)
-    for t in range(stages.steps + 1):
-        copy(work.kept_costates[t], N, work.costates[t])
+    copy_matrix(work.kept_costates, stages.steps + 1, N, work.costates)
     go_to(work.kept, mem.kept, NEGLIGIBLE * mem.kept_scale, stages, work, mem)
 
 
@@ -904,8 +898,7 @@ def keep_point(stages, work, mem):
     copy_point(work.now, work.kept, stages)
     mem.kept, mem.kept_scale = mem.cost, mem.scale
     copy(stages.rows.force, stages.rows.size * (stages.steps + 1), work.kept_force)
-    for t in range(stages.steps + 1):
-        copy(work.costates[t], N, work.kept_costates[t])
+    copy_matrix(work.costates, stages.steps + 1, N, work.kept_costates)
 
 
 @compact
@@ -965,8 +958,7 @@ def cross(tolerance, violation, stages, work, mem):
     keep_point(stages, work, mem)
     copy_plan(stages.steps, work.now.plan, work.active.plan)
     copy(work.now.numbers, stages.rows.size * (stages.steps + 1), stages.rows.numbers)
-    for t in range(stages.steps + 1):
-        copy(work.costates[t], N, work.active.costates[t])
+    copy_matrix(work.costates, stages.steps + 1, N, work.active.costates)
     if settle_rows(tolerance, violation, stages, work, mem):
         return True
     go_back(stages, work, mem)
@@ -1005,8 +997,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
         return False
     copy_plan(stages.steps, active.plan, work.now.plan)
     copy(rows.numbers, rows.size * (stages.steps + 1), work.now.numbers)
-    for t in range(stages.steps + 1):
-        copy(active.costates[t], N, work.costates[t])
+    copy_matrix(active.costates, stages.steps + 1, N, work.costates)
     mem.cost = memory.cost
     take_measures(stages, work, mem)
     return True

@@ -1,4 +1,4 @@
-"""Iterations of LQR smoothing and of iLQR, all in compiled code. Written in the kernels' subset.
+"""Iterations of LQR smoothing and of iLQR, all in compiled code.
 
 Each function, as `descend` of `descent.py`, runs the iterations `first` to `last` - 1, and can be called again to
 continue, because its state is in its arrays. The log gets a row per iteration. All return four values: the number of

@@ -1,4 +1,4 @@
-"""Runge-Kutta steps that JAX does, one or all of a plan, by one call into Python. Written in the kernels' subset.
+"""Runge-Kutta steps that JAX does, one or all of a plan, by one call into Python.
 
 Among the data of the dynamics is the address of the function of `codegen/jax_steps.py` that does them.
 """

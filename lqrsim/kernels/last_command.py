@@ -1,4 +1,4 @@
-"""A step of dynamics with the last command as their last M states. Written in the kernels' subset.
+"""A step of dynamics with the last command as their last M states.
 
 `x = (y, z)` with `y' = g(y, u)` and `z' = u`. g is called at its address, with sizes of its own, so that it may be any:
 a formula's Runge-Kutta step, a user's function, or MuJoCo's steps. `p` has the addresses below.

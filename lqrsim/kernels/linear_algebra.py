@@ -1,4 +1,4 @@
-"""Small dense linear algebra. Written in the kernels' subset.
+"""Small dense linear algebra.
 
 Innermost loops have constant length, so LLVM unrolls and vectorises them. Matrices are (N, N) or, for states and
 controls joined, (W, W). Of symmetric matrices the upper triangle is read.

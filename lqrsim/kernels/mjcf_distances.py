@@ -1,4 +1,4 @@
-"""Distances between a robot's geoms and others, by MuJoCo's `mj_geomDistance`. Written in the kernels' subset.
+"""Distances between a robot's geoms and others, by MuJoCo's `mj_geomDistance`.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
 of interest, and for each pair: its row, the robot's geom and its body, the other geom, which is an obstacle's or on

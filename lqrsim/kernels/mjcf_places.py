@@ -1,4 +1,4 @@
-"""The centres of a robot's balls in MuJoCo: points fixed to bodies of an MJCF. Written in the kernels' subset.
+"""The centres of a robot's balls in MuJoCo: points fixed to bodies of an MJCF.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the number of balls, and for each ball the number of its body
 and its place in the body's axes. It goes with functions of that module; `differences.py` has the derivatives.

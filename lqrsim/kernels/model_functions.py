@@ -1,4 +1,4 @@
-"""Calls of a problem's functions by address: dynamics, costs, constraints, noise. Written in the kernels' subset.
+"""Calls of a problem's functions by address: dynamics, costs, constraints, noise.
 
 Passes and iterations are therefore compiled once per size, and serve all problems of that size. See
 `records.ProblemModel`.

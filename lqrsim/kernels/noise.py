@@ -1,4 +1,4 @@
-"""The expected cost of noise, as part of each stage. Written in the kernels' subset.
+"""The expected cost of noise, as part of each stage.
 
 With x' = g(x, u) + M(x, u) w and w ~ N(0, I), a quadratic cost-to-go v with Hessian S at t + 1 has the expectation
 

@@ -1,4 +1,4 @@
-"""The passes of LQR smoothing. Written in the kernels' subset; `records.py` describes their arguments.
+"""The passes of LQR smoothing. `records.py` describes their arguments.
 
 A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """

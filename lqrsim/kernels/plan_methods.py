@@ -1,4 +1,4 @@
-"""The functions that Python calls of the methods on states and controls at once. Written in the kernels' subset.
+"""The functions that Python calls of the methods on states and controls at once.
 
 They are in one module because they share most of their code, which is compiled once for a size.
 """

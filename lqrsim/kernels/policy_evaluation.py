@@ -1,4 +1,4 @@
-"""Feedback policies at many measured states. Written in the kernels' subset. `AffinePolicy` does the same in NumPy."""
+"""Feedback policies at many measured states. `AffinePolicy` does the same in NumPy."""
 
 from math import floor, pi, sqrt
 

@@ -1,4 +1,4 @@
-"""The nearest positive-semidefinite matrix. Written in the kernels' subset."""
+"""The nearest positive-semidefinite matrix."""
 
 from math import sqrt
 

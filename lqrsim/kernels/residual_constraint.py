@@ -1,4 +1,4 @@
-"""Rows of a residual, minus numbers for each step. Written in the kernels' subset.
+"""Rows of a residual, minus numbers for each step.
 
 `data` has the data of the residual, and from AT on the numbers below, and the table of what is subtracted, step by
 step; the last ones hold from their step on.

@@ -1,4 +1,4 @@
-"""The sum of a loss of each row of a residual, which depends on the states. Written in the kernels' subset.
+"""The sum of a loss of each row of a residual, which depends on the states.
 
 `places` and `places_jacobian` are the residual here. `data` begins with its data.
 """

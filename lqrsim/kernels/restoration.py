@@ -1,10 +1,10 @@
 """Restoration: descent on an exact penalty, to a plan that violates the constraints least.
 
-Written in the kernels' subset. A violation costs its size times a price, smoothed by a logarithmic barrier with a
-decreasing parameter. A separate barrier keeps controls within their limits. Steps are Newton steps by the Riccati
-recursion, and are rolled out in closed loop. Every plan therefore satisfies the dynamics, and each has a lower merit
-than the previous iterate. Far from a solution this is more reliable than the interior point, whose states need not
-satisfy the dynamics. Near a solution it is slower.
+A violation costs its size times a price, smoothed by a logarithmic barrier with a decreasing parameter. A separate
+barrier keeps controls within their limits. Steps are Newton steps by the Riccati recursion, and are rolled out in
+closed loop. Every plan therefore satisfies the dynamics, and each has a lower merit than the previous iterate. Far from
+a solution this is more reliable than the interior point, whose states need not satisfy the dynamics. Near a solution it
+is slower.
 
 Far from feasibility the penalty is linear in the constraint. It has no curvature, so the minimum of a quadratic model
 may be anywhere. Two things are added: the curvature of the parabola that touches the penalty from above, and weights on
@@ -14,7 +14,7 @@ changes of controls. Both are reduced after full steps and increased after short
 from math import hypot, inf, isfinite, log
 
 from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy, fill
+from lqrsim.kernels.linear_algebra import copy_matrix, fill
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
     EQUALITY,
@@ -138,14 +138,13 @@ def descend(price, stages, work, mem):
         model_penalties(price, stages, work, mem)
         each = price / steps
         weight = mem.damping * DAMPING * each
-        if regularised_direction(0, stages, work.plan, work.gaps, weight, each, work.curves, rows.force) < 0:
+        if regularised_direction(stages, work.plan, work.gaps, weight, each, work.curves, rows.force) < 0:
             return False
         mem.decrease = -slope_of_merit(stages)
         if mem.decrease > SETTLED * mem.parameter * mem.rows or mem.parameter <= mem.least:
             break
         mem.parameter = max(FALL * mem.parameter, mem.least)
-    for t in range(steps + 1):
-        copy(stages.to_go.gradient[t], N, work.costates[t])
+    copy_matrix(stages.to_go.gradient, steps + 1, N, work.costates)
     mem.merit = penalized(mem.cost, rows.numbers, price, stages, mem)
     confine(stages, work)
     mem.part, part = 0.0, 1.0

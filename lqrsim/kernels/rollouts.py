@@ -1,6 +1,6 @@
 """Sweeps along a trajectory: rollouts of a policy, costs, line searches, and the backward pass of iLQR.
 
-Written in the kernels' subset. Shapes and names are as in `passes.py`.
+Shapes and names are as in `passes.py`.
 """
 
 from math import isnan, nan
@@ -229,10 +229,8 @@ def line_search(steps, shift, work, model, bound, slope, smallest, trial):
 
 def copy_plan(steps, source, target):
     """Copy a trajectory."""
-    for t in range(steps + 1):
-        copy(source.states[t], N, target.states[t])
-    for t in range(steps):
-        copy(source.controls[t], M, target.controls[t])
+    copy_matrix(source.states, steps + 1, N, target.states)
+    copy_matrix(source.controls, steps, M, target.controls)
 
 
 def copy_policy(steps, source, target):

@@ -1,4 +1,4 @@
-"""One Runge-Kutta step with the control held, and its Jacobian. Written in the kernels' subset.
+"""One Runge-Kutta step with the control held, and its Jacobian.
 
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """

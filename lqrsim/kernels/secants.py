@@ -2,7 +2,7 @@
 
 The models of `stages.py` then have the curvature of cost and rows alone. What they lack at each stage is learned from
 the changes of the Lagrangian's gradient by the steps taken, by symmetric updates of rank one (SR1). It enters the
-Hessians only if convergence without it is slow: at first the updates know little. Written in the kernels' subset.
+Hessians only if convergence without it is slow: at first the updates know little.
 """
 
 from lqrsim.kernels.declarations import M, N, W, compact, stack

@@ -1,4 +1,4 @@
-"""The centres of a robot's balls at many states. Written in the kernels' subset."""
+"""The centres of a robot's balls at many states."""
 
 from lqrsim.kernels.declarations import outline, places, places_jacobian
 

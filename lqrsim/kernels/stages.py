@@ -1,8 +1,8 @@
 """Models of all stages of a plan, which need not satisfy the dynamics, and the step to their minimum.
 
-Written in the kernels' subset. The gap between the end of a step and the next state is closed by the iterations. The
-rows are those of all constraints, then the limits of the controls. What a method does with the rows is a curvature
-across each, and a force along it: see `interior_point.py`, `active_set.py` and `solvers/restoration.py`.
+The gap between the end of a step and the next state is closed by the iterations. The rows are those of all constraints,
+then the limits of the controls. What a method does with the rows is a curvature across each, and a force along it: see
+`interior_point.py`, `active_set.py` and `solvers/restoration.py`.
 """
 
 from math import inf, sin, sqrt
@@ -425,8 +425,8 @@ def direction(stages, plan, gaps, share, weight, base, curves, forces):
     return -1 if forward_sweep(stages, gaps) else steps + 1
 
 
-def regularised_direction(begin, stages, plan, gaps, weight, scale, curves, forces):
-    """The first step of the ladder of regularisation that exists, from one of its rungs on.
+def regularised_direction(stages, plan, gaps, weight, scale, curves, forces):
+    """The first step of the ladder of regularisation that exists.
 
     Args:
       weight: weight on changes of the controls, which is added to those of the ladder. scale: the cost to which these
@@ -435,7 +435,7 @@ def regularised_direction(begin, stages, plan, gaps, weight, scale, curves, forc
     Returns:
       The rung; or -1 if none has a minimum.
     """
-    for rung in range(begin, len(MIXES) + len(WEIGHTS)):
+    for rung in range(len(MIXES) + len(WEIGHTS)):
         more = weight + weight_of(rung) * scale
         if direction(stages, plan, gaps, share_of(rung), more, 1.0, curves, forces) == -1:
             return rung

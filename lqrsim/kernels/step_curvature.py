@@ -1,4 +1,4 @@
-"""The Hessian of a Runge-Kutta step times weights, for rates with second derivatives. Written in the kernels' subset.
+"""The Hessian of a Runge-Kutta step times weights, for rates with second derivatives.
 
 A sweep backwards through the stages turns the weights of the next state into weights of each stage's rates. The Hessian
 of the weighted rates at a stage is then pulled back to the step's state and control by the Jacobian of the stage.

@@ -1,4 +1,4 @@
-"""A control period as several Runge-Kutta steps of equal length, with the control held. Written in the kernels' subset.
+"""A control period as several Runge-Kutta steps of equal length, with the control held.
 
 Its derivatives follow from those of a step by the chain rule: Jacobians forwards, weights of the last state backwards.
 """

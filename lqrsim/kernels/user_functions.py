@@ -1,4 +1,4 @@
-"""A user's own functions, called at their addresses. Written in the kernels' subset.
+"""A user's own functions, called at their addresses.
 
 The data of each function begin with its address and, if given, the address of its derivatives; its parameters follow.
 Outputs are NaN where the user's function does not write them. `differences.py` computes derivatives by differences.

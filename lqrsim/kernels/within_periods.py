@@ -1,4 +1,4 @@
-"""What a plan does between its knots, with the controls held. Written in the kernels' subset."""
+"""What a plan does between its knots, with the controls held."""
 
 from lqrsim.kernels.declarations import N, compact, stack
 from lqrsim.kernels.linear_algebra import copy

@@ -34,15 +34,13 @@ class Bend(NamedTuple):
     direction: Motion | None = None
 
 
-def curvature_at(stages: Stages, plan: Motion, multipliers: Array, sizes: Sizes | None = None) -> Bend:
-    """The curvature of the Lagrangian at a stationary plan.
+def curvature_at(stages: Stages, plan: Motion, multipliers: Array) -> Bend:
+    """The curvature of the Lagrangian at a stationary plan, with multipliers (T+1, R) of the constraints' rows.
 
-    Args:
-      stages: of the problem; their models are overwritten. multipliers: (T+1, R) of the constraints' rows; those of
-        limits are worked out here. sizes: typical sizes; by default those at the plan.
+    Those of limits are worked out here. The models of the stages are overwritten.
     """
     with np.errstate(all="ignore"):
-        return _Reduced(stages, plan, multipliers, sizes or stages.sizes(plan)).bend()
+        return _Reduced(stages, plan, multipliers, stages.sizes(plan)).bend()
 
 
 class _Reduced:

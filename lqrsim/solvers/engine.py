@@ -48,27 +48,14 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import LARGEST_KEPT, MOST_KEPT, Stages
 
-_METHODS = {
-    declarations.SMOOTH: "smooth",
-    declarations.DAMPED: "damped",
-    declarations.REJECTED: "rejected",
-    declarations.ILQR: "ilqr",
-    declarations.NEWTON: "newton",
-}
-_STATUS = {
+_METHODS = {getattr(declarations, name): name.lower() for name in ("SMOOTH", "DAMPED", "REJECTED", "ILQR", "NEWTON")}
+# The status of each outcome: that of the same name, if there is one.
+_STATUS = {getattr(declarations, one.name): one for one in Status if hasattr(declarations, one.name)} | {
     declarations.RUNNING: Status.MAX_ITERATIONS,  # all requested iterations were done
-    declarations.CONVERGED: Status.CONVERGED,
-    declarations.COST_CONVERGED: Status.COST_CONVERGED,
-    declarations.MAX_ITERATIONS: Status.MAX_ITERATIONS,
-    declarations.DIVERGED: Status.DIVERGED,
-    declarations.NOT_POSITIVE_DEFINITE: Status.NOT_POSITIVE_DEFINITE,
-    declarations.NOT_FINITE: Status.NOT_FINITE,
     declarations.NO_START: Status.NOT_FINITE,
-    declarations.STALLED: Status.STALLED,
     declarations.CYCLING: Status.STALLED,
     declarations.NO_PROGRESS: Status.STALLED,
     declarations.TIMED_OUT: Status.TIME_LIMIT,
-    declarations.RISK_TOO_HIGH: Status.RISK_TOO_HIGH,
     declarations.IN_VALLEY: Status.MAX_ITERATIONS,
 }
 _DETAILS = {
