@@ -58,7 +58,7 @@ def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> Solv
 def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
     """Continue from the result without the constraints; also return the run that has the answer in its memory."""
     if run.budget.over:
-        if found.success and not run.work.keeps(run.work.constraint_values(found.states, found.controls)):
+        if found.success and not run.work.keeps(run.work.constraint_values(*found.plan)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
             found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
         return run, found
@@ -78,13 +78,12 @@ def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STA
         lagrangian.evaluate(*run.work.last)
         run.weigh_noise(run.work.last)
     else:
-        lagrangian.evaluate(found.states, found.controls)
+        lagrangian.evaluate(*found.plan)
         if lagrangian.kept:
             return found
         lagrangian.start()
-        run.weigh_noise(Motion(found.states, found.controls))
-        # The arrays will be overwritten.
-        found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
+        run.weigh_noise(found.plan)
+        found = dataclasses.replace(found, plan=Motion(*map(np.copy, found.plan)))  # the arrays will be overwritten
     undamped = _undamped(run, lagrangian, known=found is None, patience=stale)
     if undamped.success or not run.settings.safeguard or run.budget.over:
         return undamped
@@ -167,7 +166,7 @@ def _damped(
     """The safeguard: from the plan without constraints, or the last plan with constraints, whichever is better."""
     work = run.work
     plans = [(work.last, undamped.cost)]
-    plans += [(Motion(found.states, found.controls), found.cost)] if found is not None else []
+    plans += [(found.plan, found.cost)] if found is not None else []
     plans = [(plan, cost) for plan, cost in plans if np.isfinite(cost)]
     if not plans:
         return undamped

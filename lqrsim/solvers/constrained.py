@@ -129,7 +129,7 @@ class Ladder:
             return None
         best = best.kept()
         self._point.without_multipliers()
-        self._run.work.take(best.states, best.controls, best.cost)
+        self._run.work.take(*best.plan, best.cost)
         found = self._run.newton(detail=best.detail, patient=True)
         if not found.success or found.violation > 0:
             return None

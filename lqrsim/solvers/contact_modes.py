@@ -26,6 +26,7 @@ import scipy.linalg
 import scipy.optimize
 
 from lqrsim.errors import Array
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import ContactCertificate, Status
 from lqrsim.results.value_functions import Quadratic
@@ -441,11 +442,10 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
     except OutOfTime:
         if descent is None or descent.plan is plan:
             return None
-        plan = descent.plan
+        plan = Motion(descent.plan.states, descent.plan.controls)
         found = RunResult(
-            status=Status.TIME_LIMIT, detail="no time was left for a certificate within its contact modes",
-            states=plan.states, controls=plan.controls, cost=plan.cost, violation=0.0, gap=np.nan,
-            law=compiled.law_about(plan.states, plan.controls, descent.model.gain),
+            status=Status.TIME_LIMIT, detail="no time was left for a certificate within its contact modes", plan=plan,
+            law=compiled.law_about(*plan, descent.model.gain), cost=descent.plan.cost, violation=0.0,
         )  # fmt: skip
         return run.certified(found)
 
@@ -456,10 +456,10 @@ def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, statu
     law = compiled.law_about(plan.states, plan.controls, gain)
     pulls, limits = descent.pulls()
     optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls, limits)
+    motion = Motion(plan.states, plan.controls)
     result = RunResult(
-        status=Status.STALLED, detail="", states=plan.states, controls=plan.controls, law=law, cost=plan.cost,
-        violation=0.0, gap=np.nan, values={"cost_to_go": value},
-    )  # fmt: skip
+        status=Status.STALLED, plan=motion, law=law, cost=plan.cost, violation=0.0, values={"cost_to_go": value}
+    )
     certificate = run.certified(result).certificate
     assert certificate is not None
     contacts = surroundings(problem, descent.model, plan, pulls)

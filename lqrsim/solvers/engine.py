@@ -207,7 +207,7 @@ class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`.
 
     Attributes:
-      cost: cost of the plan, as in the log; infinite without a plan.
+      plan: states (T+1, n) and controls (T, m). cost: that of the plan, as in the log; infinite without a plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, in the form for
         `assemble`.
       final: whether no other start can do better.
@@ -217,13 +217,12 @@ class RunResult:
     """
 
     status: Status
-    detail: str
-    states: Array
-    controls: Array
+    plan: Motion
     law: tuple[Array, Array]
-    cost: float
-    violation: float
-    gap: float
+    cost: float = np.inf
+    violation: float = np.inf
+    gap: float = np.nan
+    detail: str = ""
     values: dict[str, Any] = field(default_factory=dict)
     multipliers: tuple[Multipliers, ...] = ()
     certificate: Certificate | None = None
@@ -231,6 +230,14 @@ class RunResult:
     stuck: bool = False
     against: tuple[str, ...] = ()
     remedy: str = ""
+
+    @property
+    def states(self) -> Array:
+        return self.plan.states
+
+    @property
+    def controls(self) -> Array:
+        return self.plan.controls
 
     @property
     def rank(self) -> tuple[bool, bool, float, float]:
@@ -244,8 +251,7 @@ class RunResult:
 
     def kept(self) -> "RunResult":
         """A copy that later iterations, which write to the same memory, do not change."""
-        arrays = deepcopy((self.states, self.controls, self.law, self.values))
-        return replace(self, **dict(zip(("states", "controls", "law", "values"), arrays, strict=True)))
+        return replace(self, plan=deepcopy(self.plan), law=deepcopy(self.law), values=deepcopy(self.values))
 
 
 class SolveRun:
@@ -520,9 +526,8 @@ class SolveRun:
         """The result of smoothing, with its ending."""
         work, last = self.work, self._last
         return RunResult(
-            status=ending.status, detail=ending.detail(self.problem.steps), states=work.last.states,
-            controls=work.last.controls, law=work.arrays.last_policy, cost=_cost_of(last),
-            violation=np.inf if last is None else last.violation,
+            status=ending.status, detail=ending.detail(self.problem.steps), plan=work.last,
+            law=work.arrays.last_policy, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
             gap=np.nan if last is None else last.gap,
             values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
@@ -540,22 +545,17 @@ class SolveRun:
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
         """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
         if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # the run was stopped without looking back
-            return self.best(
-                RunResult(
-                    status=status, detail=detail, states=self.work.last.states, controls=self.work.last.controls,
-                    law=self.work.arrays.last_policy, cost=np.inf, violation=np.inf, gap=np.nan,
-                )
-            )  # fmt: skip
+            law = self.work.arrays.last_policy
+            return self.best(RunResult(status=status, detail=detail, plan=self.work.last, law=law))
         optimality = self.budget.log[-1].optimality if self.budget.log else np.nan
         return self._about_plan(optimality, status, detail)
 
     def _about_plan(self, optimality: float, status: Status, detail: str) -> RunResult:
         """The plan in memory, with the last policy and value functions about it."""
         work = self.work
-        states, controls = work.best
         values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
         if not np.isfinite(optimality):  # there is neither a model about the plan nor a policy
-            law, gap = (np.zeros_like(work.arrays.policy.gain), controls.copy()), np.nan
+            law, gap = (np.zeros_like(work.arrays.policy.gain), work.best.controls.copy()), np.nan
         else:
             values = work.value_functions()
             if not gap < self.settings.gap_tolerance:
@@ -567,13 +567,13 @@ class SolveRun:
                     why = "its pass needs a cost that is curved in every control"
                 detail += f"; the cost-to-come is left out: {why}"
         return RunResult(
-            status=status, detail=detail.removeprefix("; "), states=states, controls=controls, law=law,
-            cost=work.cost, violation=self._violation_of(work.best), gap=gap, values=values,
+            status=status, detail=detail.removeprefix("; "), plan=work.best, law=law, cost=work.cost,
+            violation=self._violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 
     def certified(self, found: RunResult) -> RunResult:
         """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
-        values = self.work.constraint_values(found.states, found.controls)
+        values = self.work.constraint_values(*found.plan)
         violation = self.work.violation(values)
         value = found.values.get("cost_to_go")
         certificate, wrong = certified(
@@ -607,7 +607,7 @@ class SolveRun:
             self._loop(*self._check_arguments(declarations.CURVE, found, no_value(found.states), out))
             if out["curvature"][0] > FLAT:
                 return Bend(Curvature.MINIMUM)
-        stages, plan = self.stages, Motion(*map(in_c_order, (found.states, found.controls)))
+        stages, plan = self.stages, Motion(*map(in_c_order, found.plan))
         return curvature_at(stages, plan, stages.of_constraints([one.values for one in found.multipliers]))
 
     def _expected_cost(self, found: RunResult) -> float:
@@ -651,10 +651,7 @@ class SolveRun:
         """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
         self.roll_out()
         work, law = self.work, self.work.arrays.last_policy
-        found = RunResult(
-            status=Status.STALLED, detail="", states=work.last.states, controls=work.last.controls, law=law,
-            cost=work.cost, violation=np.inf, gap=np.nan,
-        ).kept()  # fmt: skip
+        found = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
         return self.certified(found) if np.isfinite(found.states).all() else found
 
     def is_worse(self, found: RunResult, other: RunResult) -> bool:
@@ -666,7 +663,7 @@ class SolveRun:
 
     def _missed(self, found: RunResult) -> float:
         """The violation of a plan to two digits; 0 within the tolerances."""
-        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(found.states, found.controls)):
+        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(*found.plan)):
             return 0.0
         return float(f"{found.violation:.2g}")
 
@@ -734,8 +731,8 @@ class SolveRun:
         self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
-        work, plan = self.work, Motion(found.states, found.controls)
-        arrays = work.arrays._replace(to_go=to_go, last=plan, last_policy=Policy(*found.law), certificate=certificate)
+        work, law = self.work, Policy(*found.law)
+        arrays = work.arrays._replace(to_go=to_go, last=found.plan, last_policy=law, certificate=certificate)
         options = self._options(self._rows, self.final)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 

@@ -158,8 +158,8 @@ def _solve(
     # Without a pass about the trajectory the policy has no feedback.
     law = compiled.law_about(states, controls, gain) if whole else (np.zeros_like(gain), controls)
     found = RunResult(
-        status=ending.status, detail=ending.detail(problem.steps), states=states, controls=controls,
-        law=law, cost=work.cost, violation=0.0, gap=0.0,
+        status=ending.status, detail=ending.detail(problem.steps), plan=work.best, law=law, cost=work.cost,
+        violation=0.0, gap=0.0,
         values={"cost_to_go": Quadratic(*work.arrays.to_go)} if whole else {},
     )  # fmt: skip
     found = run.certified(found)

@@ -136,10 +136,8 @@ class InteriorRun:
         cost, _ = self._run.stages.trial(Motion(states, controls))
         work = self._run.work
         violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
-        return RunResult(
-            status=Status.MAX_ITERATIONS, detail="", states=states, controls=controls, law=law,
-            cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
-        )  # fmt: skip
+        cost, plan = cost if np.isfinite(cost) else np.inf, Motion(states, controls)
+        return RunResult(status=Status.MAX_ITERATIONS, plan=plan, law=law, cost=cost, violation=violation)
 
     def without_multipliers(self) -> None:
         """Set multipliers and penalties of the augmented Lagrangian to zero."""
@@ -224,12 +222,12 @@ class InteriorRun:
     def _newton(self, lagrangian: AugmentedLagrangian, scale: float) -> RunResult:
         """Run Newton's method from the plan in memory, with these multipliers, to an optimality relative to `scale`."""
         result = self._run.newton(added=lagrangian.added(), least=scale)
-        lagrangian.evaluate(result.states, result.controls)
+        lagrangian.evaluate(*result.plan)
         return result
 
     def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
         """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
-        values = self._run.work.constraint_values(result.states, result.controls)
+        values = self._run.work.constraint_values(*result.plan)
         multipliers = []
         for k, one in enumerate(lagrangian.multipliers()):
             size = found.sizes.rows[self._run.stages.owners == k]

@@ -294,10 +294,7 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
 
 def _unchanged(best: "_Best") -> RunResult:
     """The result before the first iteration."""
-    return RunResult(
-        status=Status.TIME_LIMIT, detail="", states=best.plan[0], controls=best.plan[1], law=best.law,
-        cost=np.inf, violation=np.inf, gap=np.nan,
-    )  # fmt: skip
+    return RunResult(status=Status.TIME_LIMIT, plan=best.plan, law=best.law)
 
 
 class _Neighbour:
@@ -381,8 +378,8 @@ class _Neighbour:
         status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
-            status=Status.CONVERGED if solved else status, detail=detail, states=plan.states, controls=plan.controls,
-            law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values), gap=np.nan,
+            status=Status.CONVERGED if solved else status, detail=detail, plan=plan,
+            law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values),
             multipliers=tuple(Multipliers(*one) for one in active.multipliers()),
         )  # fmt: skip
 
@@ -478,10 +475,7 @@ class _Yielding:
             lagrangian = AugmentedLagrangian(self._run)
             lagrangian.evaluate(*plan)
             detail = f"elastic: {lagrangian.worst()}"
-        return RunResult(
-            status=status, detail=detail, states=plan.states, controls=plan.controls, law=law,
-            cost=cost, violation=violation, gap=np.nan,
-        )  # fmt: skip
+        return RunResult(status=status, detail=detail, plan=plan, law=law, cost=cost, violation=violation)
 
 
 class _Best:
@@ -540,7 +534,7 @@ class _Best:
 
     def adopt(self, found: RunResult) -> None:
         """Adopt a result."""
-        there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())
+        there = *found.plan, *found.law, *(self._work.arrays.to_go if found.values else ())
         self._keep(found.cost, found.violation, there)
         self.multipliers = found.multipliers
 

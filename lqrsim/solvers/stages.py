@@ -260,7 +260,8 @@ class Stages:
     @functools.cached_property
     def interior(self) -> tuple[InteriorArrays, StructuredArray]:
         """The same of an interior point."""
-        crossover = dict(zip(("active", "active_memory"), self.active_set, strict=True))
+        active, memory = self.active_set
+        crossover = {"active": active, "active_memory": memory}
         return zeros_of(InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(1, INTERIOR)
 
     @functools.cached_property

@@ -235,7 +235,7 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     beside = point.result(*compiled.rollout(run.problem, *law, plan.states[0].copy()))
     if not beside.cost < saddle.cost:
         return None
-    run.work.take(beside.states, beside.controls, beside.cost)
+    run.work.take(*beside.plan, beside.cost)
     return run.certified(run.newton(patient=True))
 
 
@@ -262,7 +262,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
     other = other.kept()
     if budget.over:
         return replace(other, status=found.status, detail=found.detail)
-    run.work.take(other.states, other.controls, other.cost)
+    run.work.take(*other.plan, other.cost)
     return run.newton(detail=found.detail, patient=True)
 
 
