@@ -84,7 +84,7 @@ class CompiledModule:
             except TypeError:
                 pass
         types = tuple(map(type_of, arguments))
-        entry = self._last[name] = self._once((name, types), lambda: self._make_entry(name, types))
+        entry = self._last[name] = self._once((name, types), lambda: self._make_entries({name: types})[name])
         return Call(entry, arguments)
 
     def addresses(self, *names: str) -> tuple[float, ...]:
@@ -104,9 +104,6 @@ class CompiledModule:
         entries = self._once(tuple(types.items()), lambda: self._make_entries(types))
         self._last |= entries
         self._made |= {(name, types[name]): entry for name, entry in entries.items()}
-
-    def _make_entry(self, name: str, types: tuple[Type, ...]) -> "Entry":
-        return self._make_entries({name: types})[name]
 
     def _make_entries(self, types: dict[str, tuple[Type, ...]]) -> dict[str, "Entry"]:
         def write(program: Program, scope: Scope) -> list[Type | None]:

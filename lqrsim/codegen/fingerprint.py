@@ -115,13 +115,7 @@ def _version(name: str) -> str:
 @functools.cache
 def _versions() -> tuple[str, ...]:
     installed = (f"{name} {_version(name)}" for name in _PACKAGES if name != "math")
-    return (
-        sys.version,
-        *installed,
-        inspect.getsource(outlines),
-        inspect.getsource(rotations),
-        inspect.getsource(rotation_ratios),
-    )
+    return sys.version, *installed, *map(inspect.getsource, (outlines, rotations, rotation_ratios))
 
 
 def _helpers(function: Any) -> list[Any]:

@@ -736,11 +736,9 @@ class _Body:
     def _expression_UnaryOp(self, node: ast.UnaryOp) -> Value:
         if isinstance(node.op, ast.Not):
             value = self._condition(node.operand)
-            return (
-                _constant(not value.constant)
-                if value.constant is not None
-                else Value(BOOL, self._emit(f"xor i1 {value.name}, true"))
-            )
+            if value.constant is not None:
+                return _constant(not value.constant)
+            return Value(BOOL, self._emit(f"xor i1 {value.name}, true"))
         value = self._expression(node.operand)
         if not isinstance(node.op, ast.USub | ast.UAdd):
             self._refuse(node, f"`{ast.unparse(node)}`", "-, + or not")

@@ -85,12 +85,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
         augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # for this policy, the gradient of the cost-to-go is the costate
             given = model.noise.risk[2] > 0  # a cost-to-go about the origin
-            ahead = NextStep(
-                step.jacobian,
-                nowhere if own and not given else arrived,
-                hessians[t + 1],
-                costate if own else to_go.gradient[t + 1],
-            )
+            there, slope = nowhere if own and not given else arrived, costate if own else to_go.gradient[t + 1]
+            ahead = NextStep(step.jacobian, there, hessians[t + 1], slope)
             cost += noise_quadratic(x, u, t, model.noise, ahead, False, stage)
         terms = scale_of(x, u, stage)
         scale += terms
@@ -137,10 +133,7 @@ def cost_of_change(stage, sizes):
 
 def scale_of(x, u, stage):
     """The quadratic part of a cost at (x, u) with the sizes of its terms, states and controls apart."""
-    scale = 0.0
-    for i in range(N):
-        for j in range(N):
-            scale += 0.5 * abs(x[i] * stage.hessian[i, j] * x[j])
+    scale = curved_terms(x, stage.hessian)
     for i in range(M):
         for j in range(M):
             scale += 0.5 * abs(u[i] * stage.hessian[N + i, N + j] * u[j])
@@ -148,7 +141,7 @@ def scale_of(x, u, stage):
 
 
 def curved_terms(x, S):
-    """The quadratic part of a cost-to-go at x (N,) with the sizes of its terms."""
+    """The quadratic part of a function at x (N,) with the sizes of its terms."""
     terms = 0.0
     for i in range(N):
         for j in range(N):

@@ -250,16 +250,10 @@ class CollisionSpheres:
         }
         slopes = {target: slope for target, slope in slopes.items() if slope != 0}
         function = functools.partial(symbolic.write_function, data="data", of=self.name)
-        return {
-            "source": "\n\n".join(
-                [
-                    function("places", "x, data, out", assignments=values),
-                    function("places_jacobian", "x, data, out, slopes", assignments=values | slopes),
-                ]
-            ),
-            "size": size,
-            "depends_on": sorted({int(target[:-1].split(", ")[1]) for target in slopes}),
-        }
+        places = function("places", "x, data, out", assignments=values)
+        jacobian = function("places_jacobian", "x, data, out, slopes", assignments=values | slopes)
+        depends_on = sorted({int(target[:-1].split(", ")[1]) for target in slopes})
+        return {"source": f"{places}\n\n{jacobian}", "size": size, "depends_on": depends_on}
 
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
         names, size, own = dynamics.state_coordinates.names, self._size_of(dynamics), dynamics.calling

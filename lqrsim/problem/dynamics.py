@@ -180,11 +180,8 @@ class Dynamics:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without derived attributes that cannot be pickled."""
-        return {
-            name: value
-            for name, value in vars(self).items()
-            if name not in ("_plain", "disturbed", "compiled", "step_curvature")
-        }
+        derived = "_plain", "disturbed", "compiled", "step_curvature"
+        return {name: value for name, value in vars(self).items() if name not in derived}
 
     def __repr__(self) -> str:
         states, controls = (", ".join(space.labels) for space in (self.state_coordinates, self.control_coordinates))
@@ -413,13 +410,9 @@ class Dynamics:
         slopes |= {f"fu[{i}, {j}]": rate.diff(uj) for i, rate in enumerate(rates) for j, uj in enumerate(u)}
         slopes = {target: slope for target, slope in slopes.items() if slope != 0}
         of = f"{self.name}(x, u, p)"
-        return "\n\n".join(
-            [
-                symbolic.write_function("rate", "x, u, p, out", "p", values, of=of),
-                symbolic.write_function("rate_jacobian", "x, u, p, out, fx, fu", "p", values | slopes, of=of),
-                symbolic.write_chain(n, slopes),
-            ]
-        )
+        rate = symbolic.write_function("rate", "x, u, p, out", "p", values, of=of)
+        jacobian = symbolic.write_function("rate_jacobian", "x, u, p, out, fx, fu", "p", values | slopes, of=of)
+        return "\n\n".join([rate, jacobian, symbolic.write_chain(n, slopes)])
 
     def _trace_curvature(self) -> dict[str, Any]:
         """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved.
@@ -438,10 +431,8 @@ class Dynamics:
         place = {i: k for k, i in enumerate(support)}
         values = {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in curves.items()}
         of = f"{self.name}(x, u, p)"
-        return {
-            "source": symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of, steps=steps),
-            "support": support,
-        }
+        source = symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of, steps=steps)
+        return {"source": source, "support": support}
 
     @checked
     def period_near(self, dt: Finite) -> float:
@@ -527,10 +518,8 @@ class Dynamics:
         return a, b, out - a @ x - b @ u
 
     def _check(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
-        return (
-            check_array("state", state, (len(self.state_coordinates),)),
-            check_array("control", control, (len(self.control_coordinates),)),
-        )
+        x = check_array("state", state, (len(self.state_coordinates),))
+        return x, check_array("control", control, (len(self.control_coordinates),))
 
     @cached_property
     def _plain(self) -> dict[str, Any]:

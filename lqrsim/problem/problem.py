@@ -484,13 +484,10 @@ class Problem(OneVersion):
         """Hash of everything that defines the problem: structure and numbers."""
         space = self.dynamics.state_coordinates
         parts: list[str | Array] = [self.dynamics.step_source.digest, f" {self.dt!r} {self.steps}"]
-        parts.append(repr(self.dynamics.parameters))
-        parts.append(repr((self.control_coordinates.low, self.control_coordinates.high)))
+        parts += [repr(self.dynamics.parameters), repr((self.control_coordinates.low, self.control_coordinates.high))]
         # What wraps, where the robot is, and what actuators can do: starts, errors and policies depend on them.
-        parts += [
-            f"{space.rules} {space.position} {space.plane} {space.offset}",
-            self.dynamics.control_coordinates.rules,
-        ]
+        parts += [f"{space.rules} {space.position} {space.plane} {space.offset}"]
+        parts += [self.dynamics.control_coordinates.rules]
         if self.dynamics.fixed:
             parts.append(self.dynamics.fixed)
         functions = [*self.dynamics.functions]

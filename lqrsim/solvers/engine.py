@@ -144,11 +144,8 @@ def iterate(
       violation: violation of the constraints in the last result of `run`.
     """
     functions, stop = functions_of(problem), budget.stop
-    single = (
-        (budget.attentive and (budget.watched or bool(functions)))
-        or bool(problem.constraints)
-        or stop.deadline < np.inf
-    )
+    heard = budget.attentive and (budget.watched or bool(functions))
+    single = heard or bool(problem.constraints) or stop.deadline < np.inf
     bite = 1 if budget.attentive or single else last
     for function in functions:
         function.forget()

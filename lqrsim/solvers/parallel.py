@@ -47,12 +47,9 @@ def solve_all(
     functions = [function for problem in problems for function in functions_of(problem)]
     with workers(threads, functions) as pool:
         futures = [pool.submit(solve, problem, settings) for problem in problems]
-        done, silent = 0, progress is None
-        with (
-            reported("solving", lambda: f"{done} of {len(futures)} problems done")
-            if silent
-            else contextlib.nullcontext()
-        ):
+        done = 0
+        told = reported("solving", lambda: f"{done} of {len(futures)} problems done")
+        with told if progress is None else contextlib.nullcontext():
             for done, _ in enumerate(as_completed(futures), start=1):
                 if progress is not None:
                     progress(done, len(futures))
