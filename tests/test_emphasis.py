@@ -13,7 +13,6 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.control import tracking
 from lqrsim.control.collision_chance import Surroundings, collision_chance
-from lqrsim.control.emphasis import emphasis_of
 from lqrsim.errors import Array
 
 PLACES = ((0.0, 0.1), (0.9, -1.2))
@@ -84,7 +83,7 @@ def test_it_is_the_slope_of_the_chance(seed: int, margin: float, deviation: floa
     scale = deviation**2 / np.einsum("ti,tij,tj->t", normal, covariance[:, :2, :2], normal)
     covariance *= scale[:, None, None]
     across = np.zeros((3, 4, 4))
-    found = emphasis_of(surroundings, states, covariance, across, np.ones(4))
+    found = surroundings.emphasis(states, covariance, across, np.ones(4))
 
     def expected(changed: Array) -> float:
         return float(-np.log1p(-collision_chance(states, changed, across, surroundings)[1]))

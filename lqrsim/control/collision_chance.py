@@ -117,6 +117,29 @@ class Surroundings:
         shared = (normal[..., 1:, :, :] @ across * normal[..., :-1, :, :]) @ ones + displaced
         return Spread(clearance, std, np.clip(shared / (std[..., 1:, :] * std[..., :-1, :]), -1.0, 1.0), normal)
 
+    def emphasis(self, states: Array, covariance: Array, across: Array, weights: Array) -> Array:
+        """Weights (T+1, n, n) of deviations that lead to a collision, at most as large as `weights` (n,).
+
+        A law that holds all deviations equally tightly spends effort where nothing is near. The chance of a collision
+        depends on the variance s^2 of the clearance c at each knot and obstacle. Its derivative is close to
+        p z^2 / (2 s^2), with z = c / s and the chance p that a collision begins there. To first order, a law lowers the
+        chance most if these derivatives are its weights of deviations along the normals of the obstacles. They belong
+        to one law, and weights change the law, but their ratios change little.
+
+        Args:
+          states, covariance, across: as for `collision_chance`, without further axes.
+        """
+        found = np.zeros_like(covariance)
+        if not self.kept:
+            return found
+        spread = self.spread(states, covariance, across)
+        margin = spread.mean / spread.std
+        slopes = beginnings(margin, spread.correlation) * margin**2 / spread.std**2
+        place = np.array(self.position)
+        found[:, place[:, None], place] = np.einsum("to,toi,toj->tij", slopes, spread.normal, spread.normal)
+        largest = float(np.max(np.diagonal(found, axis1=1, axis2=2) @ (1 / weights)))
+        return found / largest if largest > 0 else found
+
 
 def collision_chance(
     states: Array, covariance: Array, across: Array, surroundings: Surroundings

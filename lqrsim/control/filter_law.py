@@ -93,9 +93,6 @@ class FilterRun(ControllerRun):
     If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
     commands since, to the time at which the next command acts.
 
-    Args:
-      records: arrays for `estimates` and `innovations`, to be filled; None to record nothing.
-
     Attributes:
       first: the step at which the law's plan begins.
       z: the current estimates, (K, Z), at the knot of the newest measurement.
@@ -103,7 +100,7 @@ class FilterRun(ControllerRun):
       innovations: the recorded innovations, (T+1, K, Y), or None.
     """
 
-    def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
+    def __init__(self, law: FilterLaw, trials: int, record: bool) -> None:
         self.law, self.first = law, 0
         self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
@@ -113,7 +110,8 @@ class FilterRun(ControllerRun):
         self._diverged: dict[int, str] = {}
         self._differences = np.empty((trials, law.model.sensor.size))
         self._wider = np.ones(trials)  # see `correct`
-        self.estimates, self.innovations = records or (None, None)
+        shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
+        self.estimates, self.innovations = (np.full((*shape, one), np.nan) if record else None for one in sizes)
         self._limits = Limits(*law.limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
         # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
@@ -161,28 +159,18 @@ class FilterRun(ControllerRun):
         gains = Policy(law.gain[t], law.offset[t])
         model.compiled.command(self._trials, ahead, near, gains, self._limits, model.turning, out)
         self._commands.append(out.copy())
-        self._look_for_diverged(ahead)
+        first_implausible = np.empty(self._trials)
+        model.compiled.diverged(self._trials, ahead, first_implausible)
+        for k in np.flatnonzero(first_implausible < model.size):
+            i = int(first_implausible[k])
+            what = f"is beyond {FAR:g}" if np.isfinite(ahead[k, i]) else "is not finite"
+            self._diverged.setdefault(int(k), f"the estimate of {model.names[i]} {what}")
         return out
-
-    def _look_for_diverged(self, estimates: Array) -> None:
-        """Note the trials whose estimate is not finite or larger than any plausible value."""
-        places = np.empty(self._trials)
-        self.model.compiled.diverged(self._trials, estimates, places)
-        for k in np.flatnonzero(places < self.model.size):
-            i = int(places[k])
-            what = f"is beyond {FAR:g}" if np.isfinite(estimates[k, i]) else "is not finite"
-            self._diverged.setdefault(int(k), f"the estimate of {self.model.names[i]} {what}")
 
     def _predict(self, estimates: Array, commands: Array) -> None:
         """Predict estimates by one control period."""
         with self.model.dynamics.quiet():
             self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
-
-
-def empty_records(law: FilterLaw, trials: int) -> tuple[Array, Array]:
-    """Arrays, filled with NaN, for the estimates and innovations of K trials."""
-    knots, model = law.model.plan.steps + 1, law.model
-    return np.full((knots, trials, model.size), np.nan), np.full((knots, trials, model.sensor.size), np.nan)
 
 
 def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
@@ -204,7 +192,9 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
         "transition": np.zeros((steps, width, width)), "input": np.zeros((steps, width, m)),
         "drift": np.zeros((steps, width)), "nominal": np.empty((steps, width)),
     }  # fmt: skip
-    measured = _expected(law)
+    measured = np.empty((steps + 1, model.sensor.size))  # h of y = H x + h
+    model.compiled.measurements(len(measured), in_c_order(plan.states), model.compiled_sensor, measured)
+    measured -= np.einsum("tij,tj->ti", model.H, plan.states)
     for t in range(steps):
         knot = max(t - latency, 0)  # the knot of z
         under_way = min(t, latency) + delay  # commands, the newest last
@@ -244,14 +234,6 @@ def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int,
         count = len(now["drift"]) - size - m
         now["transition"][size : size + count, size + m :] = np.eye(count)
         now["input"][-m:] = np.eye(m)
-
-
-def _expected(law: FilterLaw) -> Array:
-    """h of y = H x + h about the plan, (T+1, Y)."""
-    model, plan = law.model, law.model.plan
-    values = np.empty((plan.steps + 1, model.sensor.size))
-    model.compiled.measurements(len(values), in_c_order(plan.states), model.compiled_sensor, values)
-    return values - np.einsum("tij,tj->ti", model.H, plan.states)
 
 
 def _measured_coordinates(law: FilterLaw) -> Coordinates:

@@ -5,31 +5,32 @@ A Kalman filter estimates the state, the actuators' outputs and the unknowns. A 
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lqrsim.annotations import checked
 from lqrsim.control.controllers import Controller
-from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, empty_records, policy_of
+from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
-from lqrsim.control.lag_margin import with_margin
 from lqrsim.control.linear_loop import LinearLoop
-from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
+from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.control.tracking import (
+    Predictions,
     choose_tolerances,
-    reach_of,
+    narrowest,
+    predictions,
     tolerances_to_try,
-    unit_means,
     with_filter,
+    worth_of,
 )
-from lqrsim.control.tracking_laws import AT_END, Laws, Weights, check_plan, effort_of
-from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry
+from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
+from lqrsim.control.uncertainty import Uncertainty, check_seconds
 from lqrsim.errors import Array, InputError, check_kind
-from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, PerEntry
@@ -39,14 +40,18 @@ from lqrsim.results.solution import Solution
 from lqrsim.robots.sensors import RobotSensors
 
 MEMORY = 5.0  # s
-# The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
-# prediction, as if this effort had moved the state. A model is never exact: disturbances do not act evenly over a
-# control period, integration has errors, and the gains are computed about the plan. With exact sensors, a filter
-# without this assumption would infer unknowns from the last digits of its prediction errors.
-INEXACT = 0.02
-# The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
-# is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
-HELD = 0.3
+# Weight of a failure without the lag, relative to a failure with it. The value is our choice: with a larger one,
+# designs lose performance with the lag.
+ABSENT = 0.3
+# The increase in the chance of failure without the lag from which other designs compete; a tube of six times the width
+# counts as much.
+CLIFF = 0.1
+# What milder filters are told: a fraction of the stated lag, and noise that bypasses the actuators, relative to the
+# tolerated effort times `Lag.mean`.
+MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
+# The largest width of the tube with the lag, relative to the narrowest.
+WIDER = 1.25
+GONE = (1.0, 1e30, 1.0)  # the predictions for a loop whose moments are not finite
 
 
 class OffsetFree(Controller):
@@ -59,7 +64,7 @@ class OffsetFree(Controller):
     and predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
     unknown by at most six standard deviations of such a correction; see `kalman.py`. If the robot would leave its
     plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
-    `lag_margin.py`. `model.uncertainty` is the uncertainty that the filter assumes.
+    `with_margin`. `model.uncertainty` is the uncertainty that the filter assumes.
 
     The other arguments are as in `track`.
 
@@ -138,14 +143,21 @@ class OffsetFree(Controller):
         sensor = sensor_of(states, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         stated = PlanModel.of(problem.dynamics, plan, uncertainty, sensor)
-        self.model = for_filter(stated, memory, efforts)
+        self.model = stated.assumed(memory, efforts)
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self._sensing = None if self._sensors is None else self._sensor_filter(self._sensors, replan_every)
         self.filter = kalman_filter(self.model) if self._sensing is None else self._sensing.along
-        design = self._design(tolerate, efforts, at_end)
+        if tolerate is None:
+            moments = partial(with_filter, self.model, self.filter)
+            told = problem, solution, uncertainty, self.model, efforts, at_end, moments
+            design = Design(self.model, self.filter, *choose_tolerances(*told, call="OffsetFree(...)"))
+        else:
+            weights = Weights.of(tolerate, efforts, problem.dynamics, at_end=at_end)
+            design = Design.of(self.model, self.filter, weights)
         if uncertainty.lag > 0 and memory < np.inf and self._sensing is None:
-            design = self._with_margin(design, stated, memory, tolerate, efforts, at_end)
+            ends = at_end if tolerate is None else None
+            design = with_margin(problem, solution, stated, design, memory, efforts, ends)
         self.model, self.filter, self.weights = design.model, design.filter, design.weights
         self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
@@ -179,46 +191,12 @@ class OffsetFree(Controller):
         problem = replace(self.problem, dynamics=self.model.dynamics)
         return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
-    def _design(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Design:
-        """The design with the given tolerances, or with chosen ones."""
-        if tolerate is not None:
-            weights = Weights.of(tolerate, effort, self.problem.dynamics, at_end=at_end)
-            return Design.of(self.model, self.filter, weights)
-
-        def moments(laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
-            return with_filter(self.model, self.filter, laws, limits)
-
-        told = self.problem, self.solution, self.uncertainty
-        return Design(
-            self.model,
-            self.filter,
-            *choose_tolerances(*told, self.model, effort, at_end, moments, call="OffsetFree(...)"),
-        )
-
-    def _with_margin(
-        self, design: Design, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
-    ) -> Design:
-        """The design, or a milder one if it needs the lag."""
-
-        def tried() -> Weights:
-            return (
-                design.weights.alone
-                if tolerate is not None
-                else tolerances_to_try(design.model, effort, at_end, self.solution.target)
-            )
-
-        def assumed(share: float, doubt: float) -> PlanModel:
-            return for_filter(_told_of(stated, share), memory, effort, doubt)
-
-        return with_margin(self.problem, self.solution, stated, design, tried, assumed)
-
-    def start(self, trials: int) -> "FilterRun | ReplannedRun":
-        records = empty_records(self._law, trials) if self.record else None
+    def start(self, trials: int) -> FilterRun | ReplannedRun:
         if self._sensing is not None:
-            return SensorRun(self._sensing, self._law, trials, records)
+            return SensorRun(self._sensing, self._law, trials, self.record)
         if self._rule is None:
-            return FilterRun(self._law, trials, records)
-        return ReplannedRun(self._rule, self._law, trials, records, always=self.replan_always)
+            return FilterRun(self._law, trials, self.record)
+        return ReplannedRun(self._rule, self._law, trials, self.record, always=self.replan_always)
 
     @property
     def plan(self) -> Plan:
@@ -249,7 +227,7 @@ class OffsetFree(Controller):
         met = self.uncertainty if uncertainty is None else uncertainty
         check_kind("uncertainty", met, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
         met.check(self.problem.dynamics)
-        truth = self.model.under(met.as_steady)
+        truth = self.model.under(met.steady(np.inf))
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits, self.model)
@@ -286,36 +264,60 @@ class OffsetFree(Controller):
         return self._law.coordinates
 
 
-def _told_of(model: PlanModel, share: float) -> PlanModel:
-    """The model with a share of its lag."""
-    told = model.uncertainty
-    return model.under(replace(told, lag=share * told.lag))
+def with_margin(
+    problem: Problem, solution: Solution, stated: PlanModel, design: Design, memory: float, effort: Array,
+    at_end: float | None,
+) -> Design:  # fmt: skip
+    """The design, or a milder one if it is much worse without the lag.
 
+    A filter and a law that are told of a lag compensate for it: the law commands more, and the filter explains
+    unexpected motion by actuators that run ahead of their commands. Without the lag, both overcompensate. Such a loop
+    may be unstable with any tolerances, and the robot then leaves its plan even undisturbed.
 
-def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.0) -> PlanModel:
-    """The model that a filter assumes: see `Uncertainty.steady`. It includes the least errors that a filter assumes.
+    Each design is therefore also predicted without the lag. If that is much worse, milder designs compete with it: the
+    filter assumes noise on the controls that bypasses the actuators, which is the effect of an unknown lag, and it may
+    be told of only a part of the lag. Among the designs that stay about as near to the plan if the lag exists, the one
+    with the least chance of failure with and without the lag is chosen. A lag of several control periods leaves little
+    choice: without it the robot stays near its plan, but may miss its goal.
 
     Args:
-      model: the model with the uncertainty as stated.
-      memory: seconds, or infinity, as for an `OffsetFree`.
-      effort: tolerated effort of the controls, (m,).
-      doubt: of the lag; see `lag_margin.py`.
+      stated: model of the true system, with a lag. memory, effort: as in `PlanModel.assumed`.
+      at_end: as in `tolerances_to_try`, which has the tolerances that compete; None to keep those of the design.
     """
-    stated, space, controls = model.uncertainty, model.dynamics.state_coordinates, model.dynamics.control_coordinates
-    told = stated.as_steady if memory == np.inf else stated.steady(memory)
-    moved = unit_means(space.units, reach_of(model, effort, 2)[-1])
-    control = per_entry("Uncertainty: control", stated.control, controls)
-    lost = stated.command_loss
-    control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
-    error = per_entry("Uncertainty: model_error", stated.model_error, space)
-    behind = doubt * Lag.of(stated.lag, model.plan.dt).mean * effort
-    directly = [
-        Unknown(OFFSET + name, float(std), time_constant=0.0)
-        for name, std in zip(controls.names, behind, strict=True)
-        if std
-    ]
-    assumed = replace(
-        told, unknowns=(*told.unknowns, *directly), control=tuple(np.maximum(control, INEXACT * effort).tolist()),
-        model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
-    )  # fmt: skip
-    return model.under(assumed)
+    uncertainty, space = stated.uncertainty.steady(np.inf), solution.policy.control_coordinates
+    limits = np.array(space.low), np.array(space.high)
+    # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
+    none = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
+    truths = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, none)]
+
+    def predicted(one: Design) -> Predictions:
+        """The predictions for C laws, with the lag and without it: (2, C)."""
+        loops = LinearLoop(truths[0], *one.laws, one.filter.gain, *limits, one.model).in_systems(truths)
+        with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
+            found = loops.moments(stated.n)
+            lost = np.asarray(~np.isfinite(found.covariance).all(axis=(-3, -2, -1)))
+        for part in found:
+            part[lost] = 0.0
+        shown = predictions(problem, solution, uncertainty, stated, found)
+        return Predictions(*(np.where(lost, gone, own) for gone, own in zip(GONE, shown, strict=True)))
+
+    found = predicted(design)
+    worth = worth_of(found, narrowest(stated, found.width[0]))
+    if worth[1, 0] <= worth[0, 0] + CLIFF:
+        return design
+    if at_end is None:
+        weights = design.weights.pick(None)
+    else:
+        weights = tolerances_to_try(design.model, effort, at_end, solution.target)
+    designs = [Design.of(design.model, design.filter, weights)]
+    for share, doubt in MILDER:
+        partly = stated.under(replace(stated.uncertainty, lag=share * stated.uncertainty.lag))
+        model = partly.assumed(memory, effort, doubt)
+        designs.append(Design.of(model, kalman_filter(model), weights))
+    found = [predicted(one) for one in designs]
+    widths = np.array([one.width[0] for one in found])
+    least = narrowest(stated, widths)
+    worth = np.array([worth_of(one, least) for one in found])
+    worth = np.where(widths > WIDER * least, np.inf, worth[:, 0] + ABSENT * worth[:, 1])
+    i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
+    return designs[i].pick(int(j))

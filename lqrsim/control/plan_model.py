@@ -111,6 +111,14 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
     return Sensor(text_source(str(made["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
 
 
+# The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
+# prediction, as if this effort had moved the state. A model is never exact: disturbances do not act evenly over a
+# control period, integration has errors, and the gains are computed about the plan. With exact sensors, a filter
+# without this assumption would infer unknowns from the last digits of its prediction errors.
+INEXACT = 0.02
+# The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
+# is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
+HELD = 0.3
 STEP = 1e-5  # step of a parameter for differences, relative to its value if that is larger than 1
 
 
@@ -389,6 +397,43 @@ class PlanModel:
         H = np.empty((self.plan.steps + 1, self.sensor.size, self.n))
         self.compiled.sensor_slopes(len(H), in_c_order(self.plan.states), self.compiled_sensor, H)
         return H
+
+    def reach(self, effort: Array, periods: Sequence[int]) -> Array:
+        """The motion of each state by random controls of an effort (m,), in each number of periods, (periods, n).
+
+        It is the rms over the plan, and over all states of the same unit.
+        """
+        n, steps, units = self.n, self.plan.steps, self.dynamics.state_coordinates.units
+        A, B = self.jacobian[:, :, :n], self.jacobian[:, :, n:]
+        moved, squares = B * effort, np.zeros((max(periods), n))
+        for k in range(min(len(squares), steps)):
+            squares[k] = np.vecdot(moved, moved).mean(axis=0)
+            moved = A[k + 1 :] @ moved[:-1]
+        reach = np.sqrt(np.maximum(squares.cumsum(axis=0), 1e-24))[np.array(periods) - 1]
+        same = np.array([[one == other for other in units] for one in units], dtype=np.float64)
+        return np.sqrt(reach**2 @ same / same.sum(axis=0))
+
+    def assumed(self, memory: float, effort: Array, doubt: float = 0.0) -> "PlanModel":
+        """The model that a filter assumes of this one: see `Uncertainty.steady`. Nothing in it is exact.
+
+        Args:
+          memory: seconds, or infinity, as for an `OffsetFree`.
+          effort: tolerated effort of the controls, (m,).
+          doubt: of the lag; see `with_margin`.
+        """
+        stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
+        steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss
+        control = per_entry("Uncertainty: control", stated.control, controls)
+        control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
+        error = per_entry("Uncertainty: model_error", stated.model_error, space)
+        behind = zip(controls.names, doubt * Lag.of(stated.lag, self.plan.dt).mean * effort, strict=True)
+        directly = [Unknown(OFFSET + name, float(std), time_constant=0.0) for name, std in behind if std]
+        assumed = replace(
+            steady, unknowns=(*steady.unknowns, *directly),
+            control=tuple(np.maximum(control, INEXACT * effort).tolist()),
+            model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
+        )  # fmt: skip
+        return self.under(assumed)
 
     # Noise, as square roots: a root times its transpose is the covariance.
 

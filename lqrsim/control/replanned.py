@@ -34,27 +34,31 @@ class ReplannedRun(ControllerRun):
 
     Args:
       rule: the periods in which to check whether a solve is needed.
-      records: as for `FilterRun`, of all trials.
       always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
       plans: plans of each trial, by the step at which they begin; without the first plan.
       log: the log of the solves.
-      estimates: as in `FilterRun`.
-      innovations: as in `FilterRun`.
+      estimates, innovations: as in `FilterRun`.
     """
 
-    def __init__(
-        self, rule: ReplanRule, law: FilterLaw, trials: int, records: tuple[Array, Array] | None, *, always: bool
-    ) -> None:
+    def __init__(self, rule: ReplanRule, law: FilterLaw, trials: int, record: bool, *, always: bool) -> None:
         self._rule, self._always = rule, always
-        self.estimates, self.innovations = records or (None, None)
-        self._runs = [
-            FilterRun(law, 1, None if records is None else (records[0][:, k : k + 1], records[1][:, k : k + 1]))
-            for k in range(trials)
-        ]
+        self._runs = [FilterRun(law, 1, record) for _ in range(trials)]
         self.plans: list[dict[int, Trajectory]] = [{} for _ in range(trials)]
         self.log, self._sent = ReplanLog(), list[Array | None]([None] * trials)
+
+    @property
+    def estimates(self) -> Array | None:
+        return self._of_all([run.estimates for run in self._runs])
+
+    @property
+    def innovations(self) -> Array | None:
+        return self._of_all([run.innovations for run in self._runs])
+
+    def _of_all(self, records: list[Array | None]) -> Array | None:
+        known = [one for one in records if one is not None]
+        return np.concatenate(known, axis=1) if known else None
 
     def control(self, step: int, measured: Array) -> Array:
         commands: list[Array] = []

@@ -254,8 +254,8 @@ class SensorRun(FilterRun):
       estimate: the estimate at the newest knot, with the readings that have arrived.
     """
 
-    def __init__(self, filter_: SensorFilter, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
-        super().__init__(law, trials, records)
+    def __init__(self, filter_: SensorFilter, law: FilterLaw, trials: int, record: bool) -> None:
+        super().__init__(law, trials, record)
         self._filter, self._read = filter_, filter_.sensors.reader()
         self.innovations = None  # readings of one knot arrive at several
         self.estimate = self._kept = filter_.start(trials, law.nominal[0])

@@ -23,7 +23,6 @@ from scipy.special import ndtr
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import Feedback
-from lqrsim.control.emphasis import emphasis_of
 from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.linear_loop import ClosedLoop, LinearLoop
 from lqrsim.control.plan_model import PlanModel
@@ -121,7 +120,7 @@ def choose_tolerances(
         return weights, laws
     mean, covariance, across = found.mean[best], found.covariance[best], found.across[best]
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    emphasis = emphasis_of(surroundings, model.plan.states + mean, covariance, across, weights.state)
+    emphasis = surroundings.emphasis(model.plan.states + mean, covariance, across, weights.state)
     if not emphasis.any():
         return weights, laws
     stressing = weights.stressing(emphasis, EMPHASIS)
@@ -141,8 +140,7 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
     periods = [one for one in PERIODS if one <= longest]
-    reach = reach_of(model, effort, periods[-1])[np.array(periods) - 1]
-    tried = list(unit_means(model.dynamics.state_coordinates.units, reach))
+    tried = list(model.reach(effort, periods))
     if (free := np.isnan(target.state)).any():
         tried += [np.where(free, WIDE * one, one) for one in tried]
     each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
@@ -198,23 +196,6 @@ def narrowest(model: PlanModel, widths: Array) -> float:
 def worth_of(told: Predictions, least: float) -> Array:
     """How bad each law is: its chance to fail, more with saturation and with a tube wider than `least`."""
     return told.chance + FRAGILE * told.saturation**2 + NARROW * np.maximum(told.width / least, 1.0)
-
-
-def reach_of(model: PlanModel, effort: Array, periods: int) -> Array:
-    """The motion of each state by random controls of an effort, in 1 to P periods: rms over the plan, (P, n)."""
-    n, steps = model.n, model.plan.steps
-    A, B = model.jacobian[:, :, :n], model.jacobian[:, :, n:]
-    moved, squares = B * effort, np.zeros((periods, n))
-    for k in range(min(periods, steps)):
-        squares[k] = np.vecdot(moved, moved).mean(axis=0)
-        moved = A[k + 1 :] @ moved[:-1]
-    return np.sqrt(np.maximum(squares.cumsum(axis=0), 1e-24))
-
-
-def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
-    """Replace numbers (..., n) by the rms over all states of the same unit."""
-    same = np.array([[one == other for other in units] for one in units], dtype=np.float64)
-    return np.sqrt(numbers**2 @ same / same.sum(axis=0))
 
 
 def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:

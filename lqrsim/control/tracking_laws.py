@@ -4,10 +4,10 @@ With z = (e, a, d) as in `plan_model.py` and u the deviation of the command, it 
 
     sum_t  e' (Q + E_t) e + (u + M_t d)' R (u + M_t d)  +  e_T' (Q_T + E_T) e_T.
 
-E_t is the emphasis on deviations that lead to a collision; see `emphasis.py`. M_t d is the control that cancels the
-unknowns' effect on the next state as far as controls can. It costs nothing; otherwise a steady disturbance would leave
-a steady error. For the same reason a law assumes that the current disturbance continues: a law that expects a wind to
-abate yields to one that does not.
+E_t is the emphasis on deviations that lead to a collision; see `Surroundings.emphasis`. M_t d is the control that
+cancels the unknowns' effect on the next state as far as controls can. It costs nothing; otherwise a steady disturbance
+would leave a steady error. For the same reason a law assumes that the current disturbance continues: a law that expects
+a wind to abate yields to one that does not.
 
 If commands get lost, the law minimises the expected sum over the losses (Schenato 2009: LQG with a hold). When a
 command is lost, the previous one is held. It may be large, which makes the law gentle. The effort of a lost command
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lqrsim.annotations import Positive, checked
-from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.compiled_module import module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import per_entry
@@ -68,11 +68,6 @@ class Weights:
         end, last = state.copy(), list(space.position) or slice(None)
         end[last] *= at_end
         return cls(state**-2.0, effort**-2.0, end**-2.0)
-
-    @property
-    def alone(self) -> "Weights":
-        """These as those of one to compare."""
-        return self.pick(None)
 
     def pick(self, i: int | None) -> "Weights":
         """Those of one of C."""
@@ -151,7 +146,7 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     sizes, laws = PassSizes(len(state), own, model.size, m, lost), np.empty(undo.shape)
     given = PassArrays(weights.control, every.ravel(), undo.ravel(), held.ravel(), laws.ravel())
     work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
-    improve = _kernels().lay_out("improve", 0, sizes, given, work)
+    improve = module_of(source_of(tracking_law), "tracking laws").lay_out("improve", 0, sizes, given, work)
     for t in range(steps - 1, -1, -1):
         if averse is not None:
             cost[0, :, :own], cost[0, :, -1] = averse.worst(t, cost[0, :, :own], cost[0, :, -1])
@@ -161,11 +156,6 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
             cost[:, :n, :n] += emphasis[:, t]
     gain, offset = laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1]
     return (gain, offset) if weights.state.ndim == 2 else (gain[0], offset[0])
-
-
-def _kernels() -> CompiledModule:
-    """`kernels/tracking_law.py`, which is compiled once for all sizes."""
-    return module_of(source_of(tracking_law), "tracking laws")
 
 
 def _undoing(model: PlanModel, state: Array) -> Array:

@@ -149,21 +149,18 @@ class Uncertainty:
             for name in unknown.shares:
                 check_name("Uncertainty: unknowns", name, possible_unknowns(dynamics))
 
-    @checked
-    def steady(self, memory: float, share: NonNegative = MEAN) -> "Uncertainty":
+    def steady(self, memory: float) -> "Uncertainty":
         """The uncertainty for a filter: varying unknowns may have a nonzero mean, and constant unknowns may change.
 
         In the linear model, this leaves no steady error: a filter that assumes a constant stops adapting, and one that
         assumes a wind of mean zero is biased for a steady wind.
 
         Args:
-          memory: seconds in which a constant may wander by its standard deviation.
-          share: standard deviation of a varying unknown's mean, relative to the unknown's.
-
-        Returns:
-          An Uncertainty.
+          memory: seconds in which a constant may wander by its standard deviation. With np.inf constants do not change,
+            and what varies has the mean zero: the same uncertainty, with its unknowns in the order of a filter's.
         """
         memory = check_seconds("memory", memory, above=0.0)
+        share = 0.0 if memory == np.inf else MEAN
         constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
         for one in self.unknowns:
             constants.setdefault(tuple(sorted(one.shares.items())), []).append(one)
@@ -173,11 +170,6 @@ class Uncertainty:
             drift = float(np.hypot.reduce([one.drift for one in same if one.constant] or [0.0]))
             kept.append(Unknown(same[0].of, std, drift=max(drift, std / np.sqrt(memory))))
         return replace(self, unknowns=(*kept, *(one for one in self.unknowns if not one.constant)))
-
-    @property
-    def as_steady(self) -> "Uncertainty":
-        """This uncertainty with unknowns in the order of `steady`: zero means have a standard deviation of 0."""
-        return self.steady(np.inf, share=0.0)
 
 
 def possible_unknowns(dynamics: Dynamics) -> list[str]:
