@@ -124,12 +124,6 @@ def run(
       lost_after: stop after so long without a state, in s; by default three control periods, in lockstep `patience`.
       patience: time in s to wait for the other program to appear, and for the first state.
       domain: domain of DDS; by default ROS_DOMAIN_ID, or 0.
-
-    Returns:
-      The record of the run.
-
-    Raises:
-      InputError: the robot is not there, or cyclonedds is not installed.
     """
     law, dt, steps, nominal = _law_of(controller)
     states, controls = law.coordinates
@@ -153,10 +147,10 @@ def run(
     try:
         for step in range(steps):
             due = begun + step * dt
-            if not lockstep:
-                _sleep_until(due)
-            elif step:
+            if lockstep and step:
                 inlet.wait(longest)
+            while not lockstep and (left := due - time.monotonic()) > 0:
+                time.sleep(left)
             began = time.monotonic()
             held += not inlet.take() and step > 0
             if (age := began - inlet.arrived) > longest:
@@ -268,11 +262,6 @@ def _wait(until: Callable[[], Any], patience: float, lacking: Callable[[], str])
         if time.monotonic() > end:
             raise InputError(f"{lacking()} within {patience:g} s, want the other program, in the same domain")
         time.sleep(1e-3)
-
-
-def _sleep_until(due: float) -> None:
-    while (left := due - time.monotonic()) > 0:
-        time.sleep(left)
 
 
 def _law_of(given: Bridgeable) -> tuple[Controller, float, int, Array]:

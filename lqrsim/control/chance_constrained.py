@@ -130,11 +130,7 @@ def smooth_chance_constrained(
       progress: called with the number of plans that are done, the largest possible number of plans, and a text about
         the last one. The largest number counts plans with margins and plans with heavier obstacles.
 
-    Returns:
-      The SafePlan.
-
     Raises:
-      InputError: there are no obstacles, an option is out of range, or something does not fit the system.
       KeyboardInterrupt: Ctrl-C; its `found` is the SafePlan of the rounds that are done, None if there are none.
     """
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
@@ -164,7 +160,6 @@ def smooth_chance_constrained(
 
 
 def _weighing(problem: Problem, times: float) -> Problem:
-    """The problem with the weights of its obstacles multiplied."""
     return problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, times))
 
 
@@ -245,7 +240,6 @@ class _Search:
             self.enough, self.log_of_enough = deviations, np.log(max(tube.collision_chance, 1e-300))
 
     def _keep(self, problem: Problem, solution: Solution, weight: float) -> Tube:
-        """Predict the outcome of a plan, and keep it."""
         controller, margin = self._controller(problem, solution), self.margin
         tube = predict_tube(problem, solution, self.uncertainty, controller)
         plan = SafePlan(
@@ -266,7 +260,6 @@ class _Search:
                 yield times
 
     def solve_heavier(self, times: float) -> None:
-        """Plan with heavier obstacles and without margins, and predict the outcome."""
         problem = _weighing(self.problem, times)
         solution, self.margin = smooth(problem), np.zeros((1, 1))
         if solution.success:
@@ -283,7 +276,6 @@ class _Search:
         return OffsetFree(problem, solution, self.uncertainty)
 
     def _spread(self, plan: SafePlan) -> Spread:
-        """The distribution of the clearances along the plan."""
         tube = plan.tube
         return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 

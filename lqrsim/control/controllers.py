@@ -67,35 +67,23 @@ class ControllerRun(abc.ABC):
 
     @abc.abstractmethod
     def control(self, step: int, measured: Array) -> Array:
-        """The controls of a control period.
-
-        Each trial gets the same bits as it would alone.
+        """The controls (K, m) of a control period, within the limits. Each trial gets the same bits as it would alone.
 
         Args:
           step: number of the control period; called once for each, in order.
           measured: (K, n), the measured states; for a controller with `sensors` their readings, (K, Y).
-
-        Returns:
-          Controls (K, m) within the limits.
         """
 
     def estimator_diverged(self) -> Mapping[int, str]:
-        """Trials whose estimate is useless, each with a reason in one line.
+        """Rows of the trials whose estimate is useless, each with a reason in one line.
 
         They end in that period and count as diverged. The method is called after each control period. Controllers
         without an estimator need not override it.
-
-        Returns:
-          Row of the trial -> the reason.
         """
         return {}
 
     def moved_goal(self) -> Array | None:
-        """The goal of the trials, if it moved during the run.
-
-        Returns:
-          (n,), NaN in states that do not count; None if the goal is still that of the plan.
-        """
+        """The goal (n,) of the trials if it moved in the run, NaN in states that do not count; else None."""
         return None
 
     def summary(self) -> str:
@@ -112,14 +100,7 @@ class Controller(abc.ABC):
 
     @abc.abstractmethod
     def start(self, trials: int) -> ControllerRun:
-        """Begin a run of trials.
-
-        Args:
-          trials: K, the number of trials that run at once.
-
-        Returns:
-          The run; after `simulate` it is the rollout's `controller_run`.
-        """
+        """The run of K trials; after `simulate` it is the rollout's `controller_run`."""
 
     @property
     @abc.abstractmethod
@@ -228,7 +209,6 @@ class OutputFeedback(_OfPolicy):
 
     @property
     def measures(self) -> list[int]:
-        """The indices of the measured states."""
         return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
 
     def start(self, trials: int) -> ControllerRun:

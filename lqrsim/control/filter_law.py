@@ -36,7 +36,6 @@ class Design:
 
     @classmethod
     def of(cls, model: PlanModel, kalman: KalmanFilter, weights: Weights) -> "Design":
-        """The design with the laws of these weights."""
         return cls(model, kalman, weights, tracking_laws(model, weights))
 
     def pick(self, i: int) -> "Design":
@@ -77,7 +76,6 @@ class FilterLaw:
 
     @property
     def coordinates(self) -> Spaces:
-        """Coordinates of the states and of the controls."""
         return spaces_of(self.plan.policy)
 
     @property
@@ -168,7 +166,6 @@ class FilterRun(ControllerRun):
         return out
 
     def _predict(self, estimates: Array, commands: Array) -> None:
-        """Predict estimates by one control period."""
         with self.model.dynamics.quiet():
             self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
 

@@ -104,11 +104,6 @@ class OffsetFree(Controller):
       gain: gain of the law, (T, m, Z).
       offset: offset of the law, (T, m).
       nominal: z in an undisturbed run, (T+1, Z).
-
-    Raises:
-      InputError: something does not fit the system; an unknown changes no measurement; sensors of the MJCF come with
-        `replan_every` or an uncertainty of measurements, or one reads the same in all states; or `replan_every` is
-        shorter than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
     """
 
     @checked

@@ -93,7 +93,6 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
 
 
 def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -> Sensor:
-    """The sensor of a formula of the state."""
     check_signature(function, ("x", "u", "p"))
     of = name_of(function)
 
@@ -267,7 +266,6 @@ class PlanModel:
 
     @cached_property
     def predictor(self) -> Predictor:
-        """Record for the compiled predictions."""
         lag = np.array([self.lag.left, self.lag.mean])
         return Predictor(self.compiled_dynamics, self.plan.dt, self.places, lag, self.transition, self.output)
 
@@ -286,12 +284,10 @@ class PlanModel:
 
     @cached_property
     def compiled_dynamics(self) -> DynamicsModel:
-        """The dynamics in the form that compiled code takes."""
         return dynamics_model(self.dynamics)
 
     @cached_property
     def compiled_sensor(self) -> SensorModel:
-        """The sensor in the form that compiled code takes."""
         module = module_of(self.sensor.source, "sensors", N=self.n, M=self.m, W=self.n + self.m)
         measure, slope = module.addresses("measure", "measure_slope")
         return SensorModel(measure, slope, self.sensor.data)
@@ -491,7 +487,6 @@ class PlanModel:
 
 
 def _diagonal(blocks: list[Array]) -> Array:
-    """A matrix of these blocks along the diagonal."""
     size = sum(len(block) for block in blocks)
     whole, at = np.zeros((size, size)), 0
     for block in blocks:

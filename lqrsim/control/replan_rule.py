@@ -42,11 +42,7 @@ class ActivePlan:
     first: int
 
     def row(self, step: int) -> int:
-        """The index of the plan's law at a step; after the horizon, the index of the last law.
-
-        Returns:
-          The index of a row of the gains.
-        """
+        """The index of the plan's law at a step; after the horizon, of the last law."""
         return min(max(step - self.first, 0), self.plan.trajectory.steps - 1)
 
 
@@ -106,15 +102,10 @@ class ReplanLog:
         self.solved, self.kept = 0, Counter[str]()
 
     def enter(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
-        """Count a solve.
+        """Whether the new plan of a solve is to be used. Counts the solve.
 
         Args:
-          step: control period in which the solve began.
-          trial: number of a simulation, else 0.
           late: whether the answer came after the deadline.
-
-        Returns:
-          Whether the new plan is to be used.
         """
         reason = "" if replan.success else replan.status.name
         if late:
@@ -137,22 +128,11 @@ class ReplanLog:
         return used
 
     def refuse(self, reason: str) -> None:
-        """Count a solve that did not begin.
-
-        Args:
-          reason: why it did not begin.
-        """
+        """Count a solve that did not begin."""
         self.kept[reason] += 1
 
     def summary(self, *, times: bool = False) -> str:
-        """The number of solves, and the reasons why the previous law continued, in one line.
-
-        Args:
-          times: whether to include the durations of the solves.
-
-        Returns:
-          A line of text.
-        """
+        """The number of solves, and why the previous law continued, in one line; with `times`, how long solves took."""
         line = f"solved again {self.solved} times"
         early = Counter(one.reason for one in self.records if one.used and one.reason)
         if early:
@@ -229,8 +209,12 @@ class ReplanRule:
                 f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"
                 f" {name}={self.every:g} s, {self.periods} control periods: one solve at a time"
             )
+        if when is not None and not np.array_equal(when.plan.states, plan.states):
+            raise InputError(f"{who}: when: got a funnel of another plan, want a funnel of the solution")
+        if when is not None and horizon != "shrinking":
+            raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want horizon="shrinking"')
         self.horizon, self.predict, self.share = horizon, predict, share
-        self.problem, self.solution, self.when = problem, solution, _checked_funnel(who, when, solution, horizon)
+        self.problem, self.solution, self.when = problem, solution, when
         if when is None and self.share != 1:
             raise InputError(f"{who}: share: got {self.share:g} without a funnel, want when=... beside it")
         self.changes, self._who = changes, who
@@ -308,7 +292,6 @@ class ReplanRule:
         return state, None if controls is None else controls[-1]
 
     def solve(self, request: SolveRequest, time_limit: float | None = None) -> Replan:
-        """The answer to a request."""
         problem, after = request.problem, request.first
         if self.horizon == "moving":
             problem, after = problem.later(request.first * problem.dt), 0
@@ -328,12 +311,3 @@ def within_rates(commands: Array, problem: Problem, sent: Array | None) -> Array
         return commands
     low, high = np.asarray(rate.limits) * problem.dt
     return np.clip(commands, sent + low, sent + high)
-
-
-def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str) -> Funnel | None:
-    """Raises InputError unless it is None, or a funnel of the solution with a fixed end."""
-    if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
-        raise InputError(f"{who}: when: got a funnel of another plan, want a funnel of the solution")
-    if when is not None and horizon != "shrinking":
-        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want horizon="shrinking"')
-    return when

@@ -88,7 +88,6 @@ class LiveReplanner:
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Self:
-        """Start the thread that solves."""
         if self._thread is not None:
             raise InputError("LiveReplanner: got a second `with` on it, want a new replanner.live() for each run")
         self._thread = threading.Thread(target=self._work, name="lqrsim re-planner", daemon=True)
@@ -102,20 +101,14 @@ class LiveReplanner:
             self._thread.join()
 
     def summary(self) -> str:
-        """The number of solves, their times, and the reasons why the previous law was kept, in a line."""
+        """The number of solves, their times, and why the previous law was kept, in a line."""
         return self.log.summary(times=True)
 
     def change(self, **parts: Any) -> None:
-        """Change the problem from the next solve on: `live.change(final_cost=...)`; see `dataclasses.replace`.
+        """Change fields of the problem from the next solve on: `live.change(final_cost=...)`.
 
         Goals, weights, obstacles, parameters and limits can change. To change an estimate of a disturbance, plan with
         `dynamics.disturbed` from the beginning. dt, steps, states and controls cannot.
-
-        Args:
-          **parts: field of `Problem` -> new value.
-
-        Raises:
-          InputError: the result is no valid problem; it would have to be compiled; or something changes that cannot.
         """
         try:
             changed = replace(self.problem, **parts)
@@ -125,15 +118,7 @@ class LiveReplanner:
         self.problem = self._rule.checked("change", changed)
 
     def step(self, state: npt.ArrayLike, t: float) -> Array:
-        """The control (m,) to apply in a measured state (n,), `t` seconds after the start.
-
-        Args:
-          state: (n,), the measured state.
-          t: seconds since the start, 0 or more.
-
-        Returns:
-          (m,).
-        """
+        """The control (m,) to apply in a measured state (n,), `t` seconds after the start."""
         if self._thread is None or not self._thread.is_alive():
             raise InputError(
                 "LiveReplanner: got a step without its thread, want it within `with replanner.live() as live:`"
@@ -179,7 +164,6 @@ class LiveReplanner:
             self.active = ActivePlan(solve.answer, solve.request.first)
 
     def _work(self) -> None:
-        """The thread: one solve after the other."""
         while (solve := self._queue.get()) is not None:
             try:
                 left = solve.deadline - self._clock() - SPARE
@@ -229,9 +213,6 @@ class Replanner(Controller):
       computing: duration of a solve in simulations, in seconds: a number; a function that draws it from a
         `numpy.random.Generator`; or "measured".
       seed: seed of the random numbers for `computing`.
-
-    Raises:
-      InputError: `every` is shorter than a control period or the deadline, or the solution is of another problem.
     """
 
     @checked
@@ -277,9 +258,6 @@ class Replanner(Controller):
           interpolate: whether laws are blended between two knots, for loops that are faster than the plan; see
             `AffinePolicy`.
           clock: returns the time in seconds, for deadlines.
-
-        Returns:
-          A LiveReplanner, for one run.
         """
         return LiveReplanner(self.rule, interpolate=interpolate, clock=clock)
 
@@ -338,13 +316,11 @@ class ReplannerRun(ControllerRun):
         return self.log.summary(times=self._of.computing == MEASURED)
 
     def _activate(self, step: int) -> None:
-        """Put plans into force that begin at this step."""
         for trial, plan in enumerate(self._next):
             if plan is not None and plan.first == step:
                 self.active[trial], self._next[trial] = plan, None
 
     def _replan(self, step: int, measured: Array) -> None:
-        """Solve for all trials for which a solve is due."""
         rule = self._rule
         self._problem = problem = rule.problem_at(step, rule.problem)
         trials = [k for k, active in enumerate(self.active) if rule.outside(active, step, measured[k])]

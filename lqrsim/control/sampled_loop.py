@@ -152,7 +152,6 @@ class _Robots:
         return x
 
     def measure(self, t: int) -> Array:
-        """The measured states, (K, n)."""
         told, measured = self.model.uncertainty, self._late_measured
         measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.shown_std)
         shown = measured.popleft() if t >= told.latency else measured[0]

@@ -270,9 +270,6 @@ def track(
         effect of lost commands.
       risk: theta: minimise (1/theta) log E exp(theta/2 * sum of squares) under the problem's noise along the plan. A
         theta above 0 penalises large deviations more. Tolerances must then be given.
-
-    Returns:
-      The policy.
     """
     check_plan("track", problem, solution)
     risk = check_number("track: risk", risk)

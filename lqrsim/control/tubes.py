@@ -84,11 +84,7 @@ class Tube:
 
     @checked
     def added_to(self, rollout: Rollout) -> Rollout:
-        """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
-
-        Returns:
-          The rollout with its `tube` and `collision_chance`.
-        """
+        """The rollout with the covariance of the position and the chance of collision, for its figures and videos."""
         if not self.state_coordinates.position:
             raise InputError("Tube: state_coordinates.position: got none, want the 2 or 3 states that are the position")
         if not np.array_equal(rollout.plan.states, self.plan.states):
@@ -116,13 +112,6 @@ def predict_tube(
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
         written in plain Python, and with distances by MuJoCo.
-
-    Returns:
-      The Tube.
-
-    Raises:
-      InputError: something does not fit the system; the controller is of another kind; samples are requested with
-        MuJoCo's distances; or there is a latency or a delay, but no samples.
     """
     check_plan("predict_tube", problem, solution)
     check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")

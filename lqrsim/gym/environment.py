@@ -111,7 +111,6 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         return self._picture.draw(episode.rollout, episode.frames[0], episode.time)
 
     def close(self) -> None:
-        """Free the resources of pictures."""
         self._picture.close()
 
     def _info(self, episode: Episode) -> dict[str, Any]:

@@ -33,7 +33,6 @@ from lqrsim.scenarios.solutions import given, remarks, solve
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.simulation.closed_loop import ClosedLoop
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.run_settings import RunSettings
 from lqrsim.solvers.compiled import CostsByStep
 
@@ -68,7 +67,9 @@ class Task:
         if not isinstance(scenario, Scenario):
             kinds = "a Scenario, or a reference to one, such as 'quadrotor,query=3'"
             scenario = resolve(check_kind("scenario", scenario, str, kinds))
-        self.scenario, self.plant = scenario, _plant_of(scenario)
+        self.scenario, self.plant = scenario, scenario.plant()
+        own, robot = spaces_of(scenario.problem.dynamics), self.plant.robot
+        check_same_system("scenario", "a problem", own, spaces_of(robot.dynamics), f"robot {robot.name}")
         self._actions = actions
         self._given = None if solution is None else given(self.scenario, solution)
         for remark in [] if self._given is None else remarks(self.scenario, self._given):
@@ -92,7 +93,6 @@ class Task:
 
     @cached_property
     def costs(self) -> CostsByStep:
-        """The costs of the scenario's problem."""
         problem, plan = self.scenario.problem, self.solution.trajectory
         if (problem.steps, problem.dt) != (plan.steps, plan.dt):
             got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} of {problem.dt:g} s"
@@ -100,7 +100,6 @@ class Task:
         return CostsByStep(problem)
 
     def action_space(self) -> Box:
-        """The action space of one environment, (m,)."""
         if self._actions == "controls":
             return Box(self.low, self.high, dtype=np.float64)
         return Box(-1.0, 1.0, self.low.shape, dtype=np.float64)
@@ -120,7 +119,6 @@ class Task:
         return self.low + (actions + 1) / 2 * (self.high - self.low)
 
     def actions_of(self, controls: Array) -> Array:
-        """Convert controls (..., m) to actions (..., m)."""
         if self._actions == "controls":
             return controls
         return np.clip(2 * (controls - self.low) / (self.high - self.low) - 1, -1.0, 1.0)
@@ -156,25 +154,20 @@ def reset_options(options: Any) -> dict[str, Any]:
     return dict(check_kind("options", options, (Mapping, type(None)), "options by name, or None") or {})
 
 
-def _plant_of(scenario: Scenario) -> Plant:
-    """The scenario's plant. Raises InputError if its problem has other states or controls."""
-    plant = scenario.plant()
-    own, robot = spaces_of(scenario.problem.dynamics), plant.robot
-    check_same_system("scenario", "a problem", own, spaces_of(robot.dynamics), f"robot {robot.name}")
-    return plant
-
-
 Flags = npt.NDArray[np.bool_]
 
 
-class Commanded(Controller):
-    """A controller whose commands come from outside."""
+class Commanded(Controller, ControllerRun):
+    """A controller, and its run, whose commands come from outside: set `commands` (K, m) before each control period."""
 
-    def __init__(self, coordinates: tuple[Coordinates, Coordinates]) -> None:
-        self._coordinates = coordinates
+    def __init__(self, coordinates: tuple[Coordinates, Coordinates], trials: int) -> None:
+        self._coordinates, self.commands = coordinates, np.zeros((trials, len(coordinates[1])))
 
-    def start(self, trials: int) -> "CommandedRun":
-        return CommandedRun(np.zeros((trials, len(self._coordinates[1]))))
+    def start(self, trials: int) -> "Commanded":
+        return self
+
+    def control(self, step: int, measured: Array) -> Array:
+        return self.commands
 
     @property
     def digest(self) -> str:
@@ -183,16 +176,6 @@ class Commanded(Controller):
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
         return self._coordinates
-
-
-class CommandedRun(ControllerRun):
-    """Set `commands` (K, m) before each control period."""
-
-    def __init__(self, commands: Array) -> None:
-        self.commands = commands
-
-    def control(self, step: int, measured: Array) -> Array:
-        return self.commands
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +198,6 @@ class Resettable:
 
     @property
     def solution(self) -> Solution:
-        """The solution with the plan."""
         return self.task.solution
 
     def rollout(self) -> Rollout:
@@ -258,9 +240,9 @@ class Episode:
     ) -> None:  # fmt: skip
         self.task, self.seed, self.first = task, seed, first_trial
         dynamics = task.plant.robot.dynamics
-        commanded = Commanded(spaces_of(dynamics))
+        self._commanded = Commanded(spaces_of(dynamics), count)
         settings = RunSettings(
-            plant=task.plant, plan=task.solution, disturbances=disturbances, controller=commanded,
+            plant=task.plant, plan=task.solution, disturbances=disturbances, controller=self._commanded,
             seed=seed, trials=count, first_trial=first_trial, frames=frames, threads=threads,
             **task.scenario.near_enough(),
         )  # fmt: skip
@@ -278,7 +260,6 @@ class Episode:
 
     @property
     def time(self) -> float:
-        """Seconds since the start."""
         return self._loop.step * self._plan.dt
 
     @property
@@ -297,11 +278,8 @@ class Episode:
         return self._loop.physics.frame()
 
     def advance(self, controls: Array) -> Moment:
-        """Run one control period with controls (K, m)."""
         loop, step, before = self._loop, self._loop.step, self.states
-        run = self._loop.controller_run
-        assert isinstance(run, CommandedRun)
-        run.commands = controls
+        self._commanded.commands = controls
         with unlogged():
             loop.period()
             if loop.step == self._plan.steps:

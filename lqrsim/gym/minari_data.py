@@ -42,9 +42,6 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
 
     Returns:
       The `minari.MinariDataset`.
-
-    Raises:
-      InputError: Minari is not installed, the data set exists, the runs are of another plan, or none has an episode.
     """
     try:
         import minari

@@ -18,18 +18,10 @@ def _registry() -> dict[str, type[Robot]]:
 
 
 def names() -> list[str]:
-    """Names of the robots.
-
-    Returns:
-      The names, sorted.
-    """
+    """The names of the robots, sorted."""
     return sorted(_registry())
 
 
 def get(name: str) -> Robot:
-    """The robot of that name, with its default constants.
-
-    Args:
-      name: one of `names()`.
-    """
+    """The robot of that name, with its default constants."""
     return _registry()[check_name("robot", name, names())]()

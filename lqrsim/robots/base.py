@@ -3,6 +3,7 @@
 import abc
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_kind, vectors_of
@@ -57,14 +58,7 @@ class Robot(abc.ABC):
         return {"balls": self.balls} if self.balls is not None else {"radius": self.radius}
 
     def among(self, world: "World") -> "ShapeInWorld":
-        """The collision shape among other obstacles than those of the scene, which move at their velocity.
-
-        Args:
-          world: the obstacles, where they are at the time 0 of a run.
-
-        Raises:
-          InputError: the shape has no distance to one of them.
-        """
+        """The collision shape among obstacles that are not the scene's; they may move, and are as at the time 0."""
         from lqrsim.problem.collision_shape import shape_in
         from lqrsim.scenes.world import World
 
@@ -81,52 +75,22 @@ class Robot(abc.ABC):
 
     @abc.abstractmethod
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
-        """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv).
-
-        The states of the `activations` are not included.
+        """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv), without the `activations`.
 
         Args:
-          qpos: (..., nq) of MuJoCo.
-          qvel: (..., nv) of MuJoCo.
           near: (..., n), a state; angles are returned in the representative nearest to it. None for any representative.
         """
 
     @abc.abstractmethod
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        """The `qpos` (..., nq) and `qvel` (..., nv) that realise an analytic state (..., n).
-
-        Args:
-          state: (..., n).
-
-        Returns:
-          qpos (..., nq) and qvel (..., nv).
-        """
+        """The `qpos` (..., nq) and `qvel` (..., nv) that realise an analytic state (..., n)."""
 
     def with_closed_loops(self, states: npt.ArrayLike) -> Array:
-        """The states near those given that the robot can be in: the same by default, without kinematic loops.
-
-        Args:
-          states: (..., n).
-
-        Returns:
-          (..., n).
-
-        Raises:
-          InputError: there is none near a state.
-        """
+        """The states (..., n) near those given that the robot can be in: by default the same, without loops."""
         return vectors_of("states", states, len(self.dynamics.state_coordinates))
 
     def actuation(self, control: npt.ArrayLike) -> Array:
-        """MuJoCo's `ctrl` (..., nu) that realises an analytic control (..., m); the same numbers by default.
-
-        Args:
-          control: (..., m).
-
-        Returns:
-          (..., nu).
-        """
-        import numpy as np
-
+        """The `ctrl` (..., nu) of MuJoCo that realises an analytic control (..., m); the same numbers by default."""
         return np.asarray(control, dtype=np.float64)
 
 

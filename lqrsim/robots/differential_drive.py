@@ -50,11 +50,7 @@ class DifferentialDrive(Robot):
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        """The qpos (..., 9) and qvel (..., 8) at rest, wheels on a floor at height zero.
-
-        Args:
-          state: (..., 3).
-        """
+        """The qpos (..., 9) and qvel (..., 8) at rest in states (..., 3), wheels on a floor at height zero."""
         state = vectors_of("state", state, 3)
         qpos = np.zeros((*state.shape[:-1], 9))
         qpos[..., :2] = state[..., :2]

@@ -108,10 +108,6 @@ class MjcfRobot(Robot):
       mjcf: its MJCF, with joints and actuators. scene: the scene that the robot moves in.
       dynamics: MuJoCo's steps.
       geoms: its colliding geoms. balls: an outline of it, or None.
-
-    Raises:
-      InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: deformable parts, delays, plugins with states.
     """
 
     @checked
@@ -181,14 +177,7 @@ class MjcfRobot(Robot):
 
     @checked
     def among(self, world: World) -> ShapeInWorld:
-        """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them.
-
-        Args:
-          world: the obstacles, where they are at the time 0 of a run.
-
-        Raises:
-          InputError: an obstacle is a mesh or the like, or has the name of a geom.
-        """
+        """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them."""
         if not len(world):
             return shape_in(self.dynamics, world, geoms=self.geoms)
         copy = Scene(self.mjcf.with_obstacles(world), World(), ())
@@ -200,7 +189,6 @@ class MjcfRobot(Robot):
         return shape_in(other.dynamics, there, geoms=other.geoms)
 
     def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
-        """The states that are the position, and its plane."""
         axes = self._axes
         if asked is None:
             found = sorted(axes.of, key=lambda dof: axes.of[dof])
@@ -260,9 +248,6 @@ class MjcfRobot(Robot):
 
         Args:
           margin: the least distance in metres.
-
-        Raises:
-          InputError: the margin is not a number, or no two links can collide.
         """
         found = SelfClearance(self.mjcf, self.body, margin)
         if not found.links:
@@ -276,44 +261,29 @@ class MjcfRobot(Robot):
         """The robot with other numbers in its MJCF, for plans and plants: `robot.with_parameters(mass=0.6)`.
 
         `dynamics.numbers` has the names and values. `dynamics.with_parameters` changes the numbers for a plan alone.
-
-        Args:
-          **values: number of the MJCF, as in `dynamics.numbers` -> value.
-
-        Returns:
-          An MjcfRobot.
         """
         changed = self.dynamics.with_parameters(**values)
         scene = scene_of(changed.mjcf, self.scene.geoms, (*KINDS, *OTHER_KINDS))
         return MjcfRobot(scene, **self._stated)
 
     def hold(self, state: npt.ArrayLike) -> Array:
-        """The controls that hold the robot still, by MuJoCo's own forces: torques, or the targets of servos.
+        """The controls (m,) that hold the robot still, by MuJoCo's own forces: torques, or the targets of servos.
+
+        They are the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
+        those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
+        which activations never rest, as an integrator's whose control cannot be 0.
 
         Args:
           state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
-
-        Returns:
-          (m,), the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
-          those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
-          which activations never rest, as an integrator's whose control cannot be 0.
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
     def settled(self, state: npt.ArrayLike) -> Array:
-        """A nearby state in which the robot stands at rest. Joints without actuators, such as a free base, move to it.
+        """A state (n,) near another in which the robot stands at rest; `hold` has the controls for it.
 
-        Legs keep their angles. The base moves to where the contacts, which are springs, carry it. A base that touches
-        nothing is let down first. Activations of actuators take the values that hold it.
-
-        Args:
-          state: (n,), whose velocities do not count.
-
-        Returns:
-          (n,), with velocities of zero; `hold` has the controls for it.
-
-        Raises:
-          InputError: nothing nearby is at rest.
+        Joints without actuators, such as a free base, move to it. Legs keep their angles. The base moves to where the
+        contacts, which are springs, carry it. A base that touches nothing is let down first. Activations of actuators
+        take the values that hold it.
         """
         state = check_array("state", state, (len(self.dynamics.state_coordinates),))
         model = self.dynamics.physics.model
@@ -399,13 +369,6 @@ class MjcfRobot(Robot):
             that no control keeps at the start stay in the dynamics, as all do if MuJoCo's steps are unstable without
             them, or with False: then forces may saturate.
           control_rate: cost and limits of the rates of controls; see `Problem`.
-
-        Returns:
-          The Problem.
-
-        Raises:
-          InputError: the goal moves a joint past its limits; or the start has one past them by more than a tenth of its
-            range, unless it is there in the MJCF's rest or in a keyframe.
         """
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
@@ -534,7 +497,6 @@ class MjcfRobot(Robot):
         return [f"{obstacle} ({body})" for body, obstacle in dict.fromkeys(pairs)]
 
     def _dry(self) -> list[str]:
-        """The dry friction of joints and tendons, by name."""
         model, space = self.dynamics.physics.model, self.dynamics.state_coordinates
         joints = zip(space.names, space.units, model.dof_frictionloss.tolist(), strict=False)
         tendons = ((model.tendon(i).name, "m", loss) for i, loss in enumerate(model.tendon_frictionloss.tolist()))
@@ -558,9 +520,6 @@ class MjcfRobot(Robot):
 
         In MuJoCo, limits of joints are springs that push back. It knows none of speeds, which are in a URDF, or in the
         <custom> section of an MJCF: `<numeric name="JOINT_velocity_limit" data="2"/>`.
-
-        Raises:
-          InputError: no joint has limits.
         """
         names, nv = self.dynamics.state_coordinates.names, self.mjcf.model.nv
         places = {names[one.dof]: one.limits for one in self.mjcf.joints if one.limits is not None}
@@ -568,7 +527,7 @@ class MjcfRobot(Robot):
         return StateBounds(places | speeds)
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
-        """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
+        """A state (n,) at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
         A joint that an equality constraint couples to another follows it; if it is named, the other moves. The joints
         of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of
@@ -578,13 +537,6 @@ class MjcfRobot(Robot):
         Args:
           keyframe: its name; None for the MJCF's rest.
           **values: name of a state -> value.
-
-        Returns:
-          (n,).
-
-        Raises:
-          InputError: no such keyframe or state; the keyframe has mocap bodies elsewhere; a loop does not close there;
-            or values of joints contradict an equality constraint.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))
@@ -629,17 +581,7 @@ class MjcfRobot(Robot):
         return found
 
     def with_closed_loops(self, states: npt.ArrayLike) -> Array:
-        """The nearest states at which all equality constraints are met, in positions and in velocities.
-
-        Args:
-          states: (..., n).
-
-        Returns:
-          (..., n); without equality constraints the same.
-
-        Raises:
-          InputError: loops do not close near a state.
-        """
+        """The nearest states (..., n) at which all equality constraints are met, in positions and in velocities."""
         model = self.scene.model
         states = vectors_of("states", states, len(self.dynamics.state_coordinates))
         if not model.eq_active0.any():

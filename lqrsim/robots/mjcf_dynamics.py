@@ -85,7 +85,6 @@ class MjcfDynamics(Dynamics):
             return self._physics
 
     def __getstate__(self) -> dict[str, Any]:
-        """The attributes without MuJoCo's memory, which another process allocates anew."""
         return {name: value for name, value in vars(self).items() if name not in ("_physics", "disturbed", "compiled")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -149,10 +148,6 @@ class MjcfDynamics(Dynamics):
 
         A body's inertia scales with its mass; several numbers of a gear keep their ratios. Forces on the body are also
         parameters: `dynamics.disturbed.with_parameters(force_x=1.0)`.
-
-        Raises:
-          InputError: there is no such number, the value is out of range, or the mass of all bodies and of a single body
-            are both given.
         """
         numbers = self.numbers
         for name in values:
@@ -309,7 +304,6 @@ class MjcfMemory(UserFunction):
 
     @classmethod
     def of(cls, dynamics: MjcfDynamics) -> "MjcfMemory":
-        """The address for these dynamics."""
         memory = cls(
             function=_nothing, level="compiled", states=len(dynamics.state_coordinates), controls=0, parameters=(),
             offset=1, values=1, with_control=False, is_memory=True,

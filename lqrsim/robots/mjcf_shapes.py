@@ -172,7 +172,6 @@ def _centres(mjcf: MjcfModel, outline: Outline, state: Array) -> Array:
 
 
 def _same(one: Obstacle, other: Obstacle | None) -> bool:
-    """Whether two obstacles have the same shape and position."""
     if other is None or one.kind != other.kind:
         return False
     pairs = ((one.position, other.position), (one.rotation, other.rotation), (one.size, other.size))

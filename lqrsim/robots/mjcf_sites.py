@@ -67,7 +67,6 @@ class _Pose:
 
     @property
     def rows(self) -> list[str]:
-        """The name of each row in messages."""
         placed = [f"{self.site} at its {axis}" for axis in _AXES] if self.position is not None else []
         return placed + ([f"{self.site} turned about {axis}" for axis in _AXES] if self.axes is not None else [])
 

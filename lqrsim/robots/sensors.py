@@ -60,9 +60,6 @@ class RobotSensors:
       names: names of the numbers for messages, (Y,).
       drag: the robot's, through which wind acts as a force.
       quaternions: for each sensor, whether a reading and its negative mean the same.
-
-    Raises:
-      InputError: the MJCF has no sensor of a name, or a kind is not supported, or one is given twice.
     """
 
     _prefix = ""

@@ -79,7 +79,6 @@ class Approaches:
             mujoco.mj_fwdPosition(self._model, self._data)
 
     def _gap(self, tool: int) -> float:
-        """The distance of a tool from the body."""
         return min(mujoco.mj_geomDistance(self._model, self._data, tool, one, 1e3, None) for one in self.thing)
 
     def _way(self, begin: int, end: int) -> Array:
@@ -156,7 +155,6 @@ class Approaches:
         return self._data.geom_xmat[tool].reshape(3, 3)
 
     def _spot(self, tool: int, point: Array) -> Array:
-        """The place of a point of a tool."""
         return self._data.geom_xpos[tool] + self._axes(tool) @ point
 
     def _reach(self, tool: int, point: Array, centre: Array, side: Array) -> float:

@@ -225,7 +225,6 @@ class _Search:
         return self._carried @ (self._rest.wanted - forces), rates / self._steepness
 
     def _score(self, z: Array) -> float:
-        """The sum of squares of what is left, as forces, relative to the largest force."""
         missing, moving = self._left(z)
         missing, moving = missing / self._size, moving * self._weights[self._rest.model.nu :]
         return float(missing @ missing) + float(moving @ moving)

@@ -163,12 +163,10 @@ class MjcfModel:
 
     @cached_property
     def joints(self) -> tuple[Joint, ...]:
-        """All joints, in the order of their degrees of freedom."""
         return tuple(_joint(self.model, number) for number in range(self.model.njnt))
 
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
-        """All actuators, in MuJoCo's order."""
         return tuple(_actuator(self.model, number) for number in range(self.model.nactuator))
 
     @cached_property
@@ -249,11 +247,7 @@ class MjcfModel:
         return mjcf_text.numbers_of(self.xml, self.model)
 
     def keyframe(self, name: str, what: str) -> tuple[Array, Array, Array | None]:
-        """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, for which the model has zeros.
-
-        Raises:
-          InputError: there is no keyframe of that name, or mocap bodies are elsewhere in it.
-        """
+        """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, of which the model has zeros."""
         model, number = self.model, self._key(name, what)
         if moved := list(_mocap_poses(model, number)):
             raise InputError(
@@ -287,11 +281,7 @@ class MjcfModel:
         return found
 
     def with_mocap(self, key: str, what: str) -> "MjcfModel":
-        """The same with its mocap bodies where a keyframe has them, and all else as it is.
-
-        Raises:
-          InputError: there is no keyframe of that name; or the text cannot say this, as of a body in a <frame>.
-        """
+        """The same with its mocap bodies where a keyframe has them, and all else as it is."""
         number = self._key(key, what)
         if not (poses := _mocap_poses(self.model, number)):
             return self
@@ -317,9 +307,6 @@ def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
 
     Args:
       what: name of the MJCF in messages.
-
-    Raises:
-      InputError: MuJoCo refuses the MJCF, or would crash, or the MJCF contains a NaN.
     """
     _check_elements(xml, what)
     try:

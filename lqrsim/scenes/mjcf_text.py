@@ -162,11 +162,7 @@ def _is_free(element: ElementTree.Element) -> bool:
 
 
 def with_obstacles(xml: str, world: World) -> str:
-    """The MJCF with these obstacles as further geoms, fixed to the world, which nothing touches.
-
-    Raises:
-      InputError: an obstacle is of a kind of which MuJoCo needs more than its size, or has the name of a geom.
-    """
+    """The MJCF with these obstacles as further geoms, fixed to the world, which nothing touches."""
     root = ElementTree.fromstring(xml)
     taken = {one.get("name") for one in root.iter("geom")}
     section = ElementTree.SubElement(root, "worldbody")
@@ -271,9 +267,6 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
 
     Args:
       what: name of the MJCF in messages.
-
-    Raises:
-      InputError: a value is out of range, or both the whole mass and the mass of a body are given.
     """
     numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
     elements, scales = _elements(root), dict[str, float]()

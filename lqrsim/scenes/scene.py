@@ -109,10 +109,6 @@ def load_scene(
       armature: of a URDF, which has none: inertias of motors as their joints feel them, with the square of the gear
         ratio, in kg m^2, or masses in kg; by joint, or one for all. Without, small links with strong motors are shaken
         by noise that real ones do not feel.
-
-    Raises:
-      InputError: no such scene or file; it does not parse or compile; there is no geom or joint of such a name; an
-        obstacle is of a type without a distance; or a free base with several root links, or one that a joint moves.
     """
     of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts, "armature": armature}
     stated = {name: value for name, value in of_urdf.items() if value is not None}
@@ -141,9 +137,6 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
 
     Args:
       default: the geoms for True. what: name of the scene in messages.
-
-    Raises:
-      InputError: no geom or body that is fixed to the world has such a name, or the argument is no choice.
     """
     if isinstance(obstacles, bool):
         return list(default) if obstacles else []

@@ -70,11 +70,7 @@ class Obstacle:
 
     @property
     def row(self) -> Array:
-        """This obstacle as `ROW` numbers.
-
-        Raises:
-          InputError: its kind has no distance.
-        """
+        """This obstacle as `ROW` numbers."""
         if self.kind not in KINDS:
             raise InputError(
                 f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)}; or an MjcfRobot, with"
@@ -118,26 +114,12 @@ class World:
         return any(obstacle.velocity.any() for obstacle in self.obstacles)
 
     def displacements(self, times: npt.ArrayLike) -> Array:
-        """Displacements of the obstacles since time 0 of the run.
-
-        Args:
-          times: (K,) in s.
-
-        Returns:
-          (K, len(self), 3) in metres.
-        """
+        """The displacements (K, len(self), 3) in m of the obstacles at times (K,) in s since time 0 of the run."""
         velocities = np.array([obstacle.velocity for obstacle in self.obstacles]).reshape(len(self), 3)
         return np.multiply.outer(check_array("times", times, (None,)), velocities)
 
     def tables(self, times: npt.ArrayLike) -> Array:
-        """The obstacles as the numbers that compiled code reads, at given times.
-
-        Args:
-          times: (K,) in s.
-
-        Returns:
-          (K, len(self), ROW); (1, len(self), ROW) if no obstacle moves.
-        """
+        """The obstacles as compiled code reads them at times (K,) in s, (K or, if none moves, 1, len(self), ROW)."""
         if not self.moving:
             return self.table[None]
         moved = self.displacements(times)
@@ -147,12 +129,9 @@ class World:
 
     @checked
     def moved(self, seconds: Finite) -> "World":
-        """The world at a later time: each obstacle has moved at its velocity.
+        """The world after some seconds, or before if they are negative: each obstacle has moved at its velocity.
 
         An obstacle that is seen at the time t of a run goes into its problem as `ls.World([seen]).moved(-t)`.
-
-        Args:
-          seconds: the delay in seconds; negative for an earlier time.
         """
         if not self.moving:
             return self
@@ -170,14 +149,6 @@ class World:
         horizontal plane, the world is seen from above: heights do not count, upright obstacles are infinitely high, and
         a sphere counts with its equator. In both cases, planes parallel to the robot's plane, such as the floor under a
         horizontal plane, bound nothing.
-
-        Args:
-          plane: as in `Coordinates`.
-          offset: as in `Coordinates`, in metres.
-
-        Raises:
-          InputError: there is no such plane; a vertical plane has no offset; or, seen from above, an obstacle is
-            tilted, so that its outline is no primitive.
         """
         if plane == SPACE:
             return self
@@ -239,36 +210,22 @@ class World:
                 )
 
     def distances(self, point: npt.ArrayLike) -> Array:
-        """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
+        """The signed distances in metres to each obstacle, (len(self),), of a point (2,) or (3,); negative inside.
 
-        Points (2,) are for a world that is seen by a robot in the plane, in its coordinates.
-
-        Args:
-          point: (3,), or (2,) in a plane, in metres.
-
-        Returns:
-          One signed distance per obstacle, in metres.
+        A point (2,) is for a world that is seen by a robot in the plane, in its coordinates.
         """
         x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
         data = self.table.ravel()
         return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
 
     def distance(self, points: npt.ArrayLike) -> Array:
-        """The signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any.
-
-        Args:
-          points: (..., 3), or (..., 2) in a plane, in metres.
-        """
+        """The signed distance in m to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
         points = _places("points", points)
         flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
         return np.array(flat).reshape(points.shape[:-1])
 
     def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """The index of the nearest obstacle, (...), at points (..., 2 or 3).
-
-        Args:
-          points: (..., 3), or (..., 2) in a plane, in metres.
-        """
+        """The index of the nearest obstacle, (...), at points (..., 2 or 3)."""
         if not self.obstacles:
             raise InputError("nearest: got a world without obstacles, want at least one")
         points = _places("points", points)

@@ -21,9 +21,9 @@ from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.effects import Effects
-from lqrsim.simulation.mujoco_physics import MujocoPhysics
-from lqrsim.simulation.physics import Physics, SimulatorPhysics
+from lqrsim.simulation.effects import Effects, seeded
+from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
+from lqrsim.simulation.physics import SimulatorPhysics
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.readings import Readings
 from lqrsim.simulation.recorder import Recorder
@@ -89,10 +89,6 @@ def simulate(
 
     Returns:
       A Rollout of the trials. Its `controller_run` is the run of the controller, with its records.
-
-    Raises:
-      InputError: there is no plan, or it is not finite; plan or policy are for another robot; the control period is not
-        a multiple of the physics step; a disturbance does not fit; or an option is out of range.
     """
     return _run(RunSettings(**locals()))  # all arguments, by name
 
@@ -109,9 +105,6 @@ def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **o
       states: (K, n), where the trials begin.
       options: other options of `simulate`, except `trials`. Disturbances that change the start, such as
         `InitialStateError`, are refused. Times of the rollout count from the knot.
-
-    Raises:
-      InputError: as `simulate`; a disturbance changes the start; or the knot is not before the plan's end.
     """
     states = check_array("states", states, (None, None))
     return _run(RunSettings(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options))
@@ -161,8 +154,15 @@ class ClosedLoop:
     def __init__(self, settings: RunSettings) -> None:
         self.settings = settings
         plant, plan, trials = settings.plant, settings.trajectory, settings.trials
-        self.effects = Effects(plant, settings.whole, settings.acting, settings.numbers, settings.random_streams)
-        self.physics = self._physics()
+        numbers = range(settings.first_trial, settings.first_trial + trials)
+        generators = settings.generators or seeded(settings.seed)
+        self.effects = Effects(plant, settings.whole, settings.acting, numbers, generators)
+        self.physics: AnyPhysics
+        if plant.simulator is not None:
+            self.physics = SimulatorPhysics(plant, plant.simulator, trials, settings.substeps)
+        else:
+            contacts, threads = settings.contacts, settings.threads
+            self.physics = MujocoPhysics(plant, trials, settings.substeps, contacts=contacts, threads=threads)
         first = self.effects.initial_states(np.tile(settings.whole.states[0], (trials, 1)), settings.starts)
         self.physics.place(first)
         self.effects.alter_models(self.physics)
@@ -178,13 +178,6 @@ class ClosedLoop:
         self.step, self.measured, self._knot = 0, self.states, settings.knot
         sensors = settings.law.sensors
         self._readings = None if sensors is None else Readings(sensors, self.effects, self.physics, plan.dt)
-
-    def _physics(self) -> Physics:
-        plant, trials, substeps = self.settings.plant, self.settings.trials, self.settings.substeps
-        if plant.simulator is not None:
-            return SimulatorPhysics(plant, plant.simulator, trials, substeps)
-        contacts, threads = self.settings.contacts, self.settings.threads
-        return MujocoPhysics(plant, trials, substeps, contacts=contacts, threads=threads)
 
     def run(self) -> None:
         """Run all control periods; fewer if all trials have ended."""
@@ -219,7 +212,6 @@ class ClosedLoop:
         return True
 
     def measure(self, step: int) -> Array:
-        """Measure the states, (K, n)."""
         measured = self.effects.measure(self._knot + step, self.states)
         self.records.knot(step, self.states, measured, self.collisions.clearance)
         self.records.lose(step, self.physics.unstable | _not_finite(measured))
@@ -275,7 +267,7 @@ class ClosedLoop:
         if kick is not None:
             physics.kick(period, kick)
         collided = self.collisions.detect(step, period, ignored=over)
-        if physics.solidifies:
+        if isinstance(physics, MujocoPhysics) and physics.solidifies:
             if len(collided):
                 physics.rerun_with_contacts(collided, period)
                 if kick is not None:
@@ -287,7 +279,6 @@ class ClosedLoop:
             self._show(physics.drawn(period))
 
     def _show(self, frames: Sequence[Array]) -> None:
-        """Record the frames, and pass them to `watch`."""
         records, physics, watch = self.records, self.physics, self.settings.watch
         for frame in frames:
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
@@ -297,7 +288,7 @@ class ClosedLoop:
 
     def detect_contacts_at_end(self) -> None:
         """Detect contacts at the last knot, which no period follows."""
-        if not self.physics.senses_contacts:
+        if not (isinstance(self.physics, MujocoPhysics) and self.physics.senses_contacts):
             return
         plan, touching = self.settings.trajectory, self.physics.touching_now()
         never_lost = self.records.lost_since > plan.steps

@@ -48,11 +48,7 @@ class Collisions:
             self._hit(int(row), 0.0, self._last[row])
 
     def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-        """Find the trials that collide for the first time in a period. Returns their rows.
-
-        Args:
-          step: number of the period. period: its states and contacts. ignored: (K,) trials that have ended.
-        """
+        """The rows of the trials that first collide in a period; those `ignored` (K,) have ended before."""
         begun, parts = self.at.copy(), len(period.states)
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
             open_ = np.isinf(self.at) & ~ignored & (part < period.stable)

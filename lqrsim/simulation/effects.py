@@ -10,7 +10,7 @@ from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.disturbances.base import Hook
-from lqrsim.simulation.physics import Physics
+from lqrsim.simulation.mujoco_physics import AnyPhysics
 from lqrsim.simulation.plant import Plant
 
 MakeGenerator = Annotated[
@@ -41,9 +41,6 @@ class Effects:
 
     Attributes:
       displaced: (K, obstacles, 3), displacement of each obstacle in metres, along the world's axes.
-
-    Raises:
-      InputError: a disturbance does not fit the plant or the plan, or its `start` does not return an `Effect`.
     """
 
     def __init__(
@@ -82,15 +79,10 @@ class Effects:
 
     @property
     def alters_models(self) -> bool:
-        """Whether any trial has its own model."""
         return bool(self.displaced.any()) or any(effect.alter or effect.factors for _, effect in self._effects)
 
     def initial_states(self, planned: Array, given: Array | None = None) -> Array:
-        """The first states of the trials (K, n), from the plan's; or the given ones, which no disturbance may change.
-
-        Raises:
-          InputError: one does, or they are not finite.
-        """
+        """The first states (K, n) of the trials, from the plan's; or given ones, which no disturbance may change."""
         states = planned
         for name, effect in self._effects:
             if effect.initial_states is None:
@@ -106,8 +98,8 @@ class Effects:
             raise InputError("disturbances: got an infinite first state, want finite numbers")
         return states
 
-    def alter_models(self, physics: Physics) -> None:
-        """Alter the models of the trials; `Physics.prepare` must follow."""
+    def alter_models(self, physics: AnyPhysics) -> None:
+        """Alter the models of the trials; `prepare` must follow."""
         for name, effect in self._effects:
             for parameter, factors in (effect.factors or {}).items():
                 columns = len(physics.plant.actuators) if parameter == "thrust" else 1

@@ -9,7 +9,7 @@ from mujoco import batch
 
 from lqrsim.errors import Array
 from lqrsim.machine import processors
-from lqrsim.simulation.physics import Period, Physics, part_of
+from lqrsim.simulation.physics import Period, Physics, SimulatorPhysics, part_of
 from lqrsim.simulation.plant import Indices, Plant
 
 AWAY = 2.0**20  # m; depth inside an obstacle up to which it exerts no force while contacts are only sensed
@@ -37,6 +37,7 @@ class MujocoPhysics(Physics):
 
     Attributes:
       simulations: MuJoCo's simulations. solid: (K,) whether the obstacles of each are solid.
+      senses_contacts: whether contacts are sensed without a force. solidifies: whether obstacles may become solid.
     """
 
     def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
@@ -59,11 +60,13 @@ class MujocoPhysics(Physics):
         self._quaternions = _quaternions(plant)
 
     def place(self, states: Array) -> None:
+        """Put the robots into these analytic states (K, n)."""
         qpos, qvel = self.plant.robot.configuration(states)
         self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
         self._act[:] = states[:, states.shape[1] - self._act.shape[1] :]
 
     def multiply(self, parameter: str, factors: Array) -> None:
+        """Multiply a parameter of `simulator.PARAMETERS` by factors (K, 1), or (K, actuators)."""
         field, which = {
             "mass": ("body_mass", self.plant.bodies),
             "inertia": ("body_inertia", self.plant.bodies),
@@ -73,9 +76,11 @@ class MujocoPhysics(Physics):
         values[:, which] *= factors if values.ndim == 2 else factors[:, :, None]
 
     def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
+        """Let a disturbance of this name change the models."""
         change(self.simulations)
 
     def displace(self, displaced: Array) -> None:
+        """Move the obstacles by (K, obstacles, 3)."""
         self.plant.displace(self.simulations, displaced)
 
     def prepare(self, *, altered: bool) -> None:
@@ -105,12 +110,15 @@ class MujocoPhysics(Physics):
         values[:, ids] = change(values[:, ids])
 
     def frame(self) -> Array:
+        """The current qpos, (K, nq)."""
         return self._qpos.copy()
 
     def state(self) -> Array:
+        """The current analytic states (K, n), angles in any representative."""
         return self.plant.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel], self._act)
 
     def touching_now(self) -> npt.NDArray[np.bool_]:
+        """Whether each robot touches each obstacle, (K, obstacles). The simulations must not advance afterwards."""
         assert self._sensors is not None
         self.simulations.forward()
         return self._sensors[:, self.plant.contact] > 0
@@ -131,6 +139,7 @@ class MujocoPhysics(Physics):
         return readings.copy()
 
     def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
+        """Run one control period with controls (K, m), forces and torques (K, 6), and the wind (K, 3)."""
         self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench
         if self._medium is not None:
@@ -159,6 +168,7 @@ class MujocoPhysics(Physics):
         period.states[-1][which], period.frames[-1][which] = self.state()[which], self.frame()[which]
 
     def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
+        """Make obstacles solid for these simulations, and repeat the period for them; replaces its result."""
         self.simulations.state[rows] = self._before[rows]
         self.unstable[rows], self.warnings[rows] = self._was_unstable[rows], self._had_warned[rows]
         for values, ids, solid in self._inactive:
@@ -174,6 +184,7 @@ class MujocoPhysics(Physics):
         period.stable[rows] = again.stable[rows]
 
     def touched(self, period: Period) -> npt.NDArray[np.bool_]:
+        """Whether each trial with solid obstacles touched one, (K,)."""
         if not self.solid.any():
             return np.zeros(len(self.solid), dtype=bool)
         return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
@@ -224,7 +235,6 @@ def _turned(after: Array, before: Array, now: Array) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """The product of quaternions (K, 4)."""
     (w, x, y, z), (s, i, j, k) = a.T, b.T
     return np.stack(
         [w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i,
@@ -236,3 +246,6 @@ def _span(indices: Indices) -> slice | Indices:
     """The indices as a slice, which copies nothing, if they are consecutive; else as they are."""
     first, last = int(indices.min(initial=0)), int(indices.max(initial=-1))
     return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices
+
+
+AnyPhysics = MujocoPhysics | SimulatorPhysics

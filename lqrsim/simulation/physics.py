@@ -1,6 +1,5 @@
 """The physics of the closed loop: K simulations of a plant, advanced by one control period at a time."""
 
-import abc
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -34,18 +33,16 @@ class Period:
     stable: npt.NDArray[np.int64]
 
 
-class Physics(abc.ABC):
+class Physics:
     """K simulations of a plant. Call `place`, then change the models, then `prepare`, then `advance` repeatedly.
+
+    `MujocoPhysics` says what each method does.
 
     Attributes:
       parts: S, parts of a control period. drawn_parts: number of parts that end with a frame to draw.
-      senses_contacts: whether contacts are sensed without a force. solidifies: whether obstacles may become solid.
       unstable: (K,) whether a simulation has become unstable.
       warnings: (K, 7) number of MuJoCo's warnings of each kind, as in a `Rollout`.
     """
-
-    senses_contacts = False
-    solidifies = False
 
     def __init__(self, plant: Plant, trials: int, substeps: int, part: int) -> None:
         self.plant, self._part, self.parts = plant, part, substeps // part
@@ -53,54 +50,6 @@ class Physics(abc.ABC):
         self.drawn_parts = self.parts // self._every
         self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
         self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
-
-    @abc.abstractmethod
-    def place(self, states: Array) -> None:
-        """Put the robots into these analytic states (K, n)."""
-
-    @abc.abstractmethod
-    def multiply(self, parameter: str, factors: Array) -> None:
-        """Multiply a parameter of `simulator.PARAMETERS` by factors (K, 1), or (K, actuators)."""
-
-    @abc.abstractmethod
-    def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
-        """Let a disturbance of this name change MuJoCo's models."""
-
-    @abc.abstractmethod
-    def displace(self, displaced: Array) -> None:
-        """Move the obstacles by (K, obstacles, 3)."""
-
-    @abc.abstractmethod
-    def prepare(self, *, altered: bool) -> None:
-        """Begin; `altered` says whether a model has changed."""
-
-    @abc.abstractmethod
-    def state(self) -> Array:
-        """The current analytic states (K, n), angles in any representative."""
-
-    @abc.abstractmethod
-    def frame(self) -> Array:
-        """MuJoCo's current qpos, (K, nq)."""
-
-    @abc.abstractmethod
-    def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
-        """Run one control period with controls (K, m), forces and torques (K, 6), and the wind (K, 3)."""
-
-    @abc.abstractmethod
-    def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
-        """Let the states of some or all trials jump by (K, n) at the end of a period."""
-
-    def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
-        """Make obstacles solid for these simulations, and repeat the period for them; replaces its result."""
-        raise NotImplementedError
-
-    def touching_now(self) -> npt.NDArray[np.bool_]:
-        """Whether each robot touches each obstacle now, (K, obstacles). The simulations must not advance afterwards."""
-        raise NotImplementedError
-
-    def touched(self, period: Period) -> npt.NDArray[np.bool_]:
-        """Whether each trial with solid obstacles touched one, (K,)."""
-        return np.zeros(len(self.unstable), dtype=bool)
 
     def drawn(self, period: Period) -> list[Array]:
         """The frames that are needed for drawing."""

@@ -54,11 +54,6 @@ class Plant(OneVersion):
       actuators: ids of its actuators, of which each has any number of controls.
       contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: timestep of the physics, in seconds.
-
-    Raises:
-      InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
-        do not fit these; its position differs from its body's position in MuJoCo; or the simulator cannot simulate the
-        robot.
     """
 
     _prefix = ""
@@ -140,37 +135,24 @@ class Plant(OneVersion):
         return float(self.model.body_subtreemass[roots].sum() * np.linalg.norm(self.model.opt.gravity))
 
     def sensors(self, sensors: Sequence[Sensor]) -> RobotSensors:
-        """Sensors of the scene's MJCF, for `OffsetFree(sensors=...)` and `SensorErrors`.
-
-        Args:
-          sensors: one for each element of `<sensor>` that is used.
-
-        Raises:
-          InputError: as `RobotSensors`; or a simulator moves the robot, which computes no sensors of an MJCF.
-        """
+        """Sensors of the scene's MJCF, for `OffsetFree(sensors=...)` and `SensorErrors`."""
         if self.simulator is not None:
             raise InputError(f"sensors: got a plant simulated by {self.simulator.name}, want one moved by MuJoCo")
         return RobotSensors(self.robot, self.scene, sensors)
 
     def check_simulator(self, what: str, parameter: str | None = None) -> None:
-        """Check that a disturbance can change a parameter of the physics.
+        """Raise an InputError if a disturbance cannot change a parameter of the physics.
 
         Args:
           parameter: "mass", "inertia" or "thrust"; None for one that only MuJoCo's models have.
-
-        Raises:
-          InputError: it cannot.
         """
         if self.simulator is not None and parameter not in self.simulator.parameters:
             raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, want one that can have it")
 
     def for_period(self, period: float) -> "Plant":
-        """The plant with the longest physics step that divides a control period and does not exceed the present step.
+        """The plant with the longest physics step that divides a control period, in s, and does not exceed its own.
 
         A plan with a free duration has a period that the MJCF cannot know.
-
-        Args:
-          period: seconds, such as `solution.trajectory.dt`.
         """
         period = check_number("control period", period, above=0.0)
         other = copy.copy(self)
@@ -181,14 +163,7 @@ class Plant(OneVersion):
         return other
 
     def substeps(self, period: float) -> int:
-        """The number of physics steps in a control period.
-
-        Args:
-          period: seconds.
-
-        Raises:
-          InputError: the period is not a multiple of the physics step.
-        """
+        """The number of physics steps in a control period of so many seconds, which must be a whole one."""
         period = check_number("control period", period, above=0.0)
         steps = period / self.timestep
         whose, larger = f"scene {self.scene.name}", "a larger <option timestep=.../> there"
@@ -228,16 +203,10 @@ class Plant(OneVersion):
         return len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9)
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
-        """The analytic state for the robot's `qpos` and `qvel` and the actuators' `act`; see `Robot.state`.
+        """The analytic state (..., n) for the robot's `qpos` (..., nq), `qvel` (..., nv) and activations (..., na).
 
         Args:
-          qpos: (..., nq) of MuJoCo.
-          qvel: (..., nv) of MuJoCo.
-          act: (..., na), the activations of the actuators.
-          near: (..., n), a state; angles are returned in the representative nearest to it. None for any representative.
-
-        Returns:
-          (..., n).
+          near: as in `Robot.state`.
         """
         state = self.robot.state(qpos, qvel, near=near)
         if not self.robot.activations:
@@ -245,17 +214,12 @@ class Plant(OneVersion):
         return np.concatenate([state, vectors_of("act", act, self.robot.activations)], axis=-1)
 
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
-        """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls, the least over all.
-
-        For geoms, the distance of the nearest geom, by MuJoCo.
+        """The signed distance (...) in m to the nearest obstacle minus the radius; of balls or geoms, the least.
 
         Args:
           states: (..., n).
           displaced: (K, obstacles, 3), displacements of the obstacles in each trial, along the world's axes; states are
             then (K, k, n).
-
-        Returns:
-          (...), in metres.
         """
         states = vectors_of("states", states, len(self.robot.dynamics.state_coordinates))
         if displaced is not None:
@@ -267,16 +231,9 @@ class Plant(OneVersion):
         return self.shape.clearance(self.shape.places(states), displaced)
 
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
-        """The centres of the robot's balls along a plan and in runs, for pictures.
+        """The balls along planned states (T+1, n) and runs (K, T+1, n), for pictures; None for a robot without balls.
 
-        A robot with neither balls nor a position is represented by a ball about its outermost part.
-
-        Args:
-          planned: states (T+1, n).
-          driven: states (K, T+1, n).
-
-        Returns:
-          The record; None if the robot has a position and no balls.
+        One with neither balls nor a position is represented by a ball about its outermost part.
         """
         balls, dynamics, known = self.robot.balls, self.robot.dynamics, np.isfinite(driven).all(axis=2)
         if balls is None:
@@ -311,12 +268,7 @@ class Plant(OneVersion):
         return np.array([ids[name] for name in self.world.names], dtype=np.int64)
 
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
-        """Move the obstacles of each simulation; `set_const` must follow.
-
-        Args:
-          simulations: K of them.
-          displaced: (K, obstacles, 3), in metres along the world's axes.
-        """
+        """Move the obstacles of K simulations by (K, obstacles, 3) m, in the world's axes; `set_const` must follow."""
         geoms = self.obstacle_geoms
         simulations.expand("geom_pos")[:, geoms] += mjcf_kinematics.in_axes_of_bodies(self.model, geoms, displaced)
 
@@ -418,9 +370,6 @@ def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs
 
     Args:
       geoms: those of the spec, by id. apart: pairs of a robot's geom and a geom that is fixed to the world.
-
-    Raises:
-      InputError: all bits are taken.
     """
     used = int(np.bitwise_or.reduce(model.geom_contype | model.geom_conaffinity, initial=0))
     free = [1 << bit for bit in range(31) if not used >> bit & 1]
@@ -443,7 +392,6 @@ def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs
 
 
 def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:
-    """Ids of these bodies and of those attached to them."""
     found = set(roots)
     for body in range(model.nbody):  # parents come before their children
         if model.body_parentid[body] in found:

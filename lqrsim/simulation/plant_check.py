@@ -142,9 +142,6 @@ def check_plant(
       settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as wheel
         speeds; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       tolerance: largest allowed error, relative to the largest change of the state.
-
-    Raises:
-      InputError: the robot is not in the scene, the controls have no limits, or the simulation becomes unstable.
     """
     plant = Plant(robot, scene, simulator)
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
@@ -231,7 +228,6 @@ class _Region(NamedTuple):
         return cls(np.clip(points, *within), scale, within, middles, control_spread, ranges)
 
     def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """A state (n,) and a control (m,)."""
         k = int(rng.integers(len(self.states))) if len(self.states) > 1 else 0
         state = _drawn(rng, self.states[k], self.spread, *self.within)
         if self.controls is None:
@@ -318,7 +314,6 @@ def _sample(
 def _in_simulator(
     simulator: Simulator, plant: Plant, state: Array, control: Array, waiting: int, period: float
 ) -> _Sample:
-    """Run one control period in another simulator, after `waiting` steps."""
     dynamics, states = plant.robot.dynamics, [state]
     running = simulator.start(state[None], {}, plant.timestep)
     for steps in (waiting, plant.substeps(period)):

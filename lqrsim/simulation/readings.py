@@ -5,8 +5,7 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.robots.sensors import RobotSensors
 from lqrsim.simulation.effects import Effects
-from lqrsim.simulation.mujoco_physics import MujocoPhysics
-from lqrsim.simulation.physics import Physics
+from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
 
 
 class Readings:
@@ -14,12 +13,9 @@ class Readings:
 
     Args:
       dt: control period in s.
-
-    Raises:
-      InputError: the physics are not MuJoCo's.
     """
 
-    def __init__(self, sensors: RobotSensors, effects: Effects, physics: Physics, dt: float) -> None:
+    def __init__(self, sensors: RobotSensors, effects: Effects, physics: AnyPhysics, dt: float) -> None:
         if not isinstance(physics, MujocoPhysics):
             raise InputError("controller: got one that reads sensors of the MJCF, want a plant moved by MuJoCo")
         self._sensors, self._effects, self._physics, self._dt = sensors, effects, physics, dt

@@ -42,7 +42,6 @@ class Recorder:
         self.states[:, step], self.measured[:, step], self.clearance[:, step] = states, measured, clearance
 
     def lose(self, step: int, rows: Mask) -> None:
-        """Mark the records of these trials (K,) as invalid from this knot on."""
         if rows.any():
             self.lost_since[rows] = np.minimum(self.lost_since[rows], step)
 

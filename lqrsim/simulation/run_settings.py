@@ -25,7 +25,7 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
-from lqrsim.simulation.effects import MakeGenerator, seeded
+from lqrsim.simulation.effects import MakeGenerator
 from lqrsim.simulation.physics import part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.solvers.parallel import check_threads
@@ -113,26 +113,11 @@ class RunSettings:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The trajectory of the plan, from the knot on."""
         return self.followed.trajectory
-
-    @property
-    def numbers(self) -> range:
-        """The numbers of the trials."""
-        return range(self.first_trial, self.first_trial + self.trials)
-
-    @property
-    def random_streams(self) -> MakeGenerator:
-        """(trial, number of the disturbance) -> its random generator."""
-        return self.generators or seeded(self.seed)
 
 
 def _passing(plant: Plant, moving: World | None, time: float) -> ShapeInWorld | None:
-    """The robot's shape among obstacles that MuJoCo does not have, at this time in s.
-
-    Raises:
-      InputError: there is no World, or the robot has no distance to one of its obstacles.
-    """
+    """The robot's shape among obstacles that MuJoCo does not have, at this time in s."""
     if moving is None:
         return None
     robot = plant.robot
@@ -190,7 +175,6 @@ def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, f
 
 
 def _place(space: Coordinates) -> str:
-    """The position states and the plane, for a message."""
     names = ", ".join(space.names[index] for index in space.position) or "of no states"
     plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
     return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")

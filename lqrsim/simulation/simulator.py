@@ -46,32 +46,24 @@ class Simulator(abc.ABC):
         return {}
 
     def check(self, robot: Robot) -> None:  # noqa: B027 - a simulator may take any robot
-        """Check that the simulator supports this robot.
-
-        Raises:
-          InputError: it cannot.
-        """
+        """Raise an InputError for a robot that the simulator does not support."""
 
     @abc.abstractmethod
     def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> Any:
-        """Start the simulations.
+        """The simulations of K trials.
 
         Args:
           states: (K, n), where the trials begin.
           factors: parameter -> (K, 1), or (K, m) for the thrust: the factor of each trial, or of each of its controls.
             Parameters without factors keep their values.
           timestep: duration of each step in s, at most the simulator's `timestep`.
-
-        Returns:
-          The simulations.
         """
 
     @abc.abstractmethod
     def step(self, simulations: Any, controls: Array, wrench: Array, wind: Array, steps: int) -> None:
-        """Advance the simulations.
+        """Advance what `start` returned.
 
         Args:
-          simulations: what `start` returned; it is changed.
           controls: (K, m), held constant, within the robot's limits.
           wrench: (K, 6), force in N at the centre of mass and torque in N m, along the world's axes.
           wind: (K, 3), in m/s along the world's axes; zero unless `wind` is true.
@@ -79,22 +71,10 @@ class Simulator(abc.ABC):
 
     @abc.abstractmethod
     def states(self, simulations: Any) -> Array:
-        """The current states.
-
-        Args:
-          simulations: what `start` returned.
-
-        Returns:
-          (K, n); not finite for a trial whose simulation has become unstable.
-        """
+        """The current states (K, n); not finite for a trial whose simulation has become unstable."""
 
     def place(self, simulations: Any, states: Array) -> None:
-        """Put the robots into other states, for noise on the states. Refused by default.
-
-        Args:
-          simulations: what `start` returned; it is changed.
-          states: (K, n).
-        """
+        """Put the robots into other states (K, n), for noise on the states. Refused by default."""
         raise InputError(f"StateNoise: got a plant simulated by {self.name}, want one that overrides `place`")
 
 

@@ -33,10 +33,6 @@ class Crazyflow(Simulator):
       drone: name of crazyflow's drone: "cf21B_500", "cf2x_L250", "cf2x_P250" or "cf2x_T350".
       timestep: timestep of the physics in s; 1 / timestep has to be a whole number.
       integrator: "rk4", "euler" or "symplectic_euler".
-
-    Raises:
-      InputError: there is no such drone or integrator. At the first use: crazyflow is not installed, or SciPy was
-        imported without SCIPY_ARRAY_API=1 in the environment, which crazyflow needs.
     """
 
     drone: Annotated[str, OneOf(DRONES)] = "cf21B_500"
@@ -56,16 +52,10 @@ class Crazyflow(Simulator):
         return versions_of("crazyflow", "jax", "jaxlib")
 
     def quadrotor(self, **changes: Any) -> Quadrotor:
-        """Our model with the drone's numbers.
+        """A model with the drone's numbers, but for changes of fields, such as a fitted drag.
 
         The inertia about the level axes is their mean. The drag is the drag along them, and the drag torque of a rotor
         is the torque at hover.
-
-        Args:
-          **changes: fields of `Quadrotor` with other values, such as a fitted drag.
-
-        Returns:
-          A Quadrotor.
         """
         of, hover = numbers_of(self.drone), self.weight / 4
         inertia = np.diag(of["J"])

@@ -37,12 +37,7 @@ class Frame:
 
     @classmethod
     def of(cls, name: str, places: Array, turning: Array) -> "Frame":
-        """Make it from the rotors' positions (4, 2 or 3) in m, and the signs (4,) of their drag torques on the body.
-
-        Raises:
-          InputError: the rotors are not at the corners of a square about the centre of mass, or do not turn in
-            alternating directions.
-        """
+        """Make it from the rotors' positions (4, 2 or 3) in m, and the signs (4,) of their drag torques on the body."""
         angles = np.arctan2(places[:, 1], places[:, 0])
         first = int(np.argmax(turning > 0))
         order = np.argsort(np.mod(angles - angles[first] + 1e-9, 2 * np.pi))  # counterclockwise

@@ -33,10 +33,6 @@ class RotorPy(Simulator):
       vehicle: RotorPy's `quad_params`, or a name: "hummingbird", "crazyflie", or another NAME with a module NAME_params
         in `rotorpy.vehicles`.
       timestep: timestep in s; within it, RotorPy's integrator chooses its own steps.
-
-    Raises:
-      InputError: RotorPy is not installed; there is no such vehicle; it does not have four rotors at the corners of a
-        square; or it has its own noise, which would be drawn from a generator that all trials share.
     """
 
     vehicle: str | Mapping[str, Any] = "hummingbird"
@@ -100,16 +96,10 @@ class RotorPy(Simulator):
         return versions_of("rotorpy", "scipy")
 
     def quadrotor(self, **changes: Any) -> Quadrotor:
-        """Our model with the vehicle's numbers.
+        """A model with the vehicle's numbers, but for changes of fields, such as a fitted drag.
 
         The drag is the drag of the rotors at hover speed, across their axes. The inertia about the level axes is their
         mean.
-
-        Args:
-          **changes: fields of `Quadrotor` with other values, such as a fitted drag.
-
-        Returns:
-          A Quadrotor.
         """
         of = self._numbers
         numbers = {

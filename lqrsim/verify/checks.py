@@ -145,9 +145,6 @@ def verify_run(
       rollout: rollout of `simulate`, with frames.
       solution: the solution that was run, to check the plan in the rollout.
       progress: called after each frame with the number of finished frames and their total.
-
-    Raises:
-      InputError: there is no such trial, nothing can be drawn, or there is no OpenGL.
     """
     check_arguments(solution, progress)
     model = drawable_model(rollout, trial)
@@ -346,9 +343,6 @@ def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) ->
 
     Args:
       plane: the axes of the positions: "xyz", or the two axes of a planar robot.
-
-    Raises:
-      InputError: the views do not measure all axes.
     """
     size, columns = len(plane), ["xyz".index(axis) for axis in plane]
     axes = np.vstack([view.axes for view in views])[:, columns] if views else np.zeros((0, size))
@@ -394,9 +388,6 @@ def verify_video(
       path: a video by `lqrsim render`, whatever else it shows. It needs the camera `top`; for a robot in a vertical
         plane the camera `side`; for a robot that moves in space both.
       trial: row of the rollout; by default the first that the video shows.
-
-    Raises:
-      InputError: the file was not written by lqrsim, or lacks the necessary panes.
     """
     check_arguments(solution, progress)
     metadata, plane = video_metadata.read(path), rollout.plane

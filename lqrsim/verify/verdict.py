@@ -93,12 +93,10 @@ def _in_frames(seconds: float, interval: float) -> str:
 
 
 def _lengths(vectors: Array) -> npt.NDArray[np.float64]:
-    """Lengths (...) of vectors (..., d)."""
     return np.linalg.norm(vectors, axis=-1)
 
 
 def _quantile_95(vectors: Array) -> float:
-    """The 95 % quantile of the lengths."""
     return float(np.quantile(_lengths(vectors), 0.95))
 
 

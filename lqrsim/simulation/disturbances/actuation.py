@@ -108,11 +108,7 @@ class Saturation(Disturbance):
         return replace(self, strength=times(self, self.strength, strength))
 
     def limits(self, plant: Plant) -> tuple[Array, Array]:
-        """The narrowed limits.
-
-        Raises:
-          InputError: the robot's own limits do not contain them.
-        """
+        """The narrowed limits, which the robot's own limits must contain."""
         space = plant.robot.dynamics.control_coordinates
         own = np.array([space.low, space.high])
         if self.share is not None:
@@ -178,11 +174,7 @@ class ActuatorLoss(Disturbance):
         return f"{which} down to {100 * self.remaining:g} % from {self.at:g} s on"
 
     def scaled(self, strength: float) -> "ActuatorLoss":
-        """The same with `strength` times the loss, at most a complete loss.
-
-        Args:
-          strength: factor, 0 or more.
-        """
+        """The same with `strength` times the loss, at most a complete loss."""
         lost = min(1.0, times(self, 1 - self.remaining, strength))
         return replace(self, remaining=self.remaining if strength == 1 else 1 - lost)
 

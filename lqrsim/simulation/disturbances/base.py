@@ -107,14 +107,7 @@ class Disturbance(abc.ABC):
         return without_addresses(repr(self))
 
     def scaled(self, strength: float) -> "Disturbance":
-        """The disturbance with `strength` times the effect, for a sweep over strengths.
-
-        Args:
-          strength: factor; 0 has no effect, 1 is the disturbance itself.
-
-        Raises:
-          InputError: the class does not implement it, or the strength is out of range.
-        """
+        """The disturbance with `strength` times the effect, for sweeps: 0 has none, 1 is the disturbance itself."""
         if self._scales:
             one: Any = self
             return replace(one, **{self._scales: times(self, getattr(self, self._scales), strength)})
@@ -123,27 +116,15 @@ class Disturbance(abc.ABC):
         )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
-        """Check that the plant can have this disturbance.
-
-        Raises:
-          InputError: it cannot.
-        """
+        """Raise an InputError for a plant that cannot have this disturbance."""
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """Describe the disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason.
-
-        Returns:
-          An Uncertainty.
-        """
+        """The disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason."""
         return left_out(self, plant, f"{type(self).__name__} does not override `uncertainty`")
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        """Start a run with one trial per generator. A trial's random numbers must come from its own generator.
-
-        Args:
-          generators: K of them, one per trial.
-        """
+        """The effect on a run of K trials, one per generator, from which alone its random numbers must come."""
 
 
 @dataclass(frozen=True)

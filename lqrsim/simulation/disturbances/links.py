@@ -37,11 +37,7 @@ class Late(Disturbance):
         return Uncertainty(**told)
 
     def scaled(self, strength: float) -> Self:
-        """The delay with `strength` times the periods, rounded to whole periods.
-
-        Args:
-          strength: factor, 0 or more.
-        """
+        """The delay with `strength` times the periods, rounded to whole periods."""
         return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
 
 
@@ -113,15 +109,7 @@ class GilbertElliott:
         return (1 - self.bad) * self.lost_when_good + self.bad * self.lost_when_bad
 
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
-        """Draw whether each of T items is lost.
-
-        Args:
-          steps: T.
-          generators: K of them, one per trial.
-
-        Returns:
-          (K, T), True where the item is lost.
-        """
+        """Whether each of T items is lost in each of K trials, (K, T)."""
         numbers = uniform(generators, steps, 2)
         bad, lost = numbers[:, 0, 0] < self.bad, np.empty(numbers.shape[:2], dtype=bool)
         for t in range(steps):
@@ -158,15 +146,10 @@ class Dropouts(Disturbance):
 
     @property
     def share(self) -> float:
-        """The fraction that is lost in the long run."""
         return self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
 
     def scaled(self, strength: float) -> Self:
-        """The link with `strength` times as many losses or bad spells; at most everything is lost.
-
-        Args:
-          strength: factor, 0 or more.
-        """
+        """The link with `strength` times as many losses or bad spells; at most everything is lost."""
         strength, loss = check_strength(self, strength), self.loss
         if not isinstance(loss, GilbertElliott):
             return replace(self, loss=min(1.0, strength * loss))
@@ -174,19 +157,11 @@ class Dropouts(Disturbance):
         return replace(self, loss=replace(loss, to_bad=to_bad, lost_when_good=lost))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The fraction that is lost, as if losses were independent.
-
-        Args:
-          plant: as in `uncertainty_of`.
-
-        Returns:
-          An Uncertainty with `loss` or `command_loss`.
-        """
+        """The fraction that is lost, as if losses were independent."""
         told: dict[str, Any] = {self.known_as: self.share}
         return Uncertainty(**told)
 
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
-        """Draw whether each of T items is lost, (K, T)."""
         if isinstance(self.loss, GilbertElliott):
             return self.loss.draw(steps, generators)
         return uniform(generators, steps, 1)[..., 0] < self.loss

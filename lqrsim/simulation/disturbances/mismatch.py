@@ -75,7 +75,6 @@ class Mismatch(Disturbance):
         plant.check_simulator(type(self).__name__, self.parameter)
 
     def effect(self, plant: Plant, factors: Array) -> Effect:
-        """The effect of factors (K, parts)."""
         return Effect(factors={self.parameter: factors})
 
     def describe(self, plant: Plant) -> str:

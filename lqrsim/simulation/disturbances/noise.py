@@ -44,7 +44,6 @@ class AddedError(GaussianDisturbance):
         return f"{self.what}, std {with_units(self._deviations(plant), self._coordinates(plant))}"
 
     def _deviations(self, plant: Plant) -> Array:
-        """One standard deviation for each coordinate."""
         return fit(self, self.std, self._coordinates(plant))
 
     def _std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
@@ -137,7 +136,6 @@ class InitialStateError(AddedError):
 
 
 def _off(plant: Plant, states: Array, errors: Array) -> Array:
-    """States (K, n) with errors, at which kinematic loops are closed."""
     moved, found = errors.any(axis=-1), states + errors
     found[moved] = plant.robot.with_closed_loops(found[moved])
     return found
@@ -211,14 +209,7 @@ class DisplacedObstacles(GaussianDisturbance):
         return Effect(displaced=displaced)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """One standard deviation for all axes: the root mean square over the axes that matter.
-
-        Args:
-          plant: as in `uncertainty_of`.
-
-        Returns:
-          An Uncertainty with `obstacles`.
-        """
+        """The root mean square of the standard deviations over the axes that matter."""
         axes = 2 if plant.robot.dynamics.state_coordinates.from_above else 3
         return Uncertainty(obstacles=float(np.sqrt(np.mean(fit(self, self.std, self.along)[:axes] ** 2))))
 

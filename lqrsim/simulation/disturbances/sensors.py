@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,6 @@ class SensorErrors(Disturbance):
 
     @cached_property
     def known(self) -> tuple[Sensor, ...]:
-        """The sensors, each as a `Sensor`."""
         given: Any = self.sensors
         return tuple(Sensor(name, **one) for name, one in given.items())
 
@@ -78,11 +77,11 @@ class SensorErrors(Disturbance):
         for i, columns in enumerate(known.columns):
             errors[..., columns][lost[..., i]] = np.nan
         of = {one.name: errors[..., columns] for one, columns in zip(known.sensors, known.columns, strict=True)}
-        return Effect(read=partial(_with_errors, of))
+
+        def read(step: int, readings: dict[str, Array]) -> dict[str, Array]:
+            return {name: one + of[name][:, step] if name in of else one for name, one in readings.items()}
+
+        return Effect(read=read)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return left_out(self, plant, "OffsetFree has them by its own sensors=", acts=self.strength > 0)
-
-
-def _with_errors(errors: Mapping[str, Array], step: int, readings: Mapping[str, Array]) -> dict[str, Array]:
-    return {name: one + errors[name][:, step] if name in errors else one for name, one in readings.items()}

@@ -72,14 +72,7 @@ class MeanWind(Wind):
         return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The wind as an unknown constant with mean zero and this wind as standard deviation: its direction is unknown.
-
-        Args:
-          plant: as in `uncertainty_of`.
-
-        Returns:
-          An Uncertainty with the wind among its unknowns.
-        """
+        """The wind as an unknown constant of mean zero, with the wind's size as std: its direction is unknown."""
         winds = zip("xyz", self.velocity, strict=True)
         return unknowns_of(self, plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
 
