@@ -200,7 +200,8 @@ class _Search:
         surroundings: Surroundings,
     ) -> None:  # fmt: skip
         self.problem, self.uncertainty, self.asked = problem, uncertainty, asked
-        self.make, self.surroundings = make, surroundings
+        self.make = make or (lambda problem, solution: OffsetFree(problem, solution, uncertainty))
+        self.surroundings = surroundings
         self.plans: list[SafePlan] = []
         self.margin, self.deviations = np.zeros((1, 1)), 0.0  # margin of the last plan, (T+1, O), and its multiple
         self.lines: list[tuple[float, float, float, float]] = []
@@ -240,7 +241,7 @@ class _Search:
             self.enough, self.log_of_enough = deviations, np.log(max(tube.collision_chance, 1e-300))
 
     def _keep(self, problem: Problem, solution: Solution, weight: float) -> Tube:
-        controller, margin = self._controller(problem, solution), self.margin
+        controller, margin = self.make(problem, solution), self.margin
         tube = predict_tube(problem, solution, self.uncertainty, controller)
         plan = SafePlan(
             problem=problem, solution=solution, controller=controller, tube=tube, asked=self.asked, rounds=(),
@@ -269,11 +270,6 @@ class _Search:
         """Whether the last plans, counted from the given one on, were no safer than the safest of them."""
         chances = [plan.tube.collision_chance for plan in self.plans[first:]]
         return len(chances) > PATIENCE and min(chances[-PATIENCE:]) >= min(chances[:-PATIENCE])
-
-    def _controller(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
-        if self.make is not None:
-            return self.make(problem, solution)
-        return OffsetFree(problem, solution, self.uncertainty)
 
     def _spread(self, plan: SafePlan) -> Spread:
         tube = plan.tube

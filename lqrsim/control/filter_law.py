@@ -49,7 +49,6 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      model: the linear model about the plan, which the filter assumes.
       gain: (T, m, Z). offset: (T, m).
       nominal: z in an undisturbed run, (T+1, Z).
     """
@@ -94,8 +93,6 @@ class FilterRun(ControllerRun):
     Attributes:
       first: the step at which the law's plan begins.
       z: the current estimates, (K, Z), at the knot of the newest measurement.
-      estimates: the recorded estimates, (T+1, K, Z), or None; see `OffsetFree`.
-      innovations: the recorded innovations, (T+1, K, Y), or None.
     """
 
     def __init__(self, law: FilterLaw, trials: int, record: bool) -> None:

@@ -80,7 +80,6 @@ class LinearLoop:
     Attributes:
       gain, offset: of a law, (T, m, Z or n) and (T, m), in deviations from the plan; or of C laws, (C, T, m, Z or n).
       filter_gain: of a Kalman filter, (T+1, Z, Y); None for a law of the measured states.
-      low, high: limits of the controls, (m,).
       assumed: the model that the filter assumes, by which Z is that of its estimates; by default that of the true
         system.
     """

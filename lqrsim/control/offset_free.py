@@ -101,9 +101,7 @@ class OffsetFree(Controller):
       model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
       filter: the filter's gains and covariances.
       weights: the law's weights of deviations from the plan; `weights.emphasis` is None with given tolerances.
-      gain: gain of the law, (T, m, Z).
-      offset: offset of the law, (T, m).
-      nominal: z in an undisturbed run, (T+1, Z).
+      gain, offset: of the law, (T, m, Z) and (T, m). nominal: z in an undisturbed run, (T+1, Z).
     """
 
     @checked

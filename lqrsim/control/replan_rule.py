@@ -69,10 +69,7 @@ class ReplanRecord:
     Attributes:
       step: control period in which the solve began.
       trial: number of a simulation, else 0.
-      status: how the solve ended.
-      seconds: duration of the solve.
       before: cost of continuing with the law in force.
-      used: whether the new plan came into force.
       reason: why the plan was not used, or the status with which it was used without having converged; empty if all
         went well. Such a plan may cost more than `before` if it violates the constraints less.
     """
@@ -173,7 +170,6 @@ class ReplanRule:
 
     Attributes:
       periods: control periods between two solves. delay: control periods until the answer comes into force.
-      solver: the prepared solver.
     """
 
     def __init__(

@@ -38,7 +38,6 @@ class ReplannedRun(ControllerRun):
 
     Attributes:
       plans: plans of each trial, by the step at which they begin; without the first plan.
-      log: the log of the solves.
       estimates, innovations: as in `FilterRun`.
     """
 

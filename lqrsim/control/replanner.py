@@ -54,9 +54,6 @@ class LiveReplanner:
 
     The other arguments are as in `Replanner.live`.
 
-    Args:
-      rule: the rule that determines the problem, time and start of each solve.
-
     Attributes:
       problem: the problem that is solved from now on.
       active: the plan in force, `active.plan`, and the control period at which it begins, `active.first`.
@@ -212,7 +209,6 @@ class Replanner(Controller):
         loses fewer trials, because a plan that begins at the boundary often comes too late.
       computing: duration of a solve in simulations, in seconds: a number; a function that draws it from a
         `numpy.random.Generator`; or "measured".
-      seed: seed of the random numbers for `computing`.
     """
 
     @checked
@@ -280,12 +276,7 @@ class Replanner(Controller):
 
 
 class ReplannerRun(ControllerRun):
-    """K trials of a simulation, with the plan in force in each.
-
-    Attributes:
-      log: how the solves went.
-      active: the plan in force of each trial.
-    """
+    """K trials of a simulation, with the plan in force in each."""
 
     def __init__(self, of: Replanner, trials: int) -> None:
         self._of, self._rule, self._evaluate = of, of.rule, evaluator(*of.coordinates)

@@ -52,8 +52,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         factor by which the disturbances are scaled.
       actions: "normalized": from -1 to 1, between the limits of each control; "controls": the controls themselves in
         their units, within their limits.
-      render_mode: None or "rgb_array". camera, size: camera and size of the pictures; any camera of `render` except
-        "chase".
+      camera, size: of the pictures; any camera of `render` except "chase".
 
     Attributes:
       task: the scenario and its plant. solution: the solution with the plan.
@@ -98,9 +97,8 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         episode = self._current()
         if episode.ended[0]:
             raise InputError("step: the episode has ended, call reset() first")
-        moment = episode.advance(self.task.controls_of([action], 1))
-        ended = bool(moment.terminated[0]), bool(moment.truncated[0])
-        return moment.observations[0], float(moment.rewards[0]), *ended, self._info(episode)
+        seen, rewards, terminated, truncated = episode.advance(self.task.controls_of([action], 1))
+        return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info(episode)
 
     def render(self) -> npt.NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A picture of the current state, (height, width, 3); None without a render_mode."""
@@ -218,8 +216,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         episode = self._current()
         if episode.ended.all():
             raise InputError("step: all episodes have ended, call reset() first")
-        moment = episode.advance(self.task.controls_of(actions, self.num_envs))
-        return moment.observations, moment.rewards, moment.terminated, moment.truncated, self._info(episode)
+        return *episode.advance(self.task.controls_of(actions, self.num_envs)), self._info(episode)
 
     def render(self) -> NoReturn:
         """Raises InputError: a batch has no pictures of its own; `lqrsim.render` draws its rollout."""

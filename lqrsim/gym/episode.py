@@ -3,7 +3,6 @@
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
@@ -178,16 +177,6 @@ class Commanded(Controller, ControllerRun):
         return self._coordinates
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """The result of a control period of K trials: observations (K, n+1), rewards and flags, (K,) each."""
-
-    observations: Array
-    rewards: Array
-    terminated: Flags
-    truncated: Flags
-
-
 class Resettable:
     """Base class of `Environment` and `VectorEnvironment`: a task, and its current episode."""
 
@@ -277,7 +266,8 @@ class Episode:
         """MuJoCo's current qpos, (K, nq)."""
         return self._loop.physics.frame()
 
-    def advance(self, controls: Array) -> Moment:
+    def advance(self, controls: Array) -> tuple[Array, Array, Flags, Flags]:
+        """Run a control period with controls (K, m): observations (K, n+1), rewards, terminations, truncations."""
         loop, step, before = self._loop, self._loop.step, self.states
         self._commanded.commands = controls
         with unlogged():
@@ -303,7 +293,7 @@ class Episode:
             first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
             early = np.where(collided & first, "collided", "diverged").astype(object)
             self.outcomes[now] = (np.array(self.rollout().outcome, dtype=object) if over else early)[now]
-        return Moment(self.observations, rewards, *self._ended_at.copy())
+        return self.observations, rewards, self._ended_at[0].copy(), self._ended_at[1].copy()
 
     def rollout(self) -> Rollout:
         """The records so far, in the form of `simulate`; NaN from now on."""

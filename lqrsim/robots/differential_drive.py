@@ -20,9 +20,9 @@ class DifferentialDrive(Robot):
 
     MJCF: models/create.xml.
 
+    Lengths are in m.
+
     Attributes:
-      axle_length: distance between the wheels in m.
-      radius: radius of the body in m.
       max_speed: largest speed of a wheel's rim in m/s, in either direction.
       wheel_radius: radius of a wheel in m; also the height of the axle.
     """

@@ -348,15 +348,12 @@ class MjcfRobot(Robot):
         goal, the cost is zero at the mean of both. Solvers start from these controls.
 
         Args:
-          start: (n,), a state.
-          goal: (n,), a state.
           dt: the control period in seconds; by default about 0.02.
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
             that are not named then have none.
           effort: weights of the controls, in the same form. By default 1 over the square of a control's largest value,
             so that a deviation of that size costs 1/2. The largest value comes from the control limits, else from the
             force limits, else it is 1.
-          damping: weight of the velocities of hinges, slides and ball joints at each step.
           attitude: if the robot's body moves on a free joint, the weight of its attitude, about the goal's, at each
             step; half of it is that of its angular velocity. With 0, nothing keeps a plan from tumbling on its way.
           limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
@@ -536,7 +533,6 @@ class MjcfRobot(Robot):
 
         Args:
           keyframe: its name; None for the MJCF's rest.
-          **values: name of a state -> value.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))

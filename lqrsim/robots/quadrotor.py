@@ -21,17 +21,14 @@ class Quadrotor(Robot):
 
     Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. MJCF: models/quadrotor.xml.
 
+    Numbers are in kg, m, s and N.
+
     Attributes:
-      mass: mass in kg.
       inertia: moment of inertia about each axis in kg m^2.
       yaw_inertia: moment of inertia about the body's z axis in kg m^2, if it differs; else None.
       arm: distance from the centre of mass to a rotor in m.
       torque_ratio: drag torque of a rotor in N m per N of its force; the paper's k_m.
       drag: linear drag against the velocity in N s/m; the paper's k_v.
-      gravity: gravitational acceleration in m/s^2.
-      max_force: largest force of a rotor in N.
-      min_force: least force of a rotor in N.
-      radius: radius of the collision sphere in m.
     """
 
     mass: Positive = 0.5

@@ -57,7 +57,6 @@ class RobotSensors:
     Attributes:
       sensors: the sensors, with the file's numbers where none were given.
       columns: where each one's numbers are in the readings.
-      names: names of the numbers for messages, (Y,).
       drag: the robot's, through which wind acts as a force.
       quaternions: for each sensor, whether a reading and its negative mean the same.
     """

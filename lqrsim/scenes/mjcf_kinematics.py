@@ -1,7 +1,7 @@
 """Places of bodies of an MJCF, how joints move them, and positions of joints at which kinematic loops close."""
 
 import copy
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -23,12 +23,16 @@ def placed(model: mujoco.MjModel, qpos: Array | None = None) -> mujoco.MjData:
     return next(posed(model, [model.qpos0 if qpos is None else qpos]))
 
 
-def posed(model: mujoco.MjModel, positions: Iterable[Array]) -> Iterator[mujoco.MjData]:
+def posed(
+    model: mujoco.MjModel,
+    positions: Iterable[Array],
+    place: Callable[[mujoco.MjModel, mujoco.MjData], None] = mujoco.mj_kinematics,
+) -> Iterator[mujoco.MjData]:
     """MuJoCo's data with the places of all bodies at each of these positions (nq,): one object, which changes."""
     data = mujoco.MjData(model)
     for qpos in positions:
         data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
+        place(model, data)
         yield data
 
 

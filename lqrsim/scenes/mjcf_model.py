@@ -340,18 +340,15 @@ def _joint(model: mujoco.MjModel, number: int) -> Joint:
     kind = _KINDS[mujoco.mjtJoint(model.jnt_type[number])]
     firsts = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
     qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
-    limited = model.jnt_limited[number] and kind in ("slide", "hinge")
+    single, name = kind in ("slide", "hinge"), _joint_name(model, number)
+    limited = model.jnt_limited[number] and single
+    stated = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{name}{SPEED_LIMIT}") if single else -1
     return Joint(
-        name=_joint_name(model, number), kind=kind, qpos=qpos, dofs=dofs,
+        name=name, kind=kind, qpos=qpos, dofs=dofs,
         limits=_side(limited, model.jnt_range[number]) if limited else None,
         forces=_side(model.jnt_actfrclimited[number], model.jnt_actfrcrange[number]),
-        speed=_speed_limit(model, _joint_name(model, number)) if kind in ("slide", "hinge") else math.inf,
+        speed=math.inf if stated < 0 else float(model.numeric(stated).data[0]),
     )  # fmt: skip
-
-
-def _speed_limit(model: mujoco.MjModel, joint: str) -> float:
-    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{joint}{SPEED_LIMIT}")
-    return math.inf if number < 0 else float(model.numeric(number).data[0])
 
 
 def _joint_name(model: mujoco.MjModel, number: int) -> str:

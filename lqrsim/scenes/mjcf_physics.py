@@ -3,7 +3,7 @@
 import copy
 import ctypes
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
 from lqrsim.rotations import AXES
+from lqrsim.scenes.mjcf_kinematics import posed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import unlogged
 
@@ -183,13 +184,15 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
     model.opt.o_solimp[0], model.opt.o_solimp[2] = 0.0, max(width, model.opt.o_solimp[2])
 
 
+@unlogged()
 def touches(model: mujoco.MjModel, qpos: Array) -> bool:
     """Whether a contact or a limit acts at one of these positions (k, nq)."""
     kinds = mujoco.mjtConstraint.__members__
     one_sided = [int(kind) for name, kind in kinds.items() if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
-    return any(np.isin(data.efc_type, one_sided).any() for data in _placed(model, qpos))
+    return any(np.isin(data.efc_type, one_sided).any() for data in posed(model, qpos, mujoco.mj_fwdPosition))
 
 
+@unlogged()
 def untouched_body(model: mujoco.MjModel, qpos: Array, state: int) -> str:
     """The body that a state (an index) moves, if nothing that moves touches it at any of these positions; else empty.
 
@@ -201,7 +204,7 @@ def untouched_body(model: mujoco.MjModel, qpos: Array, state: int) -> str:
         return ""
     body = int(model.dof_bodyid[dof])
     roots = model.body_weldid
-    for data in _placed(model, qpos):
+    for data in posed(model, qpos, mujoco.mj_fwdPosition):
         for pair in data.contact.geom:
             first, second = (int(roots[model.geom_bodyid[one]]) for one in pair)
             if int(roots[body]) in (first, second) and first and second:
@@ -233,16 +236,6 @@ def state_jacobians(
             mujoco.mjd_transitionFD(explicit, data, _DIFFERENCE, True, step, None, None, None)
         slopes[nv:] = (step - np.eye(n))[nv:] / model.opt.timestep
     return found
-
-
-def _placed(model: mujoco.MjModel, qpos: Array) -> Iterator[mujoco.MjData]:
-    """MuJoCo's data at each of these positions (k, nq)."""
-    data = mujoco.MjData(model)
-    for positions in qpos:
-        data.qpos[:] = positions
-        with unlogged():
-            mujoco.mj_fwdPosition(model, data)
-        yield data
 
 
 @cache

@@ -25,6 +25,7 @@ import numpy as np
 
 from lqrsim.annotations import Want, checked
 from lqrsim.errors import InputError, check_count, check_items, check_name, excerpt
+from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
 from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
@@ -178,16 +179,9 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     return np.flatnonzero(fixed & collides).tolist()
 
 
-def geom_names(model: mujoco.MjModel) -> list[str]:
-    """The names of all geoms, empty for geoms without a name."""
-    text = model.names
-    return [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
-
-
 def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: Collection[str]) -> list[Obstacle]:
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    names = geom_names(model)
+    data, text = placed(model), model.names
+    names = [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
     taken, types = set(names), model.geom_type.tolist()
     kind_of = {one: mujoco.mjtGeom(one).name.removeprefix("mjGEOM_").lower() for one in set(types)}
     places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
@@ -208,14 +202,10 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
             position = position + axes[geom] @ middle
         found.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still))
     planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
-    return [_endless(obstacle, planes) if obstacle.kind in ("capsule", "cylinder") else obstacle for obstacle in found]
-
-
-def _endless(bar: Obstacle, planes: list[Obstacle]) -> Obstacle:
-    """The cylinder or capsule, infinite if both its ends are walled off."""
-    if all(_walled_off(bar, end, planes) for end in (-1, 1)):
-        return replace(bar, size=np.array([bar.size[0], np.inf, 0.0]))
-    return bar
+    for i, one in enumerate(found):
+        if one.kind in ("capsule", "cylinder") and all(_walled_off(one, end, planes) for end in (-1, 1)):
+            found[i] = replace(one, size=np.array([one.size[0], np.inf, 0.0]))
+    return found
 
 
 def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:

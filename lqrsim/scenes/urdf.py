@@ -110,7 +110,10 @@ def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, s
             geometry.attrib.pop("name", None)  # they get names later, as most have none, and some the same one
             if (mesh := geometry.find("geometry/mesh")) is not None:
                 name = mesh.get("filename", "")
-                files = [one for place in _places(name, path.parent.resolve(), settings) for one in _readable(place)]
+                files = list[Path]()
+                for place in _places(name, path.parent.resolve(), settings):
+                    is_read = place.suffix.lower() in _MESHES
+                    files += [place] if is_read else [place.with_suffix(kind) for kind in _MESHES if place.name]
                 found = next((str(one) for one in files if os.path.isfile(one)), None)
                 mesh.set("filename", found or "")
                 if found is None:
@@ -139,11 +142,6 @@ def _places(name: str, folder: Path, settings: Mapping[str, str]) -> Iterator[Pa
             yield Path(entry) / inside
     for entry in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
         yield Path(entry) / "share" / package / inside
-
-
-def _readable(place: Path) -> list[Path]:
-    """The file if MuJoCo reads its kind, else those of the same name that it reads."""
-    return [place] if place.suffix.lower() in _MESHES else [place.with_suffix(kind) for kind in _MESHES if place.name]
 
 
 def _read(root: ElementTree.Element, name: str, compiler: Mapping[str, str]) -> mujoco.MjSpec:

@@ -31,9 +31,7 @@ class MujocoPhysics(Physics):
     clearance above 0, contacts are sensed without a force.
 
     Args:
-      substeps: physics steps per control period.
       contacts: whether obstacles may become solid; without them a run takes a quarter less time.
-      threads: number of threads; by default one per processor.
 
     Attributes:
       simulations: MuJoCo's simulations. solid: (K,) whether the obstacles of each are solid.

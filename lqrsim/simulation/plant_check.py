@@ -37,12 +37,7 @@ class PlantCheck:
     Attributes:
       errors: (n,) the largest difference of each state over the samples, in its unit.
       changes: (n,) the largest change of each state that the dynamics predict.
-      period: control period in seconds.
-      state: (n,), the sample with the largest error of the worst state.
-      control: (m,), the control of this sample.
-      simulated: (n,), the state after this sample in the simulator.
-      predicted: (n,), the state after this sample by the dynamics.
-      tolerance: largest allowed value of `relative`.
+      state, control, simulated, predicted: of the sample with the largest error of the worst state.
       contacts: pairs of geoms that touched, each with its number of samples, the most frequent first. The dynamics may
         not know of these contacts.
     """

@@ -47,7 +47,6 @@ class RunSettings:
       starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
         which they begin. Both are for `simulate_from`.
       acting: the disturbances, each `Noise` as a StateNoise.
-      law: the controller; by default the plan's policy.
       whole: the plan's trajectory from its own first knot on.
       followed: the plan of the run: the given one, or else the controller's own; from the knot on.
       states, controls: coordinates of the controller, with limits within the robot's limits.

@@ -23,7 +23,6 @@ class Simulator(abc.ABC):
     must give the same bits whatever other trials run with it. States (K, n) and controls (K, m) are the robot's.
 
     Attributes:
-      name: name for messages and records.
       timestep: the longest timestep in s. A control period consists of a whole number of steps.
       parameters: which of "mass", "inertia" and "thrust" `start` can multiply. Disturbances that multiply others are
         refused.

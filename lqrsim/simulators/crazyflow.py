@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import OneOf, Positive, checked
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
-from lqrsim.simulators.quadrotors import Frame, check_quadrotor, package
+from lqrsim.simulators.quadrotors import Frame, package
 from lqrsim.versions import versions_of
 
 DRONES = ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350")
@@ -69,7 +69,7 @@ class Crazyflow(Simulator):
         return Quadrotor(**numbers | changes)
 
     def check(self, robot: Robot) -> None:
-        check_quadrotor("crazyflow", robot)
+        check_kind("crazyflow: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
         limits, of = robot.dynamics.control_coordinates, numbers_of(self.drone)
         low, high = of["thrust_min"], of["thrust_max"]
         if min(limits.low) < low - 1e-12 or max(limits.high) > high + 1e-12:

@@ -15,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lqrsim.errors import Array, InputError, check_kind
-from lqrsim.robots.base import Robot
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.errors import Array, InputError
 from lqrsim.versions import outdated
 
 TWIST = 1e-6  # m, the largest distance of rotors from the corners of a square
@@ -68,11 +66,6 @@ def about_z(vectors: Array, angle: float) -> Array:
     """Vectors (K, 3), turned about the z axis. SciPy's product has bits that depend on K."""
     (x, y, z), cosine, sine = vectors.T, np.cos(angle), np.sin(angle)
     return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=1)
-
-
-def check_quadrotor(name: str, robot: Robot) -> None:
-    """Raise InputError unless the robot has the states and controls of a Quadrotor."""
-    check_kind(f"{name}: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
 
 
 def package(module: str, extra: str) -> Any:

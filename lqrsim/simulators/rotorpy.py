@@ -14,7 +14,7 @@ from lqrsim.errors import Array, InputError, check_array, check_kind, check_numb
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
-from lqrsim.simulators.quadrotors import Frame, check_quadrotor, package
+from lqrsim.simulators.quadrotors import Frame, package
 from lqrsim.versions import versions_of
 
 GRAVITY = 9.81  # m/s2, RotorPy's
@@ -111,7 +111,7 @@ class RotorPy(Simulator):
         return Quadrotor(**numbers | changes)
 
     def check(self, robot: Robot) -> None:
-        check_quadrotor("RotorPy", robot)
+        check_kind("RotorPy: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
 
     def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> "_Vehicles":
         return _Vehicles(self, self._frame, states, factors, timestep)

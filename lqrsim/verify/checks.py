@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import av
@@ -12,28 +12,20 @@ import numpy.typing as npt
 from av.error import FFmpegError
 from mujoco import mjtGeom as Geom
 
-from lqrsim.annotations import Index, checked
-from lqrsim.errors import Array, InputError, check_progress
+from lqrsim.annotations import Index, Progress, checked
+from lqrsim.errors import Array, InputError
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.mjcf_kinematics import posed
-from lqrsim.verify.verdict import Criterion, Positions, Verification, compare, positions_at
+from lqrsim.verify.verdict import Criterion, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.geoms import RIM
 from lqrsim.view.recorded_trial import model_of, place_in, robot_body
 from lqrsim.view.video_metadata import Pane, VideoMetadata
-
-Progress = Callable[[int, int], object]
-
-
-@checked
-def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
-    """Raises InputError unless the arguments are a solution and a function, or None."""
-    check_progress(progress)
 
 
 def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
@@ -65,26 +57,12 @@ def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
     return rollout.places(trial)[rows]
 
 
-def planned_positions(rollout: Rollout, times: Array) -> Array:
-    """Planned positions (N, d)."""
-    return positions_at(rollout.times, rollout.planned_places, times)
-
-
 def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
     """Positions (N, d) of the robot's body from the frames, which are denser than the states."""
     good = np.isfinite(rollout.frames[trial]).all(axis=1)
     body = robot_body(model, rollout.body)
     places = [place_in(data, rollout, body).copy() for data in posed(model, rollout.frames[trial, good])]
     return positions_at(rollout.frame_times[good], rollout.of_world(places), times)
-
-
-def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
-    """Whether states and frames show the same motion."""
-    times, _ = frames_at_states(rollout, trial)
-    found, wanted = frame_positions(rollout, trial, model, times), state_positions(rollout, trial, times)
-    apart = np.linalg.norm(found - wanted, axis=1).max()
-    said = f"frames and states at most {1e3 * apart:.2f} mm apart, want {1e3 * bound:.2f} at most"
-    return Criterion("record", bool(apart <= bound), said)
 
 
 def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
@@ -131,8 +109,9 @@ SYMMETRIC_KINDS = (
 )
 
 
+@checked
 def verify_run(
-    rollout: Rollout, trial: int = 0, *, solution: Solution | None = None, progress: Progress | None = None
+    rollout: Rollout, trial: Index = 0, *, solution: Solution | None = None, progress: Progress | None = None
 ) -> Verification:
     """Draw the frames of a rollout, read positions from the pixels, and compare them with its states.
 
@@ -146,7 +125,6 @@ def verify_run(
       solution: the solution that was run, to check the plan in the rollout.
       progress: called after each frame with the number of finished frames and their total.
     """
-    check_arguments(solution, progress)
     model = drawable_model(rollout, trial)
     body, place = robot_body(model, rollout.body), None
     if rollout.balls is not None and not rollout.state_coordinates.position:
@@ -175,13 +153,6 @@ def verify_run(
             progress(len(measured), len(rows))
     places, apart = triangulate(views, measured, rollout.plane)
     name = model.geom(geom).name or f"a geom of {model.body(int(model.geom_bodyid[geom])).name}"
-    positions = Positions(
-        times,
-        seen=places - rollout.of_world(offsets),
-        actual=state_positions(rollout, trial, times),
-        planned=planned_positions(rollout, times),
-        apart=apart,
-    )
     others = [check_plan(rollout, solution)]
     if thickness < THIN:
         said = f"{finer * thickness:.2g} pixels where it is thinnest, want {THINNEST:g} or more"
@@ -190,7 +161,11 @@ def verify_run(
         describe(rollout, trial),
         f"the silhouette of {name} in {size[0]} x {size[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
-        positions,
+        times,
+        seen=places - rollout.of_world(offsets),
+        actual=state_positions(rollout, trial, times),
+        planned=positions_at(rollout.times, rollout.planned_places, times),
+        apart=apart,
         bound=bound,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
         others=tuple(others),
@@ -389,7 +364,6 @@ def verify_video(
         plane the camera `side`; for a robot that moves in space both.
       trial: row of the rollout; by default the first that the video shows.
     """
-    check_arguments(solution, progress)
     metadata, plane = video_metadata.read(path), rollout.plane
     digest = video_metadata.digest(rollout)
     run = metadata.runs.index(digest) if digest in metadata.runs else 0
@@ -409,24 +383,25 @@ def verify_video(
     count = min(len(measured), metadata.frames)
     times = metadata.times()[:count]
     seen, apart = triangulate(views, measured[:count], plane)
-    positions = Positions(
-        times,
-        seen=seen,
-        actual=frame_positions(rollout, trial, model, times),
-        planned=planned_positions(rollout, times),
-        apart=apart,
-    )
     areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
+    drawn, _ = frames_at_states(rollout, trial)
+    moved = frame_positions(rollout, trial, model, drawn) - state_positions(rollout, trial, drawn)
+    worst, most = np.linalg.norm(moved, axis=1).max(), RECORD_BOUND * rollout.radius
+    said = f"frames and states at most {1e3 * worst:.2f} mm apart, want {1e3 * most:.2f} at most"
     others = (
         *_check_file(metadata, digest, len(measured), off, min(areas)),
-        check_record(rollout, trial, model, RECORD_BOUND * rollout.radius),
+        Criterion("record", bool(worst <= most), said),
         check_plan(rollout, solution),
     )
     named = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
     return compare(
         f"{Path(path).name}, {describe(rollout, trial)}",
         f"the green mark in its panes {named}",
-        positions,
+        times,
+        seen=seen,
+        actual=frame_positions(rollout, trial, model, times),
+        planned=positions_at(rollout.times, rollout.planned_places, times),
+        apart=apart,
         bound=VIDEO_BOUND * rollout.radius,
         interval=metadata.speed * (1 / float(metadata.rate)),
         others=others,

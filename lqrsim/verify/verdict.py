@@ -21,7 +21,6 @@ def diagnose(
       numbers: (k,) numbers of the frames in which the robot is seen.
       times, seen, actual: times and positions for all frames.
       bound: bound on the error, in metres.
-      interval: seconds between frames.
     """
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
     error = where - truth
@@ -35,7 +34,7 @@ def diagnose(
         if slope < 0.25 and spread.std() > 5 * bound:
             return f"{name} is mirrored"
     offset = error.mean(axis=0)
-    late = _slope(error, velocity)
+    late = float((error * velocity).sum() / max((velocity**2).sum(), 1e-12))
     split, ahead = _change_point(error, velocity)
     candidates: list[tuple[Array, str]] = []
     if _lengths(offset) > bound / 2:
@@ -68,10 +67,6 @@ def _single_frames(
         if _lengths(crossed).max() <= near:
             return f"frames {numbers[first]} and {numbers[second]} are swapped"
     return f"frames that do not show their time: {', '.join(str(numbers[one]) for one in wrong)}"
-
-
-def _slope(error: Array, velocity: Array) -> float:
-    return float((error * velocity).sum() / max((velocity**2).sum(), 1e-12))
 
 
 def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
@@ -128,8 +123,6 @@ class Verification:
     """Positions of a run from pixels, in N frames with d coordinates, and the tests that they passed.
 
     Attributes:
-      subject: the file or run that was verified.
-      method: how positions were read from pixels.
       times: (N,) seconds after the start of the run that the frames should show.
       seen: (N, d) positions from pixels in metres; NaN where the robot is hidden.
       actual: (N, d) positions in the simulator.
@@ -184,42 +177,28 @@ class Verification:
     __str__ = summary
 
 
-@dataclass(frozen=True, eq=False)
-class Positions:
-    """Positions of the robot in N frames, d coordinates each, in metres.
-
-    Attributes:
-      times: (N,) seconds after the start of the run.
-      seen: (N, d) from pixels; NaN where the robot is hidden.
-      actual: (N, d) in the simulator.
-      planned: (N, d) in the plan.
-      apart: (N,) disagreement of the views.
-    """
-
-    times: Array
-    seen: Array
-    actual: Array
-    planned: Array
-    apart: Array
-
-
 def compare(
     subject: str,
     method: str,
-    positions: Positions,
+    times: Array,
     *,
+    seen: Array,
+    actual: Array,
+    planned: Array,
+    apart: Array,
     bound: float,
     interval: float,
     others: tuple[Criterion, ...] = (),
 ) -> Verification:
-    """Compare the positions from pixels with the actual ones.
+    """Compare positions (N, d) from pixels with the actual ones.
 
     Args:
+      times, seen, actual, planned: as in a `Verification`.
+      apart: (N,) disagreement of the views, in metres.
       bound: bound on the distance between seen and actual positions in any frame, in metres.
       interval: seconds between two frames; the shift must be less than a quarter of it.
       others: tests that have been made already.
     """
-    times, seen, actual = positions.times, positions.seen, positions.actual
     good = np.asarray(np.isfinite(seen).all(axis=1))
     visible = Criterion(
         "seen",
@@ -228,7 +207,7 @@ def compare(
     )
     if good.sum() < 3:
         return Verification(
-            subject, method, times, seen, actual, positions.planned, np.nan, np.nan, np.nan, np.nan,
+            subject, method, times, seen, actual, planned, np.nan, np.nan, np.nan, np.nan,
             (*others, visible), "the robot is not in the pictures, or too small",
         )  # fmt: skip
     error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
@@ -237,7 +216,7 @@ def compare(
     # A robot that hardly moves determines neither shift nor scale; the bound is then the uncertainty of the fit.
     most, stretch = max(interval / 4, 4 * shift_error), max(SCALE, 4 * scale_error)
     number = int(np.flatnonzero(good)[distance.argmax()])
-    most_apart, agreement = float(positions.apart[good].max()), ()
+    most_apart, agreement = float(apart[good].max()), ()
     if most_apart > 0:  # a single view cannot disagree
         detail = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
         agreement = (Criterion("views agree", most_apart <= bound, detail),)
@@ -254,12 +233,14 @@ def compare(
         Criterion("scale", abs(scale) <= stretch, f"{1 + scale:.4f}, want 1 within {stretch:.4f}"),
     )
     return Verification(
-        subject, method, times, seen, actual, positions.planned, _rms(distance), float(distance.max()), shift,
-        1 + scale, tests, _likely_cause(tests, positions, bound, interval),
+        subject, method, times, seen, actual, planned, _rms(distance), float(distance.max()), shift,
+        1 + scale, tests, _likely_cause(tests, times, seen, actual, bound, interval),
     )  # fmt: skip
 
 
-def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: float, interval: float) -> str:
+def _likely_cause(
+    tests: tuple[Criterion, ...], times: Array, seen: Array, actual: Array, bound: float, interval: float
+) -> str:
     """The likely cause of a failure, as a line; empty if no test failed."""
     failed = {test.name for test in tests if test.passed is False}
     if "thickness" in failed:
@@ -267,8 +248,7 @@ def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: flo
     if "mark" in failed:
         return "the panes are too small: render the video larger, or with fewer of them"
     if failed & {"position", "time", "scale", "views agree"}:
-        visible = np.flatnonzero(np.isfinite(positions.seen).all(axis=1))
-        return diagnose(visible, positions.times, positions.seen, positions.actual, bound, interval)
+        return diagnose(np.flatnonzero(np.isfinite(seen).all(axis=1)), times, seen, actual, bound, interval)
     causes = {
         "run": "the video is of another run, or the file of this run has changed",
         "plan": "the plan in this file is not the one that the policy followed",

@@ -35,9 +35,6 @@ class MotorLag(Disturbance):
     control.
 
     The control that is applied in a control period is the exact mean over the period.
-
-    Args:
-      time_constant: in s.
     """
 
     time_constant: NonNegative

@@ -89,8 +89,6 @@ class GilbertElliott:
     Args:
       to_bad: probability per control period of turning bad while good.
       to_good: probability per control period of turning good while bad.
-      lost_when_good: fraction that is lost while good.
-      lost_when_bad: fraction that is lost while bad.
     """
 
     to_bad: Share

@@ -238,7 +238,8 @@ class WheelRadiusMismatch(WheelMismatch):
         simulations.expand("geom_size")[:, wheels] *= factors[:, :, None]
         # Raise the axle by the difference of the radii, so that the wheel touches the floor and the casters do not.
         raised = plant.model.geom_size[wheels, 0] * (factors - 1)
-        simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * upward(plant, hubs)
+        parents = placed(plant.model).xmat[plant.model.body_parentid[hubs]].reshape(-1, 3, 3)
+        simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * parents[:, 2]  # upward, in their axes
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return gain_unknowns(self, plant, [driven_by(plant, hub) for hub in treads(plant)[1]])
@@ -347,9 +348,3 @@ def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Ids of the wheels' geoms, and of their bodies."""
     geoms = np.array([plant.model.geom(name).id for name in plant.robot.wheels], dtype=np.intp)
     return geoms, plant.model.geom_bodyid[geoms].astype(np.intp)
-
-
-def upward(plant: Plant, children: npt.NDArray[np.intp]) -> Array:
-    """The world's upward direction in the axes of each body's parent, (bodies, 3), in the model's initial pose."""
-    drawn = placed(plant.model)
-    return drawn.xmat[plant.model.body_parentid[children]].reshape(-1, 3, 3)[:, 2]

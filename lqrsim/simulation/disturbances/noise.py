@@ -64,8 +64,7 @@ class ControlNoise(AddedError):
     """White noise on each control, redrawn each control period.
 
     Args:
-      std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, one per control, or
-        numbers by name or unit, 0 for the others.
+      std: of each control, in its unit: one number, one per control, or numbers by name or unit.
     """
 
     what, hook, lasts = "control noise", "actuate", False
@@ -78,8 +77,7 @@ class ControlOffset(AddedError):
     """A constant error of each control, drawn for each trial from a normal distribution.
 
     Args:
-      std: standard deviation in the control's unit; one number, one per control, or numbers by name or unit, 0 for the
-        others.
+      std: of each control, in its unit: one number, one per control, or numbers by name or unit.
     """
 
     what, hook = "control offset", "actuate"
@@ -93,8 +91,7 @@ class MeasurementNoise(AddedError):
     """White noise on each measured state.
 
     Args:
-      std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
-        0.01, "rad": 0.02}, 0 for the others.
+      std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
     """
 
     what, hook, lasts = "measurement noise", "measure", False
@@ -107,8 +104,7 @@ class MeasurementBias(AddedError):
     """A constant error of each measured state, drawn for each trial from a normal distribution.
 
     Args:
-      std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
-        0.01, "rad": 0.02}, 0 for the others.
+      std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
     """
 
     what, hook = "measurement bias", "measure"
@@ -125,8 +121,7 @@ class InitialStateError(AddedError):
     meets them and is nearest to the drawn one.
 
     Args:
-      std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
-        0.01, "rad": 0.02}, 0 for the others.
+      std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
     """
 
     what, hook = "initial state off", "initial_states"
