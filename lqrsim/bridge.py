@@ -31,15 +31,7 @@ from lqrsim import rotations
 from lqrsim.annotations import Bounds, checked
 from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback
 from lqrsim.control.replanner import LiveReplanner
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_kind,
-    excerpt,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan

@@ -20,12 +20,7 @@ from lqrsim.control.collision_chance import FAR, Spread, Surroundings, chance_of
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import (
-    InputError,
-    check_array,
-    check_items,
-    keep,
-)
+from lqrsim.errors import InputError, check_array, check_items, keep
 from lqrsim.problem.costs import weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping

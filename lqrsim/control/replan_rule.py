@@ -12,13 +12,7 @@ from typing import Annotated
 import numpy as np
 
 from lqrsim.annotations import LINE, Index, Line, Want, checked
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_kind,
-    check_number,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel

@@ -14,14 +14,7 @@ from lqrsim.annotations import Bounds, Index, Want, checked
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
 from lqrsim.control.replan_rule import ActivePlan, Changes, ReplanLog, ReplanRule, SolveRequest, within_rates
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_function,
-    check_number,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256

@@ -12,15 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from lqrsim.annotations import Count, OneOf, Seed, checked
 from lqrsim.control.controllers import ControllerLike, ControllerRun, as_controller
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_kind,
-    check_seed,
-    excerpt,
-    shaped,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_kind, check_seed, excerpt, shaped, vectors_of
 from lqrsim.gym.episode import Actions, Disturbances, Episode, Flags, Resettable, Task, reset_options
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario

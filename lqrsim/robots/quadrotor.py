@@ -45,12 +45,7 @@ class Quadrotor(Robot):
     name = "quadrotor"
     body = "quadrotor"
     joints = ("quadrotor_x", "quadrotor_y", "quadrotor_z", "quadrotor_rotation")
-    actuators = (
-        "quadrotor_rotor_1",
-        "quadrotor_rotor_2",
-        "quadrotor_rotor_3",
-        "quadrotor_rotor_4",
-    )
+    actuators = ("quadrotor_rotor_1", "quadrotor_rotor_2", "quadrotor_rotor_3", "quadrotor_rotor_4")
 
     def __post_init__(self) -> None:
         check_number("Quadrotor: min_force", self.min_force, below=self.max_force)

@@ -9,14 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
 from lqrsim.control.controllers import Controller, ControllerLike, as_controller
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_items,
-    check_memory,
-    check_text,
-)
+from lqrsim.errors import Array, InputError, check_array, check_items, check_memory, check_text
 from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of

@@ -416,11 +416,7 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
       area: area of the smallest mark, in pixels.
     """
     return (
-        Criterion(
-            "run",
-            digest in metadata.runs,
-            f"the video shows {', '.join(metadata.runs)}, this run is {digest}",
-        ),
+        Criterion("run", digest in metadata.runs, f"the video shows {', '.join(metadata.runs)}, this run is {digest}"),
         Criterion(
             "frames",
             frames == metadata.frames and off < 1 / float(metadata.rate) / 4,
