@@ -9,10 +9,15 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_kind, vectors_of
 
 if TYPE_CHECKING:
+    import mujoco
+
     from lqrsim.problem.collision_shape import CollisionGeoms, ShapeInWorld
     from lqrsim.problem.collision_spheres import CollisionSpheres
     from lqrsim.problem.dynamics import Dynamics
     from lqrsim.scenes.world import World
+
+
+Indices = npt.NDArray[np.intp]
 
 
 class Robot(abc.ABC):
@@ -100,3 +105,20 @@ def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int)
     if qpos.shape[:-1] != qvel.shape[:-1]:
         raise InputError(f"qvel: got shape {qvel.shape}, want qpos's shape, {qpos.shape}, with {nv} numbers")
     return qpos, qvel
+
+
+def indices_in(robot: Robot, model: "mujoco.MjModel") -> tuple[Indices, Indices, Indices]:
+    """The indices of a robot's joints in the qpos and qvel of a model, and of its controls in ctrl."""
+    joints, actuators = (
+        [model.joint(name) for name in robot.joints],
+        [model.actuator(name).id for name in robot.actuators],
+    )
+    spans = (
+        [(one.qposadr[0], one.qpos0.size) for one in joints],
+        [(one.dofadr[0], one.damping.size) for one in joints],
+        [(model.actuator_ctrladr[i], model.actuator_ctrlnum[i]) for i in actuators],
+    )
+    qpos, qvel, ctrl = (
+        np.array([at for first, size in each for at in range(first, first + size)], dtype=np.intp) for each in spans
+    )
+    return qpos, qvel, ctrl

@@ -35,8 +35,7 @@ from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.force_limits import ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
-from lqrsim.robots.self_clearance import SelfClearance
+from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms, SelfClearance
 from lqrsim.rotations import AXES
 from lqrsim.scenes.mjcf_holding import ForceLimit, Holding, efforts, holding, limited_forces, settled
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of

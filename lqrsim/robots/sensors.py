@@ -12,7 +12,7 @@ from lqrsim.annotations import Bounds, NonNegative, Positive, Want, checked
 from lqrsim.errors import Array, InputError, check_items
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, indices_in
 from lqrsim.scenes.mjcf_sensors import NO_HIT, QUATERNIONS, SensorReader, file_sensor
 from lqrsim.scenes.scene import Scene
 
@@ -130,19 +130,15 @@ class RobotSensors:
     def reader(self) -> Reader:
         """A function that computes exact readings by MuJoCo, for one thread; see `Reader`."""
         robot, model = self._robot, self._scene.model
-        joints = [model.joint(name) for name in robot.joints]
-        qpos_at = np.concatenate([one.qposadr[0] + np.arange(one.qpos0.size) for one in joints])
-        qvel_at = np.concatenate([one.dofadr[0] + np.arange(one.damping.size) for one in joints])
-        numbers = [model.actuator(name).id for name in robot.actuators]
-        ctrl_at = np.concatenate([model.actuator_ctrladr[i] + np.arange(model.actuator_ctrlnum[i]) for i in numbers])
+        in_qpos, in_qvel, in_ctrl = indices_in(robot, model)
         reader = SensorReader(model, int(model.body(robot.body).id))
 
         def read(states: Array, controls: Array, wrench: Array) -> Array:
             count, first = len(states), states.shape[1] - robot.activations
             qpos, qvel = np.tile(model.qpos0, (count, 1)), np.zeros((count, model.nv))
             ctrl, act = np.zeros((count, model.nu)), np.zeros((count, model.na))
-            qpos[:, qpos_at], qvel[:, qvel_at] = robot.configuration(states)
-            ctrl[:, ctrl_at] = robot.actuation(controls)
+            qpos[:, in_qpos], qvel[:, in_qvel] = robot.configuration(states)
+            ctrl[:, in_ctrl] = robot.actuation(controls)
             if robot.activations:
                 act[:] = states[:, first:]
             return self.readings(reader.read(qpos, qvel, act, ctrl, wrench))

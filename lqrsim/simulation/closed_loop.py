@@ -21,11 +21,10 @@ from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.effects import Effects, seeded
+from lqrsim.simulation.effects import Effects, Readings, seeded
 from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.physics import SimulatorPhysics
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.readings import Readings
 from lqrsim.simulation.recorder import Recorder
 from lqrsim.simulation.run_settings import RunSettings
 from lqrsim.versions import versions
@@ -213,8 +212,8 @@ class ClosedLoop:
 
     def measure(self, step: int) -> Array:
         measured = self.effects.measure(self._knot + step, self.states)
-        self.records.knot(step, self.states, measured, self.collisions.clearance)
-        self.records.lose(step, self.physics.unstable | _not_finite(measured))
+        lost = self.physics.unstable | _not_finite(measured)
+        self.records.knot(step, self.states, measured, self.collisions.clearance, lost)
         over = self.records.over(step)
         if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
             measured[over] = self.settings.trajectory.states[step]
@@ -275,12 +274,8 @@ class ClosedLoop:
                 self.collisions.relocate(period.states[-1])
             self.records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]
-        if self.settings.frames:
-            self._show(physics.drawn(period))
-
-    def _show(self, frames: Sequence[Array]) -> None:
-        records, physics, watch = self.records, self.physics, self.settings.watch
-        for frame in frames:
+        records, watch = self.records, self.settings.watch
+        for frame in physics.drawn(period) if self.settings.frames else ():
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
             records.frames.append(frame)
             if watch is not None:

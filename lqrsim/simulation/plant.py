@@ -19,7 +19,7 @@ from lqrsim.errors import Array, InputError, check_number, check_text, shaped, v
 from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Indices, Robot, indices_in
 from lqrsim.robots.sensors import RobotSensors, Sensor
 from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
@@ -33,8 +33,6 @@ from lqrsim.simulation.simulator import Simulator
 
 MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
 MOST_SUBSTEPS = 20_000  # physics steps in a control period
-
-Indices = npt.NDArray[np.intp]
 
 
 class Plant(OneVersion):
@@ -89,12 +87,8 @@ class Plant(OneVersion):
         apart = np.concatenate([mounts, _left_out(robot, scene, self.body)])
         self._apart = apart[np.isin(scene.model.geom_bodyid[apart[:, 0]], self.bodies)]
         self.model = self._compile()
-        joints = [self.model.joint(name) for name in robot.joints]
-        self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
-        self.qvel = _ranges((joint.dofadr[0], joint.damping.size) for joint in joints)
+        self.qpos, self.qvel, self.ctrl = indices_in(robot, self.model)
         self.actuators = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
-        controls = self.model.actuator_ctrladr[self.actuators], self.model.actuator_ctrlnum[self.actuators]
-        self.ctrl = _ranges(zip(*controls, strict=True))
         self.contact = np.arange(self.model.nsensordata - len(self.obstacles), self.model.nsensordata)
         try:
             batch.Batch(self.model, 1, 1)
@@ -395,7 +389,3 @@ def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:
         if model.body_parentid[body] in found:
             found.add(body)
     return np.array(sorted(found), dtype=np.intp)
-
-
-def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:
-    return np.array([at for start, size in starts_and_sizes for at in range(start, start + size)], dtype=np.intp)

@@ -37,13 +37,11 @@ class Recorder:
         self.failed_since, self.reasons = np.full(trials, steps + 1), [""] * trials
         self.frames: list[Array] = []
 
-    def knot(self, step: int, states: Array, measured: Array, clearance: Array) -> None:
-        """Record true states (K, n), measured states (K, n) and clearance (K,) at a knot."""
+    def knot(self, step: int, states: Array, measured: Array, clearance: Array, lost: Mask) -> None:
+        """Record states (K, n), true and measured, and clearance (K,) at a knot, and which are invalid from here."""
         self.states[:, step], self.measured[:, step], self.clearance[:, step] = states, measured, clearance
-
-    def lose(self, step: int, rows: Mask) -> None:
-        if rows.any():
-            self.lost_since[rows] = np.minimum(self.lost_since[rows], step)
+        if lost.any():
+            self.lost_since[lost] = np.minimum(self.lost_since[lost], step)
 
     def estimator_diverged(self, step: int, reasons: Mapping[int, str]) -> None:
         """Record that the filters of these trials, row -> reason, diverged at this knot, unless a trial has ended."""
