@@ -49,11 +49,7 @@ class _Signals:
 
 
 def handle_signals(last_words: str = "") -> None:
-    """Handle signals as a command does. Call it once, before slow imports.
-
-    Args:
-      last_words: a line for stderr when a signal stops the process.
-    """
+    """Handle signals as a command does, with last words for stderr. Call it once, before slow imports."""
     _Signals.last_words = last_words
     _fill_streams()
     # Signals that are ignored stay ignored, as nohup requires.
@@ -162,11 +158,7 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
-    """A block in which an exception, such as KeyboardInterrupt, gets the results so far as its `found`.
-
-    Args:
-      make: returns the results, or None if there are none. Its argument is the results of an inner block, or None.
-    """
+    """A block in which an exception, such as KeyboardInterrupt, gets `make` of an inner block's `found` as its own."""
     try:
         yield
     except BaseException as error:

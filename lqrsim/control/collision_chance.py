@@ -146,9 +146,7 @@ def collision_chance(
 ) -> tuple[Array, Array]:
     """The chance of being in collision at each knot (..., T+1), and of colliding at all, (...).
 
-    Args:
-      states: means, (..., T+1, n). covariance: (..., T+1, n, n). across: covariance of each state with the previous
-        state, (..., T, n, n).
+    It is that of mean states (..., T+1, n), covariances, and covariances with the previous state, (..., T, n, n).
     """
     if not surroundings.kept:
         return np.zeros(states.shape[:-1]), np.zeros(states.shape[:-2])

@@ -7,6 +7,7 @@ Affine laws run compiled, for many trials at once. Each trial gets bit-identical
 import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -129,12 +130,7 @@ WANTED = "a policy, a Controller or a function of state (n,) and time in s that 
 
 
 def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dynamics) -> tuple[Controller, Plan]:
-    """The controller of a run, and the plan that the run is about.
-
-    Args:
-      given: the controller; None for the policy of the plan.
-      dynamics: dynamics of the robot that the controller runs on.
-    """
+    """The controller of a run on a robot with these dynamics, by default the plan's policy, and the plan of the run."""
     wanted = "a Plan, such as smooth(problem), which may be followed by another policy: controller=policy"
     check_kind("plan", plan, (Plan, type(None)), wanted)
     if plan is None and isinstance(given, Controller):
@@ -174,21 +170,20 @@ class _OfPolicy(Controller):
 
 
 @dataclass(frozen=True, eq=False)
-class Feedback(_OfPolicy):
-    """A policy of the measured state."""
+class Feedback(_OfPolicy, ControllerRun):
+    """A policy of the measured state. It remembers nothing, and is its own run."""
 
     policy: AffinePolicy
 
     def start(self, trials: int) -> ControllerRun:
-        return _FeedbackRun(self.policy)
+        return self
 
-
-class _FeedbackRun(ControllerRun):
-    def __init__(self, policy: AffinePolicy) -> None:
-        self._policy, self._evaluate = policy, evaluator(*spaces_of(policy))
+    @cached_property
+    def _evaluate(self) -> Callable[..., Array]:
+        return evaluator(*spaces_of(self.policy))
 
     def control(self, step: int, measured: Array) -> Array:
-        policy = self._policy
+        policy = self.policy
         t = min(step, policy.steps - 1)
         return self._evaluate(measured, policy.gain[t], policy.offset[t], policy.nominal[t])
 
@@ -207,17 +202,14 @@ class OutputFeedback(_OfPolicy):
                 f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             )
 
-    @property
-    def measures(self) -> list[int]:
-        return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
-
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self.policy, self.measures, trials)
+        return _OutputFeedbackRun(self.policy, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, policy: OutputFeedbackPolicy, measures: list[int], trials: int) -> None:
-        self._policy, self._measures = policy, measures
+    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
+        self._policy, states = policy, policy.state_coordinates.names
+        self._measures = [states.index(name) for name in policy.measured_coordinates.names]
         self._z = np.tile(policy.start(), (trials, 1))
         self._last = np.full((trials, len(policy.state_coordinates)), np.nan)
 
@@ -230,15 +222,23 @@ class _OutputFeedbackRun(ControllerRun):
         return commands
 
 
-class FunctionController(Controller):
-    """A function of the measured state (n,) and the time in s. Its controls are held within the robot's limits."""
+class FunctionController(Controller, ControllerRun):
+    """A function of the measured state (n,) and the time in s, held within the robot's limits. It is its own run."""
 
     def __init__(self, function: ControlFunction, dynamics: Dynamics, dt: float) -> None:
         self.function, self.dt = function, dt
         self._coordinates = spaces_of(dynamics)
 
     def start(self, trials: int) -> ControllerRun:
-        return _FunctionRun(self)
+        return self
+
+    def control(self, step: int, measured: Array) -> Array:
+        t, controls = step * self.dt, self._coordinates[1]
+        found = [np.asarray(self.function(state.copy(), t), dtype=np.float64) for state in measured]
+        for one in found:
+            if one.shape != (len(controls),):
+                raise InputError(f"got controls of shape {one.shape}, want {(len(controls),)}")
+        return controls.clip(np.array(found))
 
     @property
     def digest(self) -> str:
@@ -248,16 +248,3 @@ class FunctionController(Controller):
     @property
     def coordinates(self) -> Spaces:
         return self._coordinates
-
-
-class _FunctionRun(ControllerRun):
-    def __init__(self, of: FunctionController) -> None:
-        self._function, self._dt, self._controls = of.function, of.dt, of.coordinates[1]
-
-    def control(self, step: int, measured: Array) -> Array:
-        t, shape = step * self._dt, (len(self._controls),)
-        found = [np.asarray(self._function(state.copy(), t), dtype=np.float64) for state in measured]
-        for one in found:
-            if one.shape != shape:
-                raise InputError(f"got controls of shape {one.shape}, want {shape}")
-        return self._controls.clip(np.array(found))

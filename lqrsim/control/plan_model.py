@@ -410,12 +410,10 @@ class PlanModel:
         return np.sqrt(reach**2 @ same / same.sum(axis=0))
 
     def assumed(self, memory: float, effort: Array, doubt: float = 0.0) -> "PlanModel":
-        """The model that a filter assumes of this one: see `Uncertainty.steady`. Nothing in it is exact.
+        """The model that a filter assumes of this one, with a memory in s: see `Uncertainty.steady`. Nothing is exact.
 
         Args:
-          memory: seconds, or infinity, as for an `OffsetFree`.
-          effort: tolerated effort of the controls, (m,).
-          doubt: of the lag; see `with_margin`.
+          effort: tolerated effort of the controls, (m,). doubt: of the lag; see `with_margin`.
         """
         stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
         steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss

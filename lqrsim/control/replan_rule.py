@@ -93,11 +93,7 @@ class ReplanLog:
         self.solved, self.kept = 0, Counter[str]()
 
     def enter(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
-        """Whether the new plan of a solve is to be used. Counts the solve.
-
-        Args:
-          late: whether the answer came after the deadline.
-        """
+        """Whether the new plan of a solve is used; `late` if it came after the deadline. Counts the solve."""
         reason = "" if replan.success else replan.status.name
         if late:
             reason = "not ready in time"
@@ -251,10 +247,7 @@ class ReplanRule:
         self, active: ActivePlan, step: int, state: Array, problem: Problem, *, late: float = 0.0,
         sent: Array | None = None,
     ) -> SolveRequest:  # fmt: skip
-        """The solve for a control period, from a state (n,) that was measured `late` seconds after the period began.
-
-        `sent` (m,) is the command of the period before it, if there was one.
-        """
+        """The solve for a period, of a state (n,) measured `late` s after it began; `sent` (m,) is the last command."""
         plan, first = active.plan, step + self.delay
         row = active.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])

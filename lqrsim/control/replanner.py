@@ -244,8 +244,7 @@ class Replanner(Controller):
         """Re-planning in a robot's own loop, with a thread that solves: `with replanner.live() as live:`.
 
         Args:
-          interpolate: whether laws are blended between two knots, for loops that are faster than the plan; see
-            `AffinePolicy`.
+          interpolate: whether laws are blended between two knots, as by an `AffinePolicy`, for faster loops.
           clock: returns the time in seconds, for deadlines.
         """
         return LiveReplanner(self.rule, interpolate=interpolate, clock=clock)

@@ -86,11 +86,7 @@ def sample_loop(
     model: PlanModel, controller: Controller, limits: tuple[Array, Array], surroundings: Surroundings,
     counted: Counted, trials: int, seed: int,
 ) -> SampledLoop:  # fmt: skip
-    """Run K trials of a controller.
-
-    Args:
-      model: model of the true system. limits: lowest and highest controls, (m,) each.
-    """
+    """Run K trials of a controller in the model of the true system, within limits of the controls, (m,) each."""
     plan, n = model.plan, model.n
     robots, run = _Robots(model, limits, trials, np.random.default_rng(seed)), controller.start(trials)
     displaced = surroundings.displacements(robots.rng, trials)

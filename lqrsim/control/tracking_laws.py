@@ -57,12 +57,7 @@ class Weights:
     @classmethod
     @checked
     def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: Positive = AT_END) -> "Weights":
-        """The weights for tolerances in the states' units and efforts (m,) in the controls'.
-
-        Args:
-          at_end: factor on the tolerances of the position at the end; on the tolerances of all states if there is no
-            position.
-        """
+        """The weights for tolerances in the states' units and efforts (m,); `at_end` as in `track`."""
         space = dynamics.state_coordinates
         state = per_entry("tolerate", tolerate, space, above=0.0)
         end, last = state.copy(), list(space.position) or slice(None)
@@ -159,11 +154,7 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
 
 
 def _undoing(model: PlanModel, state: Array) -> Array:
-    """M, (C, T, m, D): the controls that cancel the unknowns' effect in one step, as far as they can.
-
-    Args:
-      state: diagonals of Q, (C, n).
-    """
+    """M, (C, T, m, D): the controls that cancel the unknowns' effect in one step as far as they can, by Q, (C, n)."""
     B = model.jacobian[:, :, model.n :]
     weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
     curve = weighed @ B

@@ -552,11 +552,7 @@ class MjcfRobot(Robot):
         return state
 
     def _closed(self, state: Array, qpos: Array, named: Iterable[str]) -> Array:
-        """The positions (nv,) of a state at which equalities are met and the named joints are where they are in it.
-
-        Args:
-          qpos: (nq,), with which to begin.
-        """
+        """The positions (nv,) of a state that meet equalities and are as named, beginning with qpos (nq,)."""
         model, names = self.scene.model, self.dynamics.state_coordinates.names
         fixed = np.zeros(model.nv, dtype=bool)
         for one in self.mjcf.joints:

@@ -182,27 +182,27 @@ class MjcfDynamics(Dynamics):
         if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):
             return
         for softness in SOFTER:
-            other = copy.copy(self)
-            other._stated = self._stated | {"softness": softness}
-            other._set_mjcf(self.mjcf)
-            yield f"{softness:g}", other
+            yield f"{softness:g}", self._stating(softness=softness)
 
     def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
         nv = self.physics.model.nv
         wanted = moves[:nv] if moves[:nv].any() else moves[nv : 2 * nv]  # a velocity points the way
         if not wanted.any():
             return
-        found, other = Approaches(self.mjcf, states, wanted), copy.copy(self)
-        other._stated = self._stated | {"obstacles": (*self._stated["obstacles"], *found.thing)}
+        found = Approaches(self.mjcf, states, wanted)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
-            other._set_mjcf(self.mjcf)
+            other = self._stating(obstacles=(*self._stated["obstacles"], *found.thing))
             for words, positions in found:
                 yield words, other, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
 
     def unlimited(self, actuators: tuple[int, ...], joints: tuple[int, ...]) -> "MjcfDynamics":
         """The same without limits on the forces of these actuators and on the sums at these joints."""
+        return self._stating(unlimited=(actuators, joints))
+
+    def _stating(self, **stated: Any) -> "MjcfDynamics":
+        """The same with other arguments of its `MjcfPhysics`."""
         other = copy.copy(self)
-        other._stated = self._stated | {"unlimited": (actuators, joints)}
+        other._stated = self._stated | stated
         other._set_mjcf(self.mjcf)
         return other
 

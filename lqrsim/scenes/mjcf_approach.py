@@ -220,11 +220,7 @@ def _unit(vector: Array) -> Array:
 
 
 def _paths(first: Array, last: Array) -> Iterator[tuple[str, list[Array]]]:
-    """Directions from a body's centre through which a tool goes to its far side, in words: the short way, and others.
-
-    Args:
-      first: the direction in which the tool is. last: that of the far side.
-    """
+    """Directions through which a tool goes round a body, from the first to the last, in words: the short way first."""
     if first @ last > -_ALONG:
         yield "", [first, last]
     left = np.cross([0.0, 0.0, 1.0], last)

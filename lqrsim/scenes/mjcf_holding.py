@@ -342,10 +342,9 @@ class _Search:
 
 
 def _unmet(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Of the rates now + rates x of an actuator, with low <= x <= high, as few as may be left that are not zero.
+    """Of the rates now + rates x of an actuator, with low <= x <= high: what they are, and which are left nonzero.
 
-    Returns:
-      What they are then, and which are left, of several the last.
+    Those are as few as may be, of several the last.
     """
     from scipy.optimize import lsq_linear
 
@@ -361,11 +360,7 @@ def _unmet(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, np
 
 
 def _force_limits(model: mujoco.MjModel, forces: Array, now: Array) -> Iterator[tuple[Array, Array, Array]]:
-    """Limits of the forces of actuators and tendons: rows, and the least and largest change.
-
-    Args:
-      forces: (nout, k), slopes of the forces. now: (nout,), the forces.
-    """
+    """Limits of forces (nout,), with slopes (nout, k), of actuators and tendons: rows, least and largest change."""
     limited, single = model.actuator_forcelimited.astype(bool), model.actuator_outnum == 1
     outs, least, most = model.actuator_outadr, *model.actuator_forcerange.T
     some = np.flatnonzero(limited & single)

@@ -182,10 +182,7 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
-    """The geom in a body's tree that is farthest from the body's origin at rest; the body itself if there is no geom.
-
-    It is said by the number of its body, its position (3,) there, and the radius of its bounding ball in metres.
-    """
+    """The body, place (3,) on it and bounding radius in m of the geom that is farthest out at rest, or of the body."""
     data = placed(model)
     moves = (model.body_rootid[model.geom_bodyid] == model.body_rootid[body]) & (model.geom_rbound > 0)
     own = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))

@@ -6,9 +6,9 @@ import os
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -211,20 +211,18 @@ class MjcfModel:
 
     def positions_of(self, qpos: Array) -> Array:
         """A robot's positions (..., nv), with rotation vectors, of MuJoCo's (..., nq), with quaternions."""
-        parts, rotation = list[Array](), partial(rotations.rotation_vector, turns_about=self.turns_about)
-        for one in self.joints:
-            own = qpos[..., one.qpos]
-            turned = [rotation(own[..., -4:])] if one.kind in ("free", "ball") else [own]
-            parts += [own[..., :3], *turned] if one.kind == "free" else turned
-        return np.concatenate(parts, axis=-1)
+        return self._turned([qpos[..., one.qpos] for one in self.joints], 4, rotations.rotation_vector)
 
     def qpos_of(self, positions: Array) -> Array:
         """MuJoCo's positions (..., nq) of a robot's (..., nv)."""
-        parts, quaternion = list[Array](), partial(rotations.quaternion, turns_about=self.turns_about)
-        for one in self.joints:
-            own = positions[..., one.dofs]
-            turned = [quaternion(own[..., -3:])] if one.kind in ("free", "ball") else [own]
-            parts += [own[..., :3], *turned] if one.kind == "free" else turned
+        return self._turned([positions[..., one.dofs] for one in self.joints], 3, rotations.quaternion)
+
+    def _turned(self, parts: list[Array], size: int, turn: Callable[..., Array]) -> Array:
+        """The positions of all joints, the rotation in the last numbers of ball and free joints in its other form."""
+        for i, one in enumerate(self.joints):
+            if one.kind in ("free", "ball"):
+                rotation = turn(parts[i][..., -size:], turns_about=self.turns_about)
+                parts[i] = np.concatenate([parts[i][..., :-size], rotation], axis=-1)
         return np.concatenate(parts, axis=-1)
 
     def body_of(self, name: str | None, what: str) -> int:
@@ -303,11 +301,7 @@ class MjcfModel:
 
 
 def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
-    """The model of an MJCF given as text, without includes.
-
-    Args:
-      what: name of the MJCF in messages.
-    """
+    """The model of an MJCF given as text, without includes; `what` is its name in messages."""
     _check_elements(xml, what)
     try:
         with unlogged():

@@ -44,12 +44,10 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
 
 
 def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
-    """The candidates that MuJoCo lets the robot touch, except ground and what only carries it.
+    """The candidates that MuJoCo lets the robot touch, except ground and what only carries it; arguments as above.
 
-    Ground is a floor that the robot can sink to, and what it stands on and can move over.
-
-    Args:
-      body, floors: as of `in_the_way`. A free joint, or a slide that is not level, lets it sink.
+    Ground is a floor that the robot can sink to, by a free joint or a slide that is not level, and what it stands on
+    and can move over.
     """
     data, touched = placed(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
     ground = set[int]()

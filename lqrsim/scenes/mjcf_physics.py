@@ -194,11 +194,7 @@ def touches(model: mujoco.MjModel, qpos: Array) -> bool:
 
 @unlogged()
 def untouched_body(model: mujoco.MjModel, qpos: Array, state: int) -> str:
-    """The body that a state (an index) moves, if nothing that moves touches it at any of these positions; else empty.
-
-    Args:
-      qpos: (k, nq).
-    """
+    """The body that a state (an index) moves, if nothing moving touches it at any of these (k, nq); else empty."""
     dof = state % model.nv if state < 2 * model.nv else -1
     if dof < 0:
         return ""

@@ -191,13 +191,10 @@ def with_light(xml: str, place: Array) -> str:
 
 
 def with_mocap(xml: str, model: mujoco.MjModel, poses: Mapping[str, tuple[Array, Array]], prefix: str) -> str:
-    """The MJCF with mocap bodies elsewhere, and all else as it is.
+    """The MJCF, compiled to this model, with the mocap bodies of the poses there, and all else as it is.
 
-    What MuJoCo compiles from where bodies are at rest is stated as it was: what ties two bodies.
-
-    Args:
-      xml: the MJCF. model: the model compiled from it.
-      poses: body -> position and quaternion. prefix: of the names of sites that are added.
+    What MuJoCo compiles from where bodies are at rest is stated as it was: what ties two bodies, by sites whose names
+    have the prefix.
     """
     root = ElementTree.fromstring(xml)
     elements = _elements(root)["body"]
@@ -233,11 +230,8 @@ class Number:
 def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     """All such numbers, by the names of parameters: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
 
-    Numbers are listed only for elements that have a name and this number in the text: bodies that move, geoms that
-    collide.
-
-    Args:
-      xml: an MJCF whose elements all have names. model: the model compiled from it.
+    They are of an MJCF, compiled to this model, whose elements all have names. Only elements with a name and this
+    number in the text count: bodies that move, geoms that collide.
     """
     elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
     masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
@@ -264,9 +258,6 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
     """The MJCF with changed numbers, by name, as in `numbers_of`.
 
     A body's inertia scales with its mass; `mass` scales all bodies. The numbers of a gear keep their ratios.
-
-    Args:
-      what: name of the MJCF in messages.
     """
     numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
     elements, scales = _elements(root), dict[str, float]()

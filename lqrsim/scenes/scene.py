@@ -134,11 +134,7 @@ def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str] = KIN
 
 
 def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int], what: str) -> list[int]:
-    """Ids of the geoms that the `obstacles=` of `load_scene` chooses.
-
-    Args:
-      default: the geoms for True. what: name of the scene in messages.
-    """
+    """Ids of the geoms that the `obstacles=` of `load_scene` chooses; `default` for True."""
     if isinstance(obstacles, bool):
         return list(default) if obstacles else []
     fixed = np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0).tolist()

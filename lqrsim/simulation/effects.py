@@ -143,10 +143,7 @@ class Effects:
         return controls
 
     def push(self, step: int, states: Array) -> tuple[Array, Array]:
-        """The forces in N and torques in N m in the true states (K, n), (K, 6), and the wind in m/s, (K, 3).
-
-        All are along the world's axes.
-        """
+        """Forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3), in world axes, at states (K, n)."""
         pushed = np.zeros((len(states), 9))
         for one in self._pushes:
             pushed[:, one.part] += one.factor * shaped(one.label, one.hook(step, states), (len(states), 3))
@@ -179,11 +176,7 @@ class Readings:
         return self._arriving(step, np.repeat(taken, len(states), axis=0))
 
     def arriving(self, step: int, held: Array | None = None) -> Array:
-        """The readings that arrive at a knot, (K, Y).
-
-        Args:
-          held: the controls (K, m) that are in force there; by default those that act already.
-        """
+        """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
         exact = self._sensors.readings(self._physics.sense(held))
         named = {one.name: exact[:, at] for one, at in self._columns()}
         named = self._effects.read(step, named)

@@ -122,12 +122,9 @@ class MujocoPhysics(Physics):
         return self._sensors[:, self.plant.contact] > 0
 
     def sense(self, held: Array | None = None) -> Array:
-        """MuJoCo's `sensordata` (K, any) of the present, under the controls and forces of the last period.
+        """MuJoCo's `sensordata` (K, any) of the present, under the last forces and the last controls, or `held` (K, m).
 
         The simulations continue as if it had not been asked for.
-
-        Args:
-          held: other controls (K, m) to be in force, as before the first period.
         """
         if held is not None:
             self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(held)

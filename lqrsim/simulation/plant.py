@@ -133,11 +133,7 @@ class Plant(OneVersion):
         return RobotSensors(self.robot, self.scene, sensors)
 
     def check_simulator(self, what: str, parameter: str | None = None) -> None:
-        """Raise an InputError if a disturbance cannot change a parameter of the physics.
-
-        Args:
-          parameter: "mass", "inertia" or "thrust"; None for one that only MuJoCo's models have.
-        """
+        """Raise an InputError if a disturbance cannot change "mass", "inertia" or "thrust", or, for None, models."""
         if self.simulator is not None and parameter not in self.simulator.parameters:
             raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, want one that can have it")
 
@@ -195,11 +191,7 @@ class Plant(OneVersion):
         return len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9)
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
-        """The analytic state (..., n) for the robot's `qpos` (..., nq), `qvel` (..., nv) and activations (..., na).
-
-        Args:
-          near: as in `Robot.state`.
-        """
+        """The analytic state (..., n) for `qpos`, `qvel` and activations (..., na); as `Robot.state`."""
         state = self.robot.state(qpos, qvel, near=near)
         if not self.robot.activations:
             return state

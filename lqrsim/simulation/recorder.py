@@ -73,11 +73,7 @@ class Recorder:
             turn_to_nearest(space, array.transpose(1, 0, 2), self.plan.states)
 
     def stacked_frames(self, each: int, *, all_of_them: bool) -> Array:
-        """The frames (K, F, nq); NaN for those that were not reached.
-
-        Args:
-          each: frames per control period. all_of_them: whether all were recorded, or only the first.
-        """
+        """The frames (K, F, nq), `each` in a period, or only the first; NaN for those that were not reached."""
         missing = (self._steps * each + 1 - len(self.frames)) if all_of_them else 0
         return np.stack(self.frames + [np.full_like(self.frames[0], np.nan)] * missing, axis=1)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,7 @@ class Late(Disturbance):
         return f"{self.what} late by {self.periods} control period{'' if self.periods == 1 else 's'}"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        told: dict[str, Any] = {self.known_as: self.periods}
-        return Uncertainty(**told)
+        return replace(Uncertainty(), **{self.known_as: self.periods})
 
     def scaled(self, strength: float) -> Self:
         """The delay with `strength` times the periods, rounded to whole periods."""
@@ -156,8 +155,7 @@ class Dropouts(Disturbance):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The fraction that is lost, as if losses were independent."""
-        told: dict[str, Any] = {self.known_as: self.share}
-        return Uncertainty(**told)
+        return replace(Uncertainty(), **{self.known_as: self.share})
 
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
         if isinstance(self.loss, GilbertElliott):
