@@ -25,10 +25,9 @@ from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenes.scene import load_scene, scene_from_xml
-from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.closed_loop import ClosedLoop, simulate
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.run_settings import RunSettings
 
 NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
 RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
@@ -128,9 +127,9 @@ def test_a_wall_stops_the_robot_and_is_counted_as_contact(arena):
     assert 2 - 0.17 - 0.01 < rollout.states[0, -1, 0] < 2 - 0.17 + 0.01
 
 
-def test_settings_have_the_arguments_of_simulate_with_their_defaults():
+def test_the_loop_has_the_arguments_of_simulate_with_their_defaults():
     given = {name: one.default for name, one in inspect.signature(simulate).parameters.items() if name != "plant"}
-    own = {one.name: one.default for one in fields(RunSettings) if one.init and one.name != "plant"}
+    own = {one.name: one.default for one in fields(ClosedLoop) if one.init and one.name != "plant"}
     assert own == given | {"starts": None, "knot": 0}
 
 

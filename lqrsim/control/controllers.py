@@ -202,14 +202,18 @@ class OutputFeedback(_OfPolicy):
                 f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             )
 
+    @property
+    def measures(self) -> list[int]:
+        """The indices of the measured states."""
+        return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
+
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self.policy, trials)
+        return _OutputFeedbackRun(self.policy, self.measures, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
-        self._policy, states = policy, policy.state_coordinates.names
-        self._measures = [states.index(name) for name in policy.measured_coordinates.names]
+    def __init__(self, policy: OutputFeedbackPolicy, measures: list[int], trials: int) -> None:
+        self._policy, self._measures = policy, measures
         self._z = np.tile(policy.start(), (trials, 1))
         self._last = np.full((trials, len(policy.state_coordinates)), np.nan)
 

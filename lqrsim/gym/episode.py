@@ -32,7 +32,6 @@ from lqrsim.scenarios.solutions import given, remarks, solve
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.simulation.closed_loop import ClosedLoop
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.run_settings import RunSettings
 from lqrsim.solvers.compiled import CostsByStep
 
 _log = logging.getLogger("lqrsim")
@@ -160,7 +159,8 @@ class Commanded(Controller, ControllerRun):
     """A controller, and its run, whose commands come from outside: set `commands` (K, m) before each control period."""
 
     def __init__(self, coordinates: tuple[Coordinates, Coordinates], trials: int) -> None:
-        self._coordinates, self.commands = coordinates, np.zeros((trials, len(coordinates[1])))
+        self._coordinates = coordinates
+        self.commands: Array = np.zeros((trials, len(coordinates[1])))
 
     def start(self, trials: int) -> "Commanded":
         return self
@@ -230,13 +230,12 @@ class Episode:
         self.task, self.seed, self.first = task, seed, first_trial
         dynamics = task.plant.robot.dynamics
         self._commanded = Commanded(spaces_of(dynamics), count)
-        settings = RunSettings(
+        self._loop = ClosedLoop(
             plant=task.plant, plan=task.solution, disturbances=disturbances, controller=self._commanded,
             seed=seed, trials=count, first_trial=first_trial, frames=frames, threads=threads,
             **task.scenario.near_enough(),
         )  # fmt: skip
-        self._costs, self._plan = task.costs, settings.trajectory
-        self._loop = ClosedLoop(settings)
+        self._costs, self._plan = task.costs, self._loop.trajectory
         self._loop.begin()
         self.ended = np.zeros(count, dtype=bool)
         self.outcomes = np.full(count, "", dtype=object)
@@ -309,5 +308,5 @@ class Episode:
 
     def _near_plan(self, states: Array) -> Array:
         near = np.array(states, order="C")[None]
-        turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
+        turn_to_nearest(self._loop.state_coordinates, near, self._plan.states[self._loop.step][None])
         return near[0]

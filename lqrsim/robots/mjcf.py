@@ -459,56 +459,44 @@ class MjcfRobot(Robot):
             else f"  body: {self.body}, whose position is not among the states",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
             f"  held at rest by: {_listed(told)}{short}",
-            *(f"  {what}: {_listed(found)}" for what, found in self._known_forces().items() if found),
-            *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
-            f"  obstacles: {_listed(self.scene.world.names)}",
-            *([f"  carried, without contacts, by: {_listed(mounts)}"] if (mounts := self._mounts()) else []),
+            *(f"  {title}: {_listed(found)}" for title, found in self._remarks().items() if found),
         ]
         return "\n".join(lines)
 
-    def _known_forces(self) -> dict[str, list[str]]:
-        """Limits of forces and speeds, and dry friction, with what a plan does about them."""
-        kept, clipped = self._forces
+    def _remarks(self) -> dict[str, list[str]]:
+        """What a plan does about forces and speeds, what is amiss at the MJCF's rest, and obstacles, by title."""
+        model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
+        space, joints, (kept, clipped) = self.dynamics.state_coordinates, self.mjcf.joints, self._forces
+        losses = zip(space.names, space.units, model.dof_frictionloss.tolist(), strict=False)
+        tendons = ((model.tendon(i).name, "m", loss) for i, loss in enumerate(model.tendon_frictionloss.tolist()))
+        units, obstacle_of = {"rad": "N m", "m": "N"}, dict(zip(self.scene.geoms, self.scene.world.names, strict=True))
+        past = [
+            f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
+            for one in joints
+            if one.limits is not None and not one.limits[0] <= rest[one.dof] <= one.limits[1]
+        ]
+        mounts = [
+            f"{obstacle_of[other]} ({self.scene.model.body(int(self.scene.model.geom_bodyid[own])).name})"
+            for own, other in mounting_pairs(self.scene.model, list(self.scene.geoms)).tolist()
+        ]
         return {
             "force limits, constraints of plans": [
                 f"{one.name.partition(' ')[2]} {one.low:.4g} to {one.high:.4g} {one.unit}" for one in kept
             ],
             "force limits, clipped in plans as in runs": [name.partition(" ")[2] for name in clipped],
-            "dry friction, in plans and runs": self._dry(),
+            "dry friction, in plans and runs": [
+                f"{name} {loss:.4g} {units[unit]}" for name, unit, loss in (*losses, *tendons) if loss > 0
+            ],
             "limits of speed, kept only by robot.joint_limits": [
                 f"{one.name} {one.speed:.4g} {'m' if one.kind == 'slide' else 'rad'}/s"
-                for one in self.mjcf.joints
+                for one in joints
                 if np.isfinite(one.speed)
             ],
+            "past their limits at rest": past,
+            "touching at rest": [" and ".join(pair) for pair in contacts_of(model, self.configuration(rest)[0])],
+            "obstacles": list(self.scene.world.names) or ["none"],
+            "carried, without contacts, by": list(dict.fromkeys(mounts)),
         }
-
-    def _mounts(self) -> list[str]:
-        """The obstacles that bodies touch in every position, with these bodies."""
-        model = self.scene.model
-        names = dict(zip(self.scene.geoms, self.scene.world.names, strict=True))
-        pairs = [
-            (model.body(int(model.geom_bodyid[own])).name, names[other])
-            for own, other in mounting_pairs(model, list(self.scene.geoms)).tolist()
-        ]
-        return [f"{obstacle} ({body})" for body, obstacle in dict.fromkeys(pairs)]
-
-    def _dry(self) -> list[str]:
-        model, space = self.dynamics.physics.model, self.dynamics.state_coordinates
-        joints = zip(space.names, space.units, model.dof_frictionloss.tolist(), strict=False)
-        tendons = ((model.tendon(i).name, "m", loss) for i, loss in enumerate(model.tendon_frictionloss.tolist()))
-        units = {"rad": "N m", "m": "N"}
-        return [f"{name} {loss:.4g} {units[unit]}" for name, unit, loss in (*joints, *tendons) if loss > 0]
-
-    def _amiss(self) -> dict[str, list[str]]:
-        """Problems of a plan that starts from the MJCF's rest: joints past their limits, and contacts."""
-        model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
-        past = [
-            f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
-            for one in self.mjcf.joints
-            if one.limits is not None and not one.limits[0] <= rest[one.dof] <= one.limits[1]
-        ]
-        touching = [f"{first} and {second}" for first, second in contacts_of(model, self.configuration(rest)[0])]
-        return {"past their limits": past, "touching": touching}
 
     @property
     def joint_limits(self) -> StateBounds:

@@ -43,18 +43,16 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
     return [geom for geom in candidates if geom in avoidable]
 
 
-def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
-    """The candidates that MuJoCo lets the robot touch, except ground and what only carries it; arguments as above.
+def touchable(model: mujoco.MjModel, candidates: list[int], body: int) -> list[int]:
+    """The candidates that MuJoCo lets the robot touch, except ground and what only carries it; see `in_the_way`.
 
     Ground is a floor that the robot can sink to, by a free joint or a slide that is not level, and what it stands on
     and can move over.
     """
     data, touched = placed(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
-    ground = set[int]()
-    if floors:
-        pairs = touching_pairs(model, candidates)
-        own = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
-        ground = (_ground(model, data) if _sinks(model, data, body) else ground) | _supports(model, pairs[own])
+    pairs = touching_pairs(model, candidates)
+    own = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
+    ground = (_ground(model, data) if _sinks(model, data, body) else set[int]()) | _supports(model, pairs[own])
     return [geom for geom in candidates if geom in touched and geom not in ground]
 
 

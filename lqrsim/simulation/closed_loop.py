@@ -1,33 +1,45 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
-`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `run_settings.py`
+`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `run_checks.py`
 checks the arguments, `effects.py` applies the disturbances, `mujoco_physics.py` advances MuJoCo, `collisions.py`
 detects collisions, and `recorder.py` records.
 """
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import ControllerLike, ControllerRun
+from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
+from lqrsim.control.controllers import ControllerLike, ControllerRun, as_controller
 from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
+from lqrsim.results.goal import Target
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import MOVED, MovingObstacles, Rollout
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.effects import Effects, Readings, seeded
+from lqrsim.simulation.disturbances import Disturbance, as_disturbances
+from lqrsim.simulation.effects import Effects, MakeGenerator, Readings, seeded
 from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.physics import SimulatorPhysics
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.recorder import Recorder
-from lqrsim.simulation.run_settings import RunSettings
+from lqrsim.simulation.run_checks import check_plan, check_size, coordinates_of, shape_among
+from lqrsim.solvers.parallel import check_threads
 from lqrsim.versions import versions
+
+Watch = Annotated[
+    Callable[[float, Array, npt.NDArray[np.bool_]], object],
+    Want("a function of the time, MuJoCo's qpos and which trials are unstable"),
+]
+
+MOVING = "a World of the obstacles, such as ls.World([ls.Obstacle(..., velocity=...)])"
 
 
 def simulate(
@@ -89,7 +101,7 @@ def simulate(
     Returns:
       A Rollout of the trials. Its `controller_run` is the run of the controller, with its records.
     """
-    return _run(RunSettings(**locals()))  # all arguments, by name
+    return _run(ClosedLoop(**locals()))  # all arguments, by name
 
 
 def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **options: Any) -> Rollout:
@@ -106,11 +118,10 @@ def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **o
         `InitialStateError`, are refused. Times of the rollout count from the knot.
     """
     states = check_array("states", states, (None, None))
-    return _run(RunSettings(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options))
+    return _run(ClosedLoop(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options))
 
 
-def _run(settings: RunSettings) -> Rollout:
-    loop = ClosedLoop(settings)
+def _run(loop: "ClosedLoop") -> Rollout:
     with unlogged():
         loop.run()
     return loop.rollout(undisturbed=_undisturbed(loop))
@@ -122,75 +133,124 @@ def _undisturbed(loop: "ClosedLoop") -> Array | None:
     A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
     plant repeats, there is a further run; the plant remembers it until another plan runs there.
     """
-    settings, plant, plan = loop.settings, loop.settings.plant, loop.settings.followed
-    if settings.starts is not None or settings.moving is not None:
+    plant, plan = loop.plant, loop.followed
+    if loop.starts is not None or loop.moving is not None:
         return None
-    if not settings.acting and settings.law.digest == plan.policy.digest:
-        loop.records.turn_to_plan(settings.states)
+    if not loop.acting and loop.law.digest == plan.policy.digest:
+        loop.records.turn_to_plan(loop.state_coordinates)
         ended = min(loop.collisions.at[0], loop.records.time_of(loop.records.lost_since)[0])
         return np.where(plan.trajectory.times[:, None] < ended, loop.records.states[0], np.nan)
     if not plant.robot.dynamics.by_mujoco or plant.simulator is not None:
         return None
     which = plan.policy.digest, plan.trajectory.states.tobytes()
     if plant.ran is None or plant.ran[:2] != which:
-        alone = RunSettings(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1)
+        alone = ClosedLoop(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1)
         plant.ran = (*which, _run(alone).undisturbed)
     return plant.ran[2]
 
 
+@checked
+@dataclass(kw_only=True, eq=False, repr=False)
 class ClosedLoop:
-    """The closed loop of K trials, with a method for each phase of a control period.
+    """The closed loop of K trials, with a method for each phase of a control period, by the arguments of `simulate`.
 
     All trials are advanced together. `run` runs the whole loop; `begin` and `period` run it step by step. Steps count
     from the knot at which the run begins; disturbances and controller are given those of the whole plan.
 
     Attributes:
+      starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
+        which they begin. Both are for `simulate_from`.
+      acting: the disturbances, each `Noise` as a StateNoise.
+      whole: the plan's trajectory from its own first knot on.
+      followed: the plan of the run: the given one, or else the controller's own; from the knot on.
+      state_coordinates, control_coordinates: those of the controller, with limits within the robot's limits.
       step: number of the next control period. measured: (K, n), the measured states at its beginning.
       controller_run: the run of the controller.
     """
 
+    _prefix = ""
+
+    plant: Plant
+    plan: Plan | None = None
+    controller: ControllerLike | None = None
+    disturbances: Sequence[Disturbance | Noise] = ()
+    seed: Seed = 0
+    trials: Count = 1
+    first_trial: Seed = 0
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
+    frames: bool = True
+    contacts: bool = True
+    threads: int | None = None
+    generators: MakeGenerator | None = None
+    progress: Progress | None = None
+    watch: Watch | None = None
+    starts: Array | None = None
+    knot: Index = 0
+    moving: Annotated[World, Want(MOVING)] | None = None
+
     @unlogged()
-    def __init__(self, settings: RunSettings) -> None:
-        self.settings = settings
-        plant, plan, trials = settings.plant, settings.trajectory, settings.trials
-        numbers = range(settings.first_trial, settings.first_trial + trials)
-        generators = settings.generators or seeded(settings.seed)
-        self.effects = Effects(plant, settings.whole, settings.acting, numbers, generators)
+    def __post_init__(self) -> None:
+        plant, trials = self.plant, self.trials
+        self.acting = as_disturbances(self.disturbances, "disturbances, such as ControlNoise(0.05)")
+        threads = check_threads(self.threads)
+        self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
+        self.state_coordinates, self.control_coordinates = coordinates_of(self.law, plant)
+        check_plan(plan, plant)
+        self.whole = plan.trajectory
+        if self.knot >= self.whole.steps:
+            raise InputError(f"knot: got {self.knot}, want one from 0 to {self.whole.steps - 1}, before the plan's end")
+        self.followed = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
+        if self.starts is not None:
+            self.starts = check_array("states", self.starts, (trials, self.whole.states.shape[1]))
+        self._radius = self._target(self.followed.goal).radius(
+            plant.robot.radius, self.goal_radius, self.goal_tolerance
+        )
+        dt = self.trajectory.dt
+        substeps, passing = plant.substeps(dt), shape_among(plant, self.moving, self.knot * dt)
+        check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
+        numbers = range(self.first_trial, self.first_trial + trials)
+        self.effects = Effects(plant, self.whole, self.acting, numbers, self.generators or seeded(self.seed))
         self.physics: AnyPhysics
         if plant.simulator is not None:
-            self.physics = SimulatorPhysics(plant, plant.simulator, trials, settings.substeps)
+            self.physics = SimulatorPhysics(plant, plant.simulator, trials, substeps)
         else:
-            contacts, threads = settings.contacts, settings.threads
-            self.physics = MujocoPhysics(plant, trials, settings.substeps, contacts=contacts, threads=threads)
-        first = self.effects.initial_states(np.tile(settings.whole.states[0], (trials, 1)), settings.starts)
-        self.physics.place(first)
+            self.physics = MujocoPhysics(plant, trials, substeps, contacts=self.contacts, threads=threads)
+        self.physics.place(self.effects.initial_states(np.tile(self.whole.states[0], (trials, 1)), self.starts))
         self.effects.alter_models(self.physics)
         self.physics.prepare(altered=self.effects.alters_models)
-        name = f"{type(settings.law).__name__}.start"
-        self.controller_run = check_kind(name, settings.law.start(trials), ControllerRun, "a ControllerRun returned")
-        self.records = Recorder(plan, trials)
+        name = f"{type(self.law).__name__}.start"
+        self.controller_run = check_kind(name, self.law.start(trials), ControllerRun, "a ControllerRun returned")
+        self.records = Recorder(self.trajectory, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
-        self.collisions = Collisions(plant, self.states, self.effects.displaced, plan.dt, settings.passing)
+        self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
-        self.step, self.measured, self._knot = 0, self.states, settings.knot
-        sensors = settings.law.sensors
-        self._readings = None if sensors is None else Readings(sensors, self.effects, self.physics, plan.dt)
+        self.step, self.measured = 0, self.states
+        sensors = self.law.sensors
+        self._readings = None if sensors is None else Readings(sensors, self.effects, self.physics, dt)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        return self.followed.trajectory
+
+    def _target(self, goal: Array | None) -> Target:
+        return Target(self.state_coordinates, goal, self.trajectory.states)
 
     def run(self) -> None:
         """Run all control periods; fewer if all trials have ended."""
-        settings, steps = self.settings, self.settings.trajectory.steps
+        steps = self.trajectory.steps
         self.begin()
         while self.step < steps and self.period():
-            if settings.progress is not None:
-                settings.progress(self.step, steps)
+            if self.progress is not None:
+                self.progress(self.step, steps)
         self.detect_contacts_at_end()
 
     def begin(self) -> None:
         """Measure the states at the first knot, after what came before."""
-        whole, trials = self.settings.whole, self.settings.trials
-        for step in range(self.settings.knot):
+        whole, trials = self.whole, self.trials
+        for step in range(self.knot):
             states, controls = (np.tile(one[step], (trials, 1)) for one in (whole.states, whole.controls))
             self.effects.follow(step, states, controls)
             read = self._readings
@@ -211,18 +271,18 @@ class ClosedLoop:
         return True
 
     def measure(self, step: int) -> Array:
-        measured = self.effects.measure(self._knot + step, self.states)
+        measured = self.effects.measure(self.knot + step, self.states)
         lost = self.physics.unstable | _not_finite(measured)
         self.records.knot(step, self.states, measured, self.collisions.clearance, lost)
         over = self.records.over(step)
         if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
-            measured[over] = self.settings.trajectory.states[step]
+            measured[over] = self.trajectory.states[step]
         return measured
 
     def decide(self, step: int, measured: Array) -> Array:
         """The controller's commands (K, m); if it fails, the plan's controls."""
-        shape = self.settings.trials, len(self._names)
-        shown, knot = measured, self._knot + step
+        shape = self.trials, len(self._names)
+        shown, knot = measured, self.knot + step
         if self._readings is not None:
             shown = self._readings.arriving(knot, None if step else self._held(knot))
         try:
@@ -235,21 +295,21 @@ class ClosedLoop:
         self.records.estimator_diverged(step, self.controller_run.estimator_diverged())
         self.records.fail(step, failed, reasons)
         self.records.commanded[:, step] = commands
-        return np.where(failed[:, None], self.settings.trajectory.controls[step], commands)
+        return np.where(failed[:, None], self.trajectory.controls[step], commands)
 
     def _held(self, knot: int) -> Array:
         """The plan's controls (K, m) of the period before a knot; at the first knot those of its first period."""
-        return np.tile(self.settings.whole.controls[max(knot - 1, 0)], (self.settings.trials, 1))
+        return np.tile(self.whole.controls[max(knot - 1, 0)], (self.trials, 1))
 
     def actuate(self, step: int, commands: Array) -> Array:
         """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""
-        controls = np.clip(self.effects.actuate(self._knot + step, commands), self._low, self._high)
+        controls = np.clip(self.effects.actuate(self.knot + step, commands), self._low, self._high)
         self.records.applied[:, step] = controls
         return controls
 
     def push(self, step: int) -> tuple[Array, Array]:
         """The disturbing forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3)."""
-        wrench, wind = self.effects.push(self._knot + step, self.states)
+        wrench, wind = self.effects.push(self.knot + step, self.states)
         self.records.wrench[:, step] = wrench
         return wrench, wind
 
@@ -262,7 +322,7 @@ class ClosedLoop:
         """
         physics, over = self.physics, self.records.over(step)
         period = physics.advance(controls, wrench, wind)
-        kick = self.effects.kick(self._knot + step, self.states, controls)
+        kick = self.effects.kick(self.knot + step, self.states, controls)
         if kick is not None:
             physics.kick(period, kick)
         collided = self.collisions.detect(step, period, ignored=over)
@@ -274,8 +334,8 @@ class ClosedLoop:
                 self.collisions.relocate(period.states[-1])
             self.records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]
-        records, watch = self.records, self.settings.watch
-        for frame in physics.drawn(period) if self.settings.frames else ():
+        records, watch = self.records, self.watch
+        for frame in physics.drawn(period) if self.frames else ():
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
             records.frames.append(frame)
             if watch is not None:
@@ -285,7 +345,7 @@ class ClosedLoop:
         """Detect contacts at the last knot, which no period follows."""
         if not (isinstance(self.physics, MujocoPhysics) and self.physics.senses_contacts):
             return
-        plan, touching = self.settings.trajectory, self.physics.touching_now()
+        plan, touching = self.trajectory, self.physics.touching_now()
         never_lost = self.records.lost_since > plan.steps
         for row in np.flatnonzero(touching.any(axis=1) & np.isinf(self.collisions.at) & never_lost):
             self.collisions.touch(int(row), plan.horizon, touching[row])
@@ -294,23 +354,26 @@ class ClosedLoop:
         """A Rollout of the records so far, as if the controller had failed now. The loop can continue."""
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
-        if self.step < self.settings.trajectory.steps:
-            trials = self.settings.trials
+        if self.step < self.trajectory.steps:
+            trials = self.trials
             twin.records.fail(self.step, np.ones(trials, dtype=bool), ["went no further"] * trials)
         return twin.rollout()
 
     def rollout(self, *, undisturbed: Array | None = None) -> Rollout:
         """A Rollout of all records, with the states of an undisturbed run."""
-        settings, records, collisions = self.settings, self.records, self.collisions
-        plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
-        moved = self.controller_run.moved_goal()
-        goal = settings.followed.goal if moved is None else moved
-        radius = settings.radius if moved is None else settings.radius_about(moved)
+        records, collisions = self.records, self.collisions
+        plant, plan, each = self.plant, self.trajectory, self.physics.drawn_parts
+        goal, radius = self.followed.goal, self._radius
+        if (moved := self.controller_run.moved_goal()) is not None:
+            # A radius that was given holds for another goal only in the same unit.
+            same_unit = self._target(moved).unit == self._target(goal).unit
+            stated = (self.goal_radius, self.goal_tolerance) if same_unit else (None, None)
+            goal, radius = moved, self._target(moved).radius(plant.robot.radius, *stated)
         changed = () if moved is None else (MOVED,)
-        begun = () if settings.starts is None else ("given first states",)
-        passing = () if settings.moving is None else (f"moving obstacles {', '.join(settings.moving.names)}",)
-        records.turn_to_plan(settings.states)
-        frames = records.stacked_frames(each, all_of_them=settings.frames)
+        begun = () if self.starts is None else ("given first states",)
+        passing = () if self.moving is None else (f"moving obstacles {', '.join(self.moving.names)}",)
+        records.turn_to_plan(self.state_coordinates)
+        frames = records.stacked_frames(each, all_of_them=self.frames)
         records.erase(frames, each)
         return Rollout(
             robot=plant.robot.name,
@@ -318,9 +381,9 @@ class ClosedLoop:
             scene=plant.scene.name,
             model=plant.scene.xml,
             plan=plan,
-            policy_digest=settings.law.digest,
-            state_coordinates=settings.states,
-            control_coordinates=settings.controls,
+            policy_digest=self.law.digest,
+            state_coordinates=self.state_coordinates,
+            control_coordinates=self.control_coordinates,
             goal=goal,
             goal_radius=radius,
             radius=plant.robot.radius,
@@ -340,15 +403,15 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
             frames=frames,
-            disturbances=(*(one.describe(plant) for one in settings.acting), *begun, *passing, *changed),
-            seed=settings.seed,
-            first_trial=settings.first_trial,
+            disturbances=(*(one.describe(plant) for one in self.acting), *begun, *passing, *changed),
+            seed=self.seed,
+            first_trial=self.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
-            balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
+            balls=plant.record_of_balls(plan.states, records.states) if self.frames else None,
             obstacle_geoms=plant.obstacle_geoms,
             warnings=self.physics.warnings if plant.simulator is None else None,
             undisturbed=undisturbed,
-            moving=_record_of(settings.moving, settings.knot * plan.dt),
+            moving=_record_of(self.moving, self.knot * plan.dt),
             controller_run=self.controller_run,
         )
 

@@ -336,7 +336,7 @@ def extent(plant: Plant) -> float:
 
 def _near(robot: Robot, scene: Scene) -> World:
     """The obstacles that MuJoCo lets a robot touch, except what it stands on."""
-    ids = set(touchable(scene.model, list(scene.geoms), int(scene.model.body(robot.body).id), floors=True))
+    ids = set(touchable(scene.model, list(scene.geoms), int(scene.model.body(robot.body).id)))
     return World([one for geom, one in zip(scene.geoms, scene.world.obstacles, strict=True) if geom in ids])
 
 
@@ -346,7 +346,7 @@ def _left_out(robot: Robot, scene: Scene, body: int) -> Pairs:
     Ground and what the robot stands on are not among them. Nor are any for a robot whose own steps are MuJoCo's.
     """
     left = [] if robot.geoms is not None else sorted({*obstacle_geoms(scene.model)} - {*scene.geoms})
-    return touching_pairs(scene.model, touchable(scene.model, left, body, floors=True))
+    return touching_pairs(scene.model, touchable(scene.model, left, body))
 
 
 def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs, model: mujoco.MjModel) -> None:
