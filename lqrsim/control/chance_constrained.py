@@ -117,9 +117,6 @@ def smooth_chance_constrained(
     `print(plan)` then shows how close it came. Allow a higher chance, improve the estimation, or permit another route.
 
     Args:
-      problem: a problem with obstacles in its costs or constraints.
-      uncertainty: the uncertainty in a run; see `uncertainty_of`.
-      chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> the controller that runs the plan, an OffsetFree or an AffinePolicy. By default
         an OffsetFree for the uncertainty, with tolerances chosen for each plan.
       progress: called with the number of plans that are done, the largest possible number of plans, and a text about

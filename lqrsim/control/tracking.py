@@ -77,8 +77,6 @@ def choose_tolerances(
 
     Args:
       call: name of the user's call, for warnings.
-      model: the model on which the laws are based.
-      effort: largest change of each control, (m,).
       at_end: as in `track`.
       moments: predicts the states' moments under C laws and the limits of the controls.
       truth: model with the unknowns, for trials of laws that act on the measured state itself.

@@ -40,7 +40,6 @@ class Tube:
     """Predicted distribution of the closed loop about its plan.
 
     Attributes:
-      plan: nominal states and controls.
       mean: mean of the deviation of the state, (T+1, n).
       covariance: covariance of that deviation, (T+1, n, n).
       across: covariance of the deviation with the deviation at the previous knot, (T, n, n).
@@ -104,7 +103,6 @@ def predict_tube(
     """Predict the distribution of a run about its plan, and its chance of collision.
 
     Args:
-      problem: the problem that was solved, with the obstacles in its costs and constraints.
       uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are computed from the
         samples that stay finite.
       controller: an OffsetFree of this solution or an AffinePolicy; by default the solution's policy. It may have been

@@ -79,7 +79,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
 
     @checked
     def reset(self, *, seed: Seed | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode; see the class. Raises InputError for an invalid seed or option."""
+        """Begin an episode; see the class."""
         super().reset(seed=seed)
         episode = self._begin(seed, self.np_random, options, 1, frames=True, threads=1)
         return episode.observations[0], self._info(episode)

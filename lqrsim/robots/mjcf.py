@@ -517,9 +517,6 @@ class MjcfRobot(Robot):
         of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of
         actuators are those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not
         count.
-
-        Args:
-          keyframe: its name; None for the MJCF's rest.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))

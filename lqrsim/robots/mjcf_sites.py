@@ -40,11 +40,7 @@ _AXES = "xyz"
 
 
 class _Pose:
-    """The desired position and orientation of a site, checked.
-
-    Args:
-      what: its name in messages. site: name of the site. position: (3,) or None. orientation: (4,) or None.
-    """
+    """The desired position (3,) and orientation (4,) of a site, checked; `what` names them in messages."""
 
     def __init__(self, what: str, site: str, position: npt.ArrayLike | None, orientation: npt.ArrayLike | None) -> None:
         self.what, self.site = what, check_text(f"{what}: site", site, "the name of a site", at_most=1000)

@@ -59,11 +59,7 @@ def leaders_of(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
 
 
 class Equalities:
-    """All active equality constraints of a model, at given positions.
-
-    Args:
-      model: with at least one.
-    """
+    """All active equality constraints of a model, at given positions."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = copy.copy(model)

@@ -58,11 +58,7 @@ def at_once(model: mujoco.MjModel) -> None:
 
 
 class SensorReader:
-    """Computes readings in given states. One is used by one thread.
-
-    Args:
-      body: id of the body at which forces act.
-    """
+    """Computes readings in given states. One is used by one thread."""
 
     def __init__(self, model: mujoco.MjModel, body: int) -> None:
         self._model = copy.copy(model)

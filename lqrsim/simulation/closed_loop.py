@@ -72,7 +72,6 @@ def simulate(
     count. In the other cases they are NaN.
 
     Args:
-      plant: robot and scene to run.
       plan: a solution or another plan, which gives the first state, the duration, and the reference for comparisons. By
         default the controller's own plan; an `OffsetFree` and a `Replanner` have their own.
       controller: computes the controls; by default the plan's policy. Another policy, with or without a filter; a

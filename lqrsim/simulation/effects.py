@@ -36,10 +36,6 @@ class _ForceHook(NamedTuple):
 class Effects:
     """The effects of disturbances on K trials, started.
 
-    Args:
-      plan: plan of the run. trials: numbers of the trials.
-      generators: (trial, number of the disturbance) -> its random generator.
-
     Attributes:
       displaced: (K, obstacles, 3), displacement of each obstacle in metres, along the world's axes.
     """
@@ -159,9 +155,6 @@ class Readings:
     """What a controller reads of the sensors of an MJCF in K trials, with errors, rates and delays.
 
     A number is NaN where no reading of its sensor arrives, or it got lost.
-
-    Args:
-      dt: control period in s.
     """
 
     def __init__(self, sensors: RobotSensors, effects: Effects, physics: AnyPhysics, dt: float) -> None:

@@ -9,8 +9,9 @@ from mujoco import batch
 
 from lqrsim.errors import Array
 from lqrsim.machine import processors
+from lqrsim.robots.base import Indices
 from lqrsim.simulation.physics import Period, Physics, SimulatorPhysics, part_of
-from lqrsim.simulation.plant import Indices, Plant
+from lqrsim.simulation.plant import Plant
 
 AWAY = 2.0**20  # m; depth inside an obstacle up to which it exerts no force while contacts are only sensed
 

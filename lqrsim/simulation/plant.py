@@ -5,7 +5,7 @@ With a `Simulator`, the simulator moves the robot. The MuJoCo model then provide
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from lqrsim.errors import Array, InputError, check_number, check_text, shaped, v
 from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
-from lqrsim.robots.base import Indices, Robot, indices_in
+from lqrsim.robots.base import Robot, indices_in
 from lqrsim.robots.sensors import RobotSensors, Sensor
 from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
@@ -75,16 +75,28 @@ class Plant(OneVersion):
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
         in_space = self.shape.centers is not None and not self.shape.in_plane
         bounded = "radius" not in robot.shape or robot.dynamics.state_coordinates.position
-        near = _near(robot, scene) if in_space or not bounded else scene.world
+        own, near = int(scene.model.body(robot.body).id), scene.world
+        if in_space or not bounded:  # the obstacles that MuJoCo lets it touch, except what it stands on
+            ids = set(touchable(scene.model, list(scene.geoms), own))
+            pairs = zip(scene.geoms, scene.world.obstacles, strict=True)
+            near = World([one for geom, one in pairs if geom in ids])
         if in_space:
             self.shape = replace(self.shape, world=near)
         self.world = self.shape.world
         self.obstacles = self.world.names if bounded else near.names
-        self.body = int(scene.model.body(robot.body).id)
+        self.body = own
         jointed = (int(scene.model.joint(name).bodyid[0]) for name in robot.joints)
-        self.bodies = _attached(scene.model, [self.body, *jointed])
+        attached = {own, *jointed}
+        for body in range(scene.model.nbody):  # parents come before their children
+            if scene.model.body_parentid[body] in attached:
+                attached.add(body)
+        self.bodies = np.array(sorted(attached), dtype=np.intp)
         mounts = mounting_pairs(scene.model, [geom for geom, one in self._scenery() if one in self.obstacles])
-        apart = np.concatenate([mounts, _left_out(robot, scene, self.body)])
+        # What a choice of obstacles leaves out does not collide, but ground and what the robot stands on; for a robot
+        # whose own steps are MuJoCo's all of it does.
+        left = [] if robot.geoms is not None else sorted({*obstacle_geoms(scene.model)} - {*scene.geoms})
+        left = touching_pairs(scene.model, touchable(scene.model, left, own))
+        apart = np.concatenate([mounts, left])
         self._apart = apart[np.isin(scene.model.geom_bodyid[apart[:, 0]], self.bodies)]
         self.model = self._compile()
         self.qpos, self.qvel, self.ctrl = indices_in(robot, self.model)
@@ -334,21 +346,6 @@ def extent(plant: Plant) -> float:
     return off + reach + float(thickest)
 
 
-def _near(robot: Robot, scene: Scene) -> World:
-    """The obstacles that MuJoCo lets a robot touch, except what it stands on."""
-    ids = set(touchable(scene.model, list(scene.geoms), int(scene.model.body(robot.body).id)))
-    return World([one for geom, one in zip(scene.geoms, scene.world.obstacles, strict=True) if geom in ids])
-
-
-def _left_out(robot: Robot, scene: Scene, body: int) -> Pairs:
-    """The pairs of a moving geom and a geom that is no obstacle because a choice of obstacles leaves it out.
-
-    Ground and what the robot stands on are not among them. Nor are any for a robot whose own steps are MuJoCo's.
-    """
-    left = [] if robot.geoms is not None else sorted({*obstacle_geoms(scene.model)} - {*scene.geoms})
-    return touching_pairs(scene.model, touchable(scene.model, left, body))
-
-
 def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs, model: mujoco.MjModel) -> None:
     """Let no contact arise between the geoms of these pairs, by bits of their own for the fixed ones.
 
@@ -373,11 +370,3 @@ def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs
     for pair in list(spec.pairs):
         if frozenset((pair.geomname1, pair.geomname2)) in names:
             spec.delete(pair)
-
-
-def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:
-    found = set(roots)
-    for body in range(model.nbody):  # parents come before their children
-        if model.body_parentid[body] in found:
-            found.add(body)
-    return np.array(sorted(found), dtype=np.intp)

@@ -50,9 +50,6 @@ def tube_under(
     why there is no tube.
 
     Without disturbances there is neither a tube nor a line.
-
-    Args:
-      problem: the problem that was solved. solution: its solution. plant, disturbances, controller: as in `simulate`.
     """
     if not disturbances:
         return None, ""

@@ -119,11 +119,6 @@ def verify_run(
     plane, and from both if it moves in space. The pictures are segmentations that show only one geom of the robot, like
     X-rays, in which obstacles hide nothing, and all of it is in each picture. For a robot without a position, the
     position of its last ball is read, or of its outermost geom if it has no balls.
-
-    Args:
-      rollout: rollout of `simulate`, with frames.
-      solution: the solution that was run, to check the plan in the rollout.
-      progress: called after each frame with the number of finished frames and their total.
     """
     model = drawable_model(rollout, trial)
     body, place = robot_body(model, rollout.body), None
@@ -356,8 +351,6 @@ def verify_video(
     progress: Progress | None = None,
 ) -> Verification:
     """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
-
-    The other arguments are as in `verify_run`.
 
     Args:
       path: a video by `lqrsim render`, whatever else it shows. It needs the camera `top`; for a robot in a vertical

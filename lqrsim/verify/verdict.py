@@ -123,7 +123,6 @@ class Verification:
     """Positions of a run from pixels, in N frames with d coordinates, and the tests that they passed.
 
     Attributes:
-      times: (N,) seconds after the start of the run that the frames should show.
       seen: (N, d) positions from pixels in metres; NaN where the robot is hidden.
       actual: (N, d) positions in the simulator.
       planned: (N, d) positions in the plan.
@@ -197,7 +196,6 @@ def compare(
       apart: (N,) disagreement of the views, in metres.
       bound: bound on the distance between seen and actual positions in any frame, in metres.
       interval: seconds between two frames; the shift must be less than a quarter of it.
-      others: tests that have been made already.
     """
     good = np.asarray(np.isfinite(seen).all(axis=1))
     visible = Criterion(

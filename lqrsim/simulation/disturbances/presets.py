@@ -44,10 +44,6 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     control periods, and the 6 to 7 ms of motion capture are less than half a period. For pushes, time and direction
     matter. A quadrotor does not survive the loss of an actuator. There is no `MotorLag` for a robot whose actuators
     have their own states, because its MJCF describes their lag. In a liquid there are currents in place of turbulence.
-
-    Args:
-      name: calm, light, moderate, strong or severe.
-      plant: the plant that the disturbances act on.
     """
     strength = PRESETS[check_name("preset", name, PRESETS)]
     return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one) and _acts(one)]
