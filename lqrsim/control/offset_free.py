@@ -58,10 +58,10 @@ class OffsetFree(Controller):
     """Tracks a plan, with estimates of the state, the actuators' outputs and the unknowns.
 
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
-    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. A measurement that
-    is late by `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation,
-    so there is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort,
-    and predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
+    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted; one that is late by
+    `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so there
+    is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and
+    predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
     unknown by at most six standard deviations of such a correction; see `kalman.py`. If the robot would leave its
     plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
     `with_margin`. `model.uncertainty` is the uncertainty that the filter assumes.
@@ -69,33 +69,26 @@ class OffsetFree(Controller):
     The other arguments are as in `track`.
 
     Args:
-      solution: its solution, or another solution with a plan of the same system.
-      uncertainty: uncertainty of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean,
-        and constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
+      uncertainty: as stated, such as by `uncertainty_of`. The filter assumes that unknowns that vary may have a mean,
+        and that constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u; or sensors of the MJCF, `plant.sensors(...)`, each
         with its own noise, bias, rate, delay and loss: see `sensor_filter.py`. With these the uncertainty says nothing
         of measurements, a stated lag makes nothing milder, and only `simulate` runs the law.
-      memory: time in s; by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as
-        stated: constants do not change, what varies has the mean zero, and a stated lag exists. A steady disturbance
-        then leaves an error.
+      memory: by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as stated, and a
+        steady disturbance then leaves an error.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
-      replan_every: seconds between two checks, rounded to control periods; by default there are no checks. A check
-        simulates the model from the estimated state, with the estimated constants. If the law no longer leads to the
-        goal without a collision, the rest of the horizon is solved from that state. If the solve fails, the law stays
-        in force. Except for a reference, costs that depend on the step's number are not supported with re-planning.
+      replan_every: seconds between two checks, rounded to control periods; by default there are none. A check simulates
+        the model from the estimated state, with the estimated constants. If the law no longer leads to the goal without
+        a collision, the rest of the horizon is solved from that state; if that fails, the law stays in force. Costs
+        that depend on the step's number, but for a reference, are not supported then.
       replan_always: whether to solve at each of these times without a check.
 
-    Its run, a rollout's `controller_run`, has these attributes:
-
-    - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot; else
-      None. They are NaN at knots whose measurement was not used: the last knot, and one more for each period of
-      latency. The covariances of their errors are `filter.corrected`.
-    - `innovations`: with `record`, the differences between measurements and predictions, (T+1, K, Y), with the
-      covariances `filter.innovation`. They are also NaN where a measurement got lost. Both covariances belong to the
-      first plan: with `replan_every` they hold up to a run's first solve.
-    - with `replan_every`, `plans`: the new plans of each trial, by the step at which they begin; and `log`, the log of
-      the solves, as in a `Replanner`.
+    Its run, a rollout's `controller_run`, has with `record` the `estimates` (T+1, K, Z) of the K trials, each with the
+    measurement of its knot, and the `innovations` (T+1, K, Y), measurements minus predictions. Both are NaN where no
+    measurement was used: at the last knot, and one more for each period of latency; innovations where one got lost.
+    `filter.corrected` and `filter.innovation` are their covariances, up to a run's first solve. With `replan_every` it
+    has the new `plans` of each trial, by the step at which they begin, and a `log`, as a `Replanner`.
 
     Attributes:
       model: the linear model about the plan, with z = (state, actuator outputs, unknowns).

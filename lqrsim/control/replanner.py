@@ -42,16 +42,14 @@ class LiveReplanner:
     """One run of a `Replanner` on a robot, made by `Replanner.live`: its own loop calls `step` as often as it likes.
 
     `step` only evaluates the law in force, and never waits for a solve. A solve begins with the first call in a control
-    period in which one is due. Its answer comes into force at the deadline. An answer that is not ready then is not
-    used, and the previous law continues. Everything is compiled before the first step.
-
-    The other arguments are as in `Replanner.live`.
+    period in which one is due. Its answer comes into force at the deadline; one that is not ready then is not used.
+    Everything is compiled before the first step.
 
     Attributes:
       problem: the problem that is solved from now on.
       active: the plan in force, `active.plan`, and the control period at which it begins, `active.first`.
-      log: the log of the solves: `log.records`, a `ReplanRecord` of each; `log.solved`, the number of solves that were
-        used; and `log.kept`, reason why a solve was not used, and the previous law continued -> number.
+      log: of the solves: `records`, a `ReplanRecord` of each; `solved`, how many were used; and `kept`, why others were
+        not, and how often.
     """
 
     _prefix = "Replanner.live: "
@@ -176,14 +174,13 @@ class Replanner(Controller):
                 robot.apply(live.step(robot.state(), t))
 
     Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
-    plan that is not ready by the deadline is not used. A reference moves with time, see `QuadraticCost`; other costs
-    that depend on the step's number are not supported. With a `control_rate`, each plan goes on from the last command,
-    and commands are clipped to the limits of rates. Running a re-planner does not change it, so several runs can share
-    it.
+    reference moves with time, see `QuadraticCost`; other costs that depend on the step's number are not supported. With
+    a `control_rate`, each plan goes on from the last command, and commands are clipped to the limits of rates. Several
+    runs can share a re-planner.
 
-    In a simulation a solve takes as long as `computing` says. With a number or a function, the results are
-    bit-identical on all machines. With "measured" they depend on the speed of the machine. The rollout's
-    `controller_run` has a `log` of the solves, like a `LiveReplanner`, and the plans in force, `active`.
+    In a simulation a solve takes as long as `computing` says: a number, a function of a `numpy.random.Generator`, with
+    which results are bit-identical on all machines, or "measured". The rollout's `controller_run` has a `log` of the
+    solves, like a `LiveReplanner`, and the plans in force, `active`.
 
     Args:
       every: seconds between two solves, rounded to control periods.
@@ -193,15 +190,12 @@ class Replanner(Controller):
       predict: whether to solve from the state that the model predicts for the deadline, under the law in force. If
         False, a plan begins where the robot was when the solve began.
       changes: a function of the time in seconds and the problem that returns the problem as known at that time, with
-        other goals, obstacles or parameters. dt, steps, states and controls cannot change, nor can anything that would
-        have to be compiled. If the goal moves, a run ends at the goal of the last problem.
+        other goals, obstacles or parameters; what would have to be compiled cannot change. If the goal moves, a run
+        ends at the goal of the last problem.
       when: a funnel of the solution, for the horizon "shrinking": solve only for states outside the funnel about the
-        plan in force. The certificate is for the first plan. About a later plan, or after a change, the same ellipsoids
-        are a rule of thumb.
+        plan in force. About a later plan, or after a change, its ellipsoids are a rule of thumb, and no certificate.
       share: fraction of the funnel's level at which to solve; 1 is its boundary. Planning earlier takes more solves and
         loses fewer trials, because a plan that begins at the boundary often comes too late.
-      computing: duration of a solve in simulations, in seconds: a number; a function that draws it from a
-        `numpy.random.Generator`; or "measured".
     """
 
     @checked

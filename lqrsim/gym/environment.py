@@ -152,16 +152,13 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
     """K trials of one scenario at once, with the actions, observations and rewards of `Environment`.
 
     All begin together and have the same horizon. After its end a trial keeps its observation and flags; its rewards are
-    0, and its actions have no effect. There is no automatic reset: `reset` begins all trials again.
-
-    `reset(seed=s)` begins trials 0 to K-1 of seed s, the next `reset()` trials K to 2K-1. Each is bit-identical to the
-    trial in `simulate` and in an `Environment`. The info has arrays with an entry per trial.
+    0, and its actions have no effect. There is no automatic reset: `reset(seed=s)` begins trials 0 to K-1 of seed s,
+    the next `reset()` trials K to 2K-1. Each is bit-identical to the trial in `simulate` and in an `Environment`. The
+    info has arrays with an entry per trial. The other arguments are those of `Environment`.
 
     Args:
       num_envs: K. threads: number of MuJoCo's threads; by default one per processor.
       frames: whether `rollout()` can be drawn; it takes memory.
-
-    The other arguments are the arguments of `Environment`.
     """
 
     _prefix = ""

@@ -40,7 +40,6 @@ Actions = Literal["normalized", "controls"]
 Disturbances = str | Sequence[str | Disturbance]
 
 LARGEST = 1e10  # MuJoCo's mjMAXVAL: a simulation with larger numbers counts as unstable
-ACTIONS = ("normalized", "controls")
 RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 

@@ -29,17 +29,14 @@ class Robot(abc.ABC):
         is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
       actuators: its actuators in the MJCF, in the order of `actuation`.
-      wheels: the geoms in the MJCF that are the treads of its wheels, each on its own body; none by default.
-      drag: linear drag against its velocity through the air, in N s/m; wind acts through it. None by default.
-        A fluid of the MJCF needs none.
-      activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states. None by default.
-      radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball. For
-        a robot with neither a position nor balls its size in pictures.
-      balls: the colliding balls, in place of `radius`, for a robot of more than one ball or without a position. None by
-        default. With balls, the radius is the size of the robot in pictures, and the distance from the goal within
-        which the robot has reached it.
-      geoms: the colliding geoms, in place of both, for a robot from an MJCF, for which the simulator computes
-        distances. None by default.
+      wheels: the geoms in the MJCF that are the treads of its wheels, each on its own body.
+      drag: linear drag against its velocity through the air, in N s/m; wind acts through it. A fluid of the MJCF needs
+        none.
+      activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states.
+      radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball. With
+        balls or without a position, its size in pictures, and the distance from the goal that counts as reached.
+      balls: the colliding balls, in place of `radius`, for a robot of more than one ball or without a position.
+      geoms: the colliding geoms, in place of both, for a robot from an MJCF; the simulator computes their distances.
     """
 
     _want = "a Robot, such as Quadrotor()"
