@@ -108,10 +108,7 @@ class Mismatch(Disturbance):
 
 
 class MassMismatch(Mismatch):
-    """Another mass, as by a load at the centre of mass of each of the robot's bodies; the inertia does not change.
-
-    Drawn for each trial from a truncated normal distribution, or a fixed factor.
-    """
+    """Another mass, as by a load at the centre of mass of each of the robot's bodies; the inertia does not change."""
 
     what = parameter = "mass"
 
@@ -180,10 +177,7 @@ class InertiaMismatch(Mismatch):
 
 
 class ThrustMismatch(Mismatch):
-    """Actuators that exert more or less force than commanded: their gains change. Not for servos.
-
-    Drawn for each trial and actuator from a truncated normal distribution, or fixed factors.
-    """
+    """Actuators that exert more or less force than commanded: their gains change. Not for servos."""
 
     what = parameter = "thrust"
 
@@ -223,10 +217,7 @@ class WheelMismatch(Mismatch):
 
 
 class WheelRadiusMismatch(WheelMismatch):
-    """Wheels that are larger or smaller, independently of each other; the robot stays level.
-
-    Drawn for each trial and wheel from a truncated normal distribution, or fixed factors.
-    """
+    """Wheels that are larger or smaller, independently of each other; the robot stays level."""
 
     what = "wheel radius"
 
@@ -246,10 +237,7 @@ class WheelRadiusMismatch(WheelMismatch):
 
 
 class AxleMismatch(WheelMismatch):
-    """Wheels that are further apart, or closer together.
-
-    Drawn for each trial from a truncated normal distribution, or a fixed factor.
-    """
+    """Wheels that are further apart, or closer together."""
 
     what = "axle length"
 
@@ -263,10 +251,7 @@ class AxleMismatch(WheelMismatch):
 
 
 class FrictionMismatch(WheelMismatch):
-    """Another sliding friction between the wheels and the floor, the same for all wheels.
-
-    Drawn for each trial from a truncated normal distribution, or a fixed factor.
-    """
+    """Another sliding friction between the wheels and the floor, the same for all wheels."""
 
     what = "friction of the wheels"
 

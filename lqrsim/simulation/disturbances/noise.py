@@ -1,7 +1,7 @@
 """Gaussian disturbances: noise on controls, measurements, forces and states, wrong starts and obstacles; and pushes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -33,6 +33,7 @@ class AddedError(GaussianDisturbance):
     what: ClassVar[str]
     hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # the field of an `Effect`
     lasts: ClassVar[bool] = True
+    known_as: ClassVar[str]  # the field of an Uncertainty
     by_name = True
 
     def _coordinates(self, plant: Plant) -> Coordinates:
@@ -46,11 +47,6 @@ class AddedError(GaussianDisturbance):
     def _deviations(self, plant: Plant) -> Array:
         return fit(self, self.std, self._coordinates(plant))
 
-    def _std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
-        """The standard deviations in the form of an Uncertainty: 0 for none."""
-        std = self._deviations(plant)
-        return tuple(std.tolist()) if std.any() else 0.0
-
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std, steps = self._deviations(plant), 1 if self.lasts else plan.steps + (self.hook == "measure")
         errors = std * normal(generators, steps, len(std))
@@ -58,6 +54,10 @@ class AddedError(GaussianDisturbance):
             return Effect(initial_states=lambda states: _off(plant, states, errors[:, 0]))
         hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.lasts else step]}
         return Effect(**hooks)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        std = self._deviations(plant)
+        return replace(Uncertainty(), **{self.known_as: tuple(std.tolist()) if std.any() else 0.0})
 
 
 class ControlNoise(AddedError):
@@ -67,10 +67,7 @@ class ControlNoise(AddedError):
       std: of each control, in its unit: one number, one per control, or numbers by name or unit.
     """
 
-    what, hook, lasts = "control noise", "actuate", False
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(control=self._std_for_filters(plant))
+    what, hook, lasts, known_as = "control noise", "actuate", False, "control"
 
 
 class ControlOffset(AddedError):
@@ -94,10 +91,7 @@ class MeasurementNoise(AddedError):
       std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
     """
 
-    what, hook, lasts = "measurement noise", "measure", False
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(measurement=self._std_for_filters(plant))
+    what, hook, lasts, known_as = "measurement noise", "measure", False, "measurement"
 
 
 class MeasurementBias(AddedError):
@@ -124,10 +118,7 @@ class InitialStateError(AddedError):
       std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
     """
 
-    what, hook = "initial state off", "initial_states"
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(start=self._std_for_filters(plant))
+    what, hook, known_as = "initial state off", "initial_states", "start"
 
 
 def _off(plant: Plant, states: Array, errors: Array) -> Array:
