@@ -158,7 +158,7 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
-    """A block in which an exception, such as KeyboardInterrupt, gets `make` of an inner block's `found` as its own."""
+    """A block in which an exception gets results so far as its `found`: what `make` returns, given an inner block's."""
     try:
         yield
     except BaseException as error:

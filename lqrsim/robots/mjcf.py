@@ -41,6 +41,7 @@ from lqrsim.scenes.mjcf_holding import ForceLimit, Holding, efforts, holding, li
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
+from lqrsim.scenes.mjcf_text import listed
 from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, World
 
@@ -50,7 +51,6 @@ _PAST = 1e-3  # fraction of a joint's range that a goal may be past its limits
 _REST = 1e-6  # m/s^2, largest acceleration at rest
 _PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
 _WILD = 2.0  # factor by which a deviation grows in a period where MuJoCo's steps are unstable; robots fall slower
-_LISTED = 12  # largest number of names in a printed line
 
 
 class MjcfRobot(Robot):
@@ -453,13 +453,13 @@ class MjcfRobot(Robot):
             short = f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {unit}"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
-            f"  states: {_listed(space.names)}",
+            f"  states: {listed(space.names)}",
             f"  body: {self.body}, with the position {', '.join(space.names[i] for i in space.position)}"
             if space.position
             else f"  body: {self.body}, whose position is not among the states",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
-            f"  held at rest by: {_listed(told)}{short}",
-            *(f"  {title}: {_listed(found)}" for title, found in self._remarks().items() if found),
+            f"  held at rest by: {listed(told)}{short}",
+            *(f"  {title}: {listed(found)}" for title, found in self._remarks().items() if found),
         ]
         return "\n".join(lines)
 
@@ -567,7 +567,7 @@ class MjcfRobot(Robot):
             closed = equalities.closed(*self.configuration(state))
             if closed is None:
                 names, told = self.dynamics.state_coordinates.names, state[: model.nv].tolist()
-                got = _listed([f"{name} {value:.4g}" for name, value in zip(names, told, strict=False)])
+                got = listed([f"{name} {value:.4g}" for name, value in zip(names, told, strict=False)])
                 raise InputError(f"MjcfRobot {self.name}: states: got {got}, want positions near which all loops close")
             state[: 2 * model.nv] = self.state(*closed, near=state)
         return found
@@ -600,9 +600,3 @@ def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) 
 def _weights(field: str, given: PerEntry, size: int) -> PerEntry:
     """Weights by name unchanged; other weights as one number for each of `size` entries."""
     return given if isinstance(given, Mapping) else check_weights(field, given, size)
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Names in a line; only the first ones if there are many."""
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more if names else "none"

@@ -178,7 +178,7 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
-    """The body, place (3,) on it and bounding radius in m of the geom that is farthest out at rest, or of the body."""
+    """The body of a tree's geom that is farthest out at rest, the geom's place (3,) on it and bounding radius in m."""
     data = placed(model)
     moves = (model.body_rootid[model.geom_bodyid] == model.body_rootid[body]) & (model.geom_rbound > 0)
     own = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))

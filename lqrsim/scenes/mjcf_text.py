@@ -8,7 +8,7 @@ import itertools
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -343,3 +343,8 @@ def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Elem
 def _set(element: ElementTree.Element, name: str, numbers: Iterable[float]) -> None:
     """Write numbers so that they read back exactly."""
     element.set(name, " ".join(repr(float(number)) for number in numbers))
+
+
+def listed(names: Sequence[str], most: int = 12) -> str:
+    """Names in a line, or none; only the first ones if there are many."""
+    return (", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")) or "none"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_number, check_path, excerpt
-from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, mujoco
+from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, listed, mujoco
 from lqrsim.scenes.mujoco_log import unlogged
 
 Base = Literal["fixed", "free"]
@@ -171,7 +171,7 @@ def _free_base(spec: mujoco.MjSpec, name: str) -> None:
     """Let the root link float. Raises InputError if there are several, or it moves by a joint of its own."""
     roots = spec.worldbody.bodies
     if len(roots) != 1 or roots[0].joints:
-        got = f"'free', with {_listed([one.name or '' for one in roots])} at the root"
+        got = f"'free', with {listed([one.name or '' for one in roots], _LISTED)} at the root"
         raise InputError(f"{name}: base: got {got}, want one link there, without a joint")
     roots[0].add_freejoint()
 
@@ -199,10 +199,12 @@ def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> 
         [one.get("name", "") for one in root.iterfind("joint[mimic]")],
     )
     if loose := [one for one in names if one not in coupled]:
-        _log.warning("%s: no joint is followed by %s: want a <mimic> of one that turns or slides", name, _listed(loose))
+        _log.warning(
+            "%s: no joint is followed by %s: want a <mimic> of one that turns or slides", name, listed(loose, _LISTED)
+        )
     bounded = {one.get("name") for one in root.iterfind("joint") if one.get("type") in ("revolute", "prismatic")}
     if endless := [one.name or "" for one in spec.joints if one.name in bounded and not _is_limited(one)]:
-        _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, _listed(endless))
+        _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(endless, _LISTED))
 
 
 def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
@@ -302,7 +304,7 @@ def _add_actuators(
     if bare := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *given)]:
         _log.warning(
             "%s: no motor for %s: want an effort in <limit>, or efforts={%r: 10.0}, with 0.0 if there is none",
-            name, _listed(bare), bare[0],
+            name, listed(bare, _LISTED), bare[0],
         )  # fmt: skip
 
 
@@ -373,7 +375,7 @@ def _exclude_overlaps(mjcf: ElementTree.Element, model: mujoco.MjModel, name: st
     for one, other in pairs:
         _add(section, "exclude", {"body1": one, "body2": other})
     if touching := [f"{one} and {other}" for one, other in pairs]:
-        _log.warning("%s: links that touch at zero never collide: %s", name, _listed(touching))
+        _log.warning("%s: links that touch at zero never collide: %s", name, listed(touching, _LISTED))
 
 
 def _text(mjcf: ElementTree.Element) -> str:
@@ -395,8 +397,3 @@ def _add(
     """A new element, whose numbers read back exactly."""
     texts = {key: " ".join(repr(float(one)) for one in np.ravel(given)) for key, given in numbers.items()}
     return ElementTree.SubElement(parent, tag, {**(own or {}), **texts})
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Names in a line; only the first ones if there are many."""
-    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")

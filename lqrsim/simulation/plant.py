@@ -145,7 +145,7 @@ class Plant(OneVersion):
         return RobotSensors(self.robot, self.scene, sensors)
 
     def check_simulator(self, what: str, parameter: str | None = None) -> None:
-        """Raise an InputError if a disturbance cannot change "mass", "inertia" or "thrust", or, for None, models."""
+        """Raise an InputError if a disturbance cannot change a parameter; None for one of MuJoCo's models alone."""
         if self.simulator is not None and parameter not in self.simulator.parameters:
             raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, want one that can have it")
 
