@@ -329,7 +329,7 @@ def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
         value, inner = getattr(record, name), f"{field}.{name}"
         if value is None or said.letters.startswith("..."):
             continue
-        if isinstance(value, np.ndarray):
+        if isinstance(value, np.ndarray) and said.letters:
             check_sizes(inner, value.shape, said.letters, sizes)
         elif said.letters:
             _check_length(inner, len(value), said.letters, sizes)

@@ -186,7 +186,7 @@ def test_the_usual_four_are_run_unless_others_are_asked_for() -> None:
             {"policies": ("smooth", "replan")},
             "^design_disturbances: got them with smooth, replan, want track or offset_free",
         ),
-        ({"policies": ("tracking",)}, "^policies: got 'tracking', want .*track"),
+        ({"policies": ("tracking",)}, r"^policies\[0\]: got 'tracking', want .*track"),
     ],
 )
 def test_campaigns_that_make_no_sense_are_refused(changes: dict[str, object], line: str) -> None:

@@ -20,7 +20,6 @@ from lqrsim.stress.statistics import (
     mean,
     paired_difference,
     rate,
-    wilson,
 )
 
 
@@ -68,7 +67,7 @@ def test_exact_interval_covers(p: float) -> None:
 def test_wilson_s_interval_is_where_the_score_test_just_rejects(case: tuple[int, int]) -> None:
     """Its definition: |rate - p| is 1.96 standard deviations of p at both ends."""
     successes, trials = case
-    found = wilson(successes, trials)
+    found = rate(successes, trials, method="wilson")
     for end in (found.low, found.high):
         distance = abs(found.value - end)
         assert distance == pytest.approx(1.959964 * np.sqrt(end * (1 - end) / trials), abs=1e-6)

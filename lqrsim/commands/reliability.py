@@ -261,7 +261,7 @@ class FunnelCommand(StudyOptions):
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import disturbance_set, folder_name
         from lqrsim.simulation.disturbances import InitialStateError
-        from lqrsim.stress.funnels import FunnelOptions, funnel
+        from lqrsim.stress.funnels import funnel, level_test
         from lqrsim.stress.study import Study
         from lqrsim.view.plots import plot_funnel
 
@@ -270,7 +270,7 @@ class FunnelCommand(StudyOptions):
         folder = self.out or Path("runs/funnel") / folder_name(scenario)
         console.check_output("--out", folder)
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
-        FunnelOptions.of(space, steps, **stated(self, FunnelOptions.of))  # checked before the solve
+        level_test(space, steps, **stated(self, level_test))  # checked before the solve
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
             if isinstance(one, InitialStateError):

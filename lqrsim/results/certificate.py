@@ -51,6 +51,8 @@ class FailureCertificate:
     versions: Mapping[str, Line]
     keep: Annotated[float, Bounds(at_least=0.0, at_most=0.5)] = 0.1
 
+    _want = "a FailureCertificate, such as rare.certificate()"
+
     def __post_init__(self) -> None:
         if not self.low <= self.probability <= self.high:
             wanted = f"a number from {self.low:g} to {self.high:g}, its interval"

@@ -5,13 +5,15 @@ outcome is a failure.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
+from lqrsim.annotations import SHARE, Bounds, Count, OneOf, checked
+from lqrsim.errors import Array, InputError, check_name, excerpt
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.statistics import (
     CONFIDENCE,
@@ -22,7 +24,6 @@ from lqrsim.stress.statistics import (
     mean,
     paired_difference,
     rate,
-    wilson,
 )
 from lqrsim.stress.study import Cell
 
@@ -32,16 +33,13 @@ MEASURES = {  # measure -> unit; tracking errors and the distance from the goal 
     "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
     "saturated": "", "cost": "",
 }  # fmt: skip
-LEVELS = (0.05, 0.5, 0.95)
+LEVELS = np.array([0.05, 0.5, 0.95])
 
 
+@checked
 def succeeded(outcomes: Outcomes) -> npt.NDArray[np.bool_]:
-    """Whether each trial reached its goal, (K,). Raises InputError unless these are Outcomes."""
-    return _checked(outcomes).outcome == "reached"
-
-
-def _checked(outcomes: Outcomes) -> Outcomes:
-    return check_kind("outcomes", outcomes, Outcomes, "Outcomes, such as results.outcomes(cell)")
+    """Whether each trial reached its goal, (K,)."""
+    return outcomes.outcome == "reached"
 
 
 def _checked_table(table: Table) -> Table:
@@ -68,24 +66,26 @@ class Success:
     alike: bool
 
 
+@checked
 def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -> Success:
     """The success rate of a cell with its intervals. Raises InputError if there are no trials."""
-    check_kind("cell", cell, Cell, "a Cell")
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
-    exact, band = rate(reached, trials, confidence=confidence), wilson(reached, trials, confidence=confidence)
+    exact = rate(reached, trials, confidence=confidence)
+    band = rate(reached, trials, confidence=confidence, method="wilson")
     same = alike(cell, outcomes)
     if same:
         exact = band = Estimate(exact.value, exact.value, exact.value, confidence)
     return Success(cell, reached, trials, exact, band, same)
 
 
+@checked
 def alike(cell: Cell, outcomes: Outcomes) -> bool:
     """Whether there are several trials, and all are the same run: nothing was drawn, as at strength 0.
 
     Equal outcomes alone are no reason: losses may be so rare that no trial has one. Trials of which nothing was
     simulated are no runs, and trials that differ, though nothing was drawn, are not the same run.
     """
-    if len(_checked(outcomes)) < 2 or np.isnan(outcomes.ended).any():
+    if len(outcomes) < 2 or np.isnan(outcomes.ended).any():
         return False
     if cell.strength and not outcomes.deterministic:
         return False
@@ -120,9 +120,11 @@ class BreakingPoint:
     success: Estimate | None
 
 
-def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE) -> list[BreakingPoint]:
-    """The breaking point of each policy and sweep, the weakest first. Raises InputError unless `below` is a rate."""
-    check_number("below", below, above=0.0, at_most=1.0)
+@checked
+def breaks(
+    table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95, confidence: float = CONFIDENCE
+) -> list[BreakingPoint]:
+    """The breaking point of each policy and sweep, the weakest first."""
     breaking_points = []
     for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table)):
         points = degradation(table, policy, sweep, confidence=confidence)
@@ -187,11 +189,11 @@ def compared(
       paired: whether trials of the same number are compared with each other, see `comparisons`. If not, the difference
         of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
     """
-    found = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
-    tested = [place for place, one in enumerate(found) if not np.isnan(one.p_value)]
-    for place, adjusted in zip(tested, holm([found[place].p_value for place in tested]).tolist(), strict=True):
-        found[place] = replace(found[place], adjusted=adjusted)
-    return found
+    compared = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
+    tested = [place for place, one in enumerate(compared) if not np.isnan(one.p_value)]
+    for place, adjusted in zip(tested, holm([compared[place].p_value for place in tested]).tolist(), strict=True):
+        compared[place] = replace(compared[place], adjusted=adjusted)
+    return compared
 
 
 def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes, *, paired: bool) -> Comparison:
@@ -206,8 +208,8 @@ def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes, *, pair
         both = int(joint.sum())
         rms = mean(one.rms[joint] - other.rms[joint]) if both > 1 else None
     else:
-        difference, p_value = independent_difference(*((found.reached, found.trials) for found in rates))
-    if all(found.alike for found in rates):  # the difference of two runs
+        difference, p_value = independent_difference(*((rate.reached, rate.trials) for rate in rates))
+    if all(rate.alike for rate in rates):  # the difference of two runs
         difference, p_value = replace(difference, low=difference.value, high=difference.value), float("nan")
     return Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)
 
@@ -219,18 +221,18 @@ def modes(outcomes: Outcomes) -> dict[tuple[str, str], int]:
     return dict(sorted(Counter(kinds).items(), key=lambda kind: (-kind[1], kind[0])))
 
 
-def quantiles(outcomes: Outcomes, measure: str, levels: Sequence[float] = LEVELS) -> Array:
-    """Quantiles of a measure (see MEASURES) over the trials for which it is defined; NaN if there are none.
+@checked
+def quantiles(
+    outcomes: Outcomes, measure: Annotated[str, OneOf(MEASURES)], levels: Annotated[Array, "L", SHARE] = LEVELS
+) -> Array:
+    """Quantiles of a measure over the trials for which it is defined; NaN if there are none.
 
     Infinite values count: without obstacles, clearance is infinite.
     """
-    shares = check_array("levels", levels, (None,))
-    if not ((shares >= 0) & (shares <= 1)).all():
-        raise InputError(f"levels: got {excerpt(levels)}, want numbers from 0 to 1")
-    values = getattr(_checked(outcomes), check_name("measure", measure, MEASURES))
+    values = getattr(outcomes, measure)
     values = values[~np.isnan(values)]
     # Not interpolated: interpolation between two infinite values gives NaN.
-    return np.quantile(values, shares, method="inverted_cdf") if len(values) else np.full(len(shares), np.nan)
+    return np.quantile(values, levels, method="inverted_cdf") if len(values) else np.full(len(levels), np.nan)
 
 
 RANKING = (
@@ -252,9 +254,9 @@ class Trial:
     worst: float
 
 
-def worst(table: Table, count: int = 10) -> list[Trial]:
-    """The worst trials of all cells, ranked as RANKING says. Raises InputError unless `count` is a positive number."""
-    check_count("count", count)
+@checked
+def worst(table: Table, count: Count = 10) -> list[Trial]:
+    """The worst trials of all cells, ranked as RANKING says."""
     ranked: list[tuple[tuple[float, ...], Trial]] = []
     for cell, outcomes in _checked_table(table).items():
         over = np.isin(outcomes.outcome, ("collided", "diverged"))

@@ -12,23 +12,14 @@ import itertools
 import logging
 import os
 import sys
-from collections.abc import Callable
 from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from lqrsim.errors import (
-    InputError,
-    check_count,
-    check_kind,
-    check_path,
-    check_progress,
-    check_text,
-    excerpt,
-    without_addresses,
-)
+from lqrsim.annotations import Bounds, Progress, Want, checked
+from lqrsim.errors import InputError, check_path, excerpt, without_addresses
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
@@ -66,23 +57,23 @@ from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
 
-MOST_WORKERS = 1024
+MOST_WORKERS, LARGEST_BATCH = 1024, 100_000
 _CAMPAIGN_FILES = {NAME, GIVEN, "campaign.lock", "policies", "shards", "damaged"}
 
 
+@checked
 def run_campaign(
     campaign: Campaign,
     folder: str | os.PathLike[str],
     *,
-    workers: int | None = None,
-    batch: int = 256,
-    scheduler: str | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    workers: Annotated[int, Bounds(at_least=0, at_most=MOST_WORKERS)] | None = None,
+    batch: Annotated[int, Bounds(at_least=1, at_most=LARGEST_BATCH)] = 256,
+    scheduler: Annotated[str, Want("an address, such as tcp://host:8786")] | None = None,
+    progress: Progress | None = None,
 ) -> Results:
     """Run the trials of a campaign that are not in its folder yet. Call it again to resume after an interruption.
 
     Args:
-      campaign: the campaign to run.
       folder: where everything is stored, the campaign's `solution` too.
       workers: number of processes on this machine; by default one per processor. 0 runs everything in this process.
       batch: number of trials that a worker simulates together; affects only time and memory.
@@ -97,13 +88,9 @@ def run_campaign(
     """
     executors.end_if_started_by_import()
     # A copy, so that the next run resolves the scenario again: its code may have changed.
-    campaign = copy(check_kind("campaign", campaign, Campaign, "a Campaign"))
-    folder = check_path("folder", folder, "the path of a folder")
-    workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
-    batch = check_count("batch", batch, at_most=100_000)
-    if scheduler is not None:
-        check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
-    check_progress(progress)
+    campaign, folder = copy(campaign), check_path("folder", folder, "the path of a folder")
+    workers = processors() if workers is None else workers
+    tell = progress or (lambda done, total: None)
     deterministic = _check_runnable(campaign)
     _check_folder(folder)
     with contextlib.ExitStack() as stack:
@@ -123,8 +110,7 @@ def run_campaign(
         job = Job.of(results.trials, results.manifest, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
-        if progress is not None:
-            progress(done, total)
+        tell(done, total)
         if client is not None:
             work = executors.run_on_cluster(job, unfinished, client, campaign.time_limit)
         elif workers:
@@ -134,8 +120,7 @@ def run_campaign(
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
-            if progress is not None:
-                progress(done, total)
+            tell(done, total)
         for cell in results.cells:
             if (counted := results.tally(cell).total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")

@@ -1,12 +1,13 @@
 """Comparison of two campaigns, or of two policies, cell by cell."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_items, check_name, excerpt, printable
+from lqrsim.annotations import Want, checked
+from lqrsim.errors import InputError, check_name, excerpt, printable
 from lqrsim.stress.analysis import Comparison, compared
 from lqrsim.stress.data_table import DataTable, Entry, fraction_format
 from lqrsim.stress.results import Results
@@ -23,11 +24,12 @@ _METHOD = {
 }
 
 
+@checked
 def compare(
     first: Results | str | os.PathLike[str],
     second: Results | str | os.PathLike[str] | None = None,
     *,
-    policies: Sequence[str] | None = None,
+    policies: Annotated[Sequence[str], Want("two policies")] | None = None,
 ) -> DataTable:
     """Compare the success rates of two campaigns, or of two policies, in each cell that both have.
 
@@ -50,7 +52,7 @@ def compare(
     """
     one = first if isinstance(first, Results) else Results(first)
     other = one if second is None else second if isinstance(second, Results) else Results(second)
-    chosen = () if policies is None else check_items("policies", policies, str, "two policies")
+    chosen = policies or ()
     if len(chosen) != 2 and (second is None or policies is not None):
         raise InputError(f"policies: got {excerpt(policies)}, want two policies, or another campaign to compare with")
     for policy, results in zip(chosen, (one, other), strict=False):
@@ -64,7 +66,12 @@ def compare(
     if not pairs:
         raise InputError(f"second: got cells from {other.cells[0]} to {other.cells[-1]}, want some of the first's")
     campaigns = one.manifest["campaign"], other.manifest["campaign"]
-    _check_comparable(*campaigns, dict.fromkeys(cell.sweep for cell, _ in pairs))
+    for sweep in dict.fromkeys(cell.sweep for cell, _ in pairs):
+        if campaigns[0]["sweeps"][sweep] != campaigns[1]["sweeps"][sweep]:
+            raise InputError(f"second: got other disturbances in the sweep {excerpt(sweep)}, want those of the first")
+    for name in ("goal_radius", "goal_tolerance"):
+        if campaigns[0][name] != campaigns[1][name]:
+            raise InputError(f"second: {name}: got {campaigns[1][name]}, want {campaigns[0][name]}, as the first has")
     paired = campaigns[0]["seed"] == campaigns[1]["seed"]
     trials = [campaign["trials"] for campaign in campaigns]
     counts = [min(trials)] * 2 if paired else trials
@@ -75,16 +82,6 @@ def compare(
     found = compared(pairs, firsts, seconds, paired=paired)
     method = f"difference: first minus second; low, high: {100 * CONFIDENCE:g} % by {_METHOD[paired]}, adjusted (Holm)"
     return _table(found, [*_notes(one, other, chosen), method], paired=paired, fractions=fraction_format(max(counts)))
-
-
-def _check_comparable(first: Mapping[str, Any], second: Mapping[str, Any], sweeps: Iterable[str]) -> None:
-    """Raises InputError unless two campaigns have the same disturbances in these sweeps, and the same goals."""
-    for sweep in sweeps:
-        if first["sweeps"][sweep] != second["sweeps"][sweep]:
-            raise InputError(f"second: got other disturbances in the sweep {excerpt(sweep)}, want those of the first")
-    for name in ("goal_radius", "goal_tolerance"):
-        if first[name] != second[name]:
-            raise InputError(f"second: {name}: got {second[name]}, want {first[name]}, as the first has")
 
 
 def _notes(first: Results, second: Results, policies: Sequence[str]) -> list[str]:

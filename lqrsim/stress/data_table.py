@@ -4,17 +4,18 @@ import csv
 import io
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
+from lqrsim.annotations import Want, checked
 from lqrsim.errors import (
     InputError,
     check_count,
     check_items,
-    check_kind,
     check_name,
     check_number,
     check_path,
@@ -37,6 +38,7 @@ _MARKDOWN = re.compile(r"[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])")
 _ENTITIES = {letter: f"&#{ord(letter)};" for letter in "&<>~$"}
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class DataTable:
     """A table with one name or number in each entry. `str(table)` is its Markdown.
@@ -48,13 +50,12 @@ class DataTable:
       notes: lines that say what the numbers are: comments in LaTeX, lines below the table in Markdown, not in a CSV.
     """
 
-    columns: Mapping[str, Sequence[Entry]]
-    formats: Mapping[str, str] = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    columns: Annotated[Mapping[str, Sequence[Entry]], Want("heading -> entries")]
+    formats: Annotated[Mapping[str, str], Want("heading -> format")] = field(default_factory=dict)
+    notes: Annotated[Sequence[str], Want("a list of lines")] = ()
 
     def __post_init__(self) -> None:
         who, want = "DataTable: columns", "heading -> entries, each text, a finite number or None"
-        check_kind(who, self.columns, Mapping, want)
         columns = {
             check_text(f"{who}: heading", name): tuple(
                 _entry(f"{who}: {excerpt(name)}", entry) for entry in check_items(who, column, object, want)
@@ -64,23 +65,17 @@ class DataTable:
         if len({len(column) for column in columns.values()}) != 1:
             got = ", ".join(f"{len(column)} in {excerpt(name)}" for name, column in columns.items()) or "none"
             raise InputError(f"{who}: got {got}, want at least one column, all of one length")
-        check_kind("DataTable: formats", self.formats, Mapping, "heading -> format")
         for name, spec in self.formats.items():
             check_name("DataTable: formats", name, columns)
             if not (isinstance(spec, str) and re.fullmatch(r"(\.\d\d?)?[efg]", spec)):
                 raise InputError(f"DataTable: formats: {excerpt(name)}: got {excerpt(spec)}, want such as '.3f' or 'g'")
-        notes = check_items("DataTable: notes", self.notes, str, "a list of lines")
-        notes = tuple(check_text("DataTable: notes", note, "a line", at_most=_LONGEST) for note in notes)
+        notes = tuple(check_text("DataTable: notes", note, "a line", at_most=_LONGEST) for note in self.notes)
         keep(self, columns=columns, formats=dict(self.formats), notes=notes)
 
-    def select(self, headings: Iterable[str]) -> "DataTable":
-        """The table with these columns alone, in this order.
-
-        Args:
-          headings: headings of columns.
-        """
-        given = check_items("headings", headings, object, "a list of headings")
-        chosen = {name: self.columns[check_name("headings", name, self.columns)] for name in given}
+    @checked
+    def select(self, headings: Annotated[Sequence[str], Want("a list of headings")]) -> "DataTable":
+        """The table with these columns alone, in this order."""
+        chosen = {name: self.columns[check_name("headings", name, self.columns)] for name in headings}
         formats = {name: spec for name, spec in self.formats.items() if name in chosen}
         return DataTable(chosen, formats, self.notes)
 
@@ -115,14 +110,7 @@ class DataTable:
     __str__ = markdown
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the table in the format that the name ends with: .csv, .tex or .md.
-
-        Args:
-          path: the file.
-
-        Returns:
-          The path.
-        """
+        """Write the table in the format that the name ends with, .csv, .tex or .md; returns its path."""
         path = check_table_path("path", path)
         text = _WRITERS[path.suffix](self)
         with replacing(path) as unfinished:

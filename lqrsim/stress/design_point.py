@@ -17,22 +17,15 @@ The result is a failure. There may be a nearer failure; a search from other fail
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_function,
-    check_memory,
-    check_progress,
-    check_seed,
-)
+from lqrsim.annotations import Bounds, Count, Seed, TextProgress, checked
+from lqrsim.errors import Array, InputError, check_array, check_memory
 from lqrsim.process import keeping
 from lqrsim.results.rollout import Rollout
-from lqrsim.stress.multilevel_splitting import MOST, CountedScore, Progress, Score, failure_probability
+from lqrsim.stress.multilevel_splitting import CountedScore, Rounds, Score, failure_probability
 from lqrsim.stress.trial_score import normal_tail
 
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
@@ -66,15 +59,16 @@ class DesignPoint:
     converged: bool
 
 
+@checked
 def smallest_failure(
     score: Score,
-    size: int,
+    size: Count,
     *,
     failures: Array | None = None,
-    rounds: int = 40,
-    pairs: int | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
+    rounds: Rounds = 40,
+    pairs: Annotated[int, Bounds(at_least=2)] | None = None,
+    seed: Seed = 0,
+    progress: TextProgress | None = None,
 ) -> DesignPoint:
     """Search for the failure that is nearest to the origin.
 
@@ -86,21 +80,17 @@ def smallest_failure(
         distance, and five rounds together gain less than a tenth of that.
       pairs: number of pairs in each round; by default half the size, and at least 250. With fewer pairs the gradient is
         mostly noise.
-      seed: seed of all random numbers.
       progress: called with the number of finished rounds, the number of all rounds, and the distance so far as text.
 
     Raises:
       NoFailure: no failure was given, and none was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
     """
-    check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
-    check_progress(progress, text=True)
-    size = check_count("size", size)
-    rounds = check_count("rounds", rounds, at_most=MOST)
-    pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs, at_least=2)
+    pairs = max(250, size // 2) if pairs is None else pairs
     check_memory("pairs", pairs, 8 * 5 * size, "whose vectors")
     check_memory("size", size, 8 * 16 * 12, "whose vectors")  # the vectors along the rays
-    rng, counted = np.random.default_rng(check_seed("seed", seed)), CountedScore(score)
+    rng, counted = np.random.default_rng(seed), CountedScore(score)
+    tell = progress or (lambda done, total, text: None)
     if failures is None:
         failures = failure_probability(counted, size, particles=200, keep=0.2, repetitions=2, seed=seed).failures
     failures = check_array("failures", failures, (None, size))
@@ -116,8 +106,7 @@ def smallest_failure(
             simulations=counted.evaluations, remaining=remaining, converged=converged,
         )  # fmt: skip
 
-    if progress is not None:
-        progress(0, rounds, f"distance {history[-1]:.3g}")
+    tell(0, rounds, f"distance {history[-1]:.3g}")
     with keeping(lambda _: so_far()):
         for number in range(rounds):
             # The oldest rounds were around another point.
@@ -127,10 +116,9 @@ def smallest_failure(
             nearer = _nearer(counted, best, halves.sum(axis=0))
             best = best if nearer is None else nearer
             history.append(float(np.linalg.norm(best)))
-            if progress is not None:
-                progress(number + 1, rounds, f"distance {history[-1]:.3g}")
-            settled = number >= 5 and history[-1] > (1 - TOLERANCE / 10) * history[-6]
-            converged = settled and remaining < TOLERANCE
+            tell(number + 1, rounds, f"distance {history[-1]:.3g}")
+            is_steady = number >= 5 and history[-1] > (1 - TOLERANCE / 10) * history[-6]
+            converged = is_steady and remaining < TOLERANCE
             if converged:
                 break
     return so_far()

@@ -13,21 +13,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from lqrsim.annotations import Bounds, Count, OneOf, Seed, TextProgress, Want, checked
 from lqrsim.control.controllers import as_controller
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_function,
-    check_name,
-    check_path,
-    check_progress,
-    check_seed,
-)
+from lqrsim.errors import Array, InputError, check_path
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
@@ -37,7 +29,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
-from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, check_keep, failure_probability
+from lqrsim.stress.multilevel_splitting import MOST, Keep, SplittingResult, check_keep, failure_probability
 from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.study import Study, disturbances_as_json
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
@@ -45,9 +37,10 @@ from lqrsim.versions import versions
 
 FAILURES = {"collision": collision_score, "miss": miss_score}
 TIE_EVERY = 5.0  # s between reports while the pilot run draws more at a tie
-Report = Callable[[str], object]
+Report = Annotated[Callable[[str], object], Want("a function of a line of text")]
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReliabilityProblem(Study):
     """A study, and a definition of its failure.
@@ -56,11 +49,7 @@ class ReliabilityProblem(Study):
       failure: "collision": the robot collides, or its simulation diverges; "miss": it does not reach its goal.
     """
 
-    failure: str = "collision"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_name("failure", self.failure, FAILURES)
+    failure: Annotated[str, OneOf(FAILURES)] = "collision"
 
     @cached_property
     def score(self) -> TrialScore:
@@ -95,15 +84,16 @@ class ReliabilityProblem(Study):
         radius = self.resolved.target_radius(self.goal_radius, self.goal_tolerance, target=target)
         return "\n".join(lines + target.of_plan(radius))
 
+    @checked
     def rare_failures(
         self,
         *,
-        particles: int = 250,
-        repetitions: int = 10,
-        keep: float = 0.1,
-        seed: int | None = None,
+        particles: Annotated[int, Bounds(at_least=20)] = 250,
+        repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST)] = 10,
+        keep: Keep = 0.1,
+        seed: Seed | None = None,
         report: Report | None = None,
-        progress: Progress | None = None,
+        progress: TextProgress | None = None,
     ) -> "RareFailures":
         """Estimate the probability of a rare failure by multilevel splitting: see `failure_probability`.
 
@@ -117,32 +107,27 @@ class ReliabilityProblem(Study):
           progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so
             far as text.
 
-        Returns:
-          The probability with its interval, and the failures that were found.
-
         Raises:
           NoFailure: no failure was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
-        options: dict[str, Any] = {
-            "seed": self.seed if seed is None else check_seed("seed", seed),
-            "particles": check_count("particles", particles, at_least=20),
-            "repetitions": check_count("repetitions", repetitions, at_least=2, at_most=MOST),
-            "keep": check_keep(keep, particles),
-        }
-        score = self._begin(report, progress)
+        check_keep(keep, particles)
+        seed = self.seed if seed is None else seed
+        options: dict[str, Any] = {"seed": seed, "particles": particles, "repetitions": repetitions, "keep": keep}
+        score = self._begin(report)
         with keeping(lambda done: None if done is None else RareFailures(self, done, options)):
             splitting = failure_probability(score, score.size, level=self._level(report), progress=progress, **options)
         return RareFailures(self, splitting, options)
 
+    @checked
     def smallest_failure(
         self,
         *,
-        rounds: int = 40,
-        particles: int = 200,
-        seed: int | None = None,
+        rounds: Annotated[int, Bounds(at_least=1, at_most=MOST)] = 40,
+        particles: Annotated[int, Bounds(at_least=20)] = 200,
+        seed: Seed | None = None,
         report: Report | None = None,
-        progress: Progress | None = None,
+        progress: TextProgress | None = None,
     ) -> "SmallestFailure":
         """Find the smallest disturbance that makes the policy fail: see `lqrsim.stress.smallest_failure`.
 
@@ -154,17 +139,12 @@ class ReliabilityProblem(Study):
           progress: called with the number of finished rounds, the number of all rounds, and the distance so far as
             text.
 
-        Returns:
-          The failure, its distance, and the contribution of each disturbance.
-
         Raises:
           NoFailure: none was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
-        seed = self.seed if seed is None else check_seed("seed", seed)
-        rounds = check_count("rounds", rounds, at_most=MOST)
-        particles = check_count("particles", particles, at_least=20)
-        score = self._begin(report, progress)
+        seed = self.seed if seed is None else seed
+        score = self._begin(report)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
             raise InputError(
@@ -172,7 +152,7 @@ class ReliabilityProblem(Study):
                 " policy that succeeds when undisturbed"
             )
 
-        def found(point: DesignPoint) -> SmallestFailure:
+        def result(point: DesignPoint) -> SmallestFailure:
             simulations = score.simulations - before
             rollout = score.rollout(point.numbers[None], frames=False)
             ends = np.cumsum(score.sizes)[:-1]
@@ -186,19 +166,17 @@ class ReliabilityProblem(Study):
                 options={"seed": seed, "rounds": rounds, "particles": particles},
             )
 
-        with keeping(lambda done: found(done) if isinstance(done, DesignPoint) else None):
+        with keeping(lambda done: result(done) if isinstance(done, DesignPoint) else None):
             first = failure_probability(
                 score, score.size, particles=particles, keep=0.2, repetitions=2, level=self._level(report), seed=seed
             )
             point = smallest_failure(
                 score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
             )
-        return found(point)
+        return result(point)
 
-    def _begin(self, report: Report | None, progress: Progress | None) -> TrialScore:
-        """Check the callbacks, report the summary, and return the score."""
-        check_function("report", report, "a function of a line of text", arguments=1)
-        check_progress(progress, text=True)
+    def _begin(self, report: Report | None) -> TrialScore:
+        """Report the summary, and return the score."""
         if report is not None:
             report(self.summary())
         return self.score
@@ -272,9 +250,9 @@ class RareFailures:
         few = [one.describe(score.plant) for one, size in drawn if one.discrete and size]
         return "; ".join(few) if len(self.splitting.levels) > 1 else ""
 
-    def typical(self, count: int = 8) -> Array:
+    @checked
+    def typical(self, count: Count = 8) -> Array:
         """The random numbers of at most `count` failures, (k, d): first the worst, then a sample of the others."""
-        check_count("count", count)
         scores = self.splitting.scores
         worst = int(scores.argmax())
         others = np.delete(np.arange(len(scores)), worst)  # in the order of the repetitions
@@ -291,20 +269,21 @@ class RareFailures:
             high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions, versions=versions(),
         )  # fmt: skip
 
-    def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout:
+    @checked
+    def save(self, folder: str | os.PathLike[str], *, shown: Count = 8) -> Rollout:
         """Write rare.json, certificate.npz, and `shown` typical failures as rollout.npz. Returns these."""
         folder, result, one = check_path("folder", folder, "the path of a folder"), self.splitting, self.probability
-        numbers = self.typical(check_count("shown", shown))
+        numbers = self.typical(shown)
         found = {
             "probability": one.value, "low": one.low, "high": one.high, "confidence": one.confidence,
             "standard_error": result.standard_error, "repetitions": result.repetitions.tolist(),
             "levels": result.levels.tolist(), "moves": result.step_sizes.tolist(), "simulations": result.simulations,
             "plain_trials": self.plain_trials, "failures": len(result.scores),
         }  # fmt: skip
-        asked = {**self.options, "shown": shown}
-        written = _write(self.problem, folder, "rare", asked, found, numbers, self.stopped)
+        asked, score = {**self.options, "shown": shown}, self.problem.score
+        write_json(self.problem, score.solution, folder / "rare.json", asked, found, self.stopped)
         save_load.save(self.certificate(), folder / "certificate.npz")
-        return written
+        return _saved(score, numbers, folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,40 +348,27 @@ class SmallestFailure:
             "sizes": self.problem.score.sizes, "largest": [vars(one) for one in self.largest],
             "numbers": point.numbers.tolist(),
         }  # fmt: skip
-        return _write(self.problem, folder, "break", self.options, found, point.numbers[None], self.stopped)
+        score = self.problem.score
+        write_json(self.problem, score.solution, folder / "break.json", self.options, found, self.stopped)
+        return _saved(score, point.numbers[None], folder)
 
 
-def _write(
-    problem: ReliabilityProblem,
-    folder: Path,
-    name: str,
-    options: Mapping[str, Any],
-    found: Mapping[str, Any],
-    numbers: Array,
-    stopped: str,
-) -> Rollout:
-    """Write trials with these numbers as rollout.npz, and options and results as NAME.json. Returns the trials."""
+def _saved(score: TrialScore, numbers: Array, folder: Path) -> Rollout:
+    """The trials with these numbers, which are written as rollout.npz."""
     # With contacts, for pictures; bit-identical until the collision.
-    rollout = replace(problem.score, contacts=True).rollout(numbers)
+    rollout = replace(score, contacts=True).rollout(numbers)
     save_load.save(rollout, folder / "rollout.npz")
-    write_json(problem, problem.score.solution, folder, name, options, found, stopped)
     return rollout
 
 
 def write_json(
-    problem: ReliabilityProblem,
-    solution: Solution,
-    folder: Path,
-    name: str,
-    options: Mapping[str, Any],
-    found: Mapping[str, Any],
-    stopped: str,
+    problem: ReliabilityProblem, solution: Solution, path: Path, options: Mapping[str, Any], found: object, stopped: str
 ) -> None:
-    """Write the settings of a search, and what it found, as NAME.json."""
+    """Write the settings of a search, and what it found."""
     asked = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
     asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
-        "format": f"lqrsim {name}",
+        "format": f"lqrsim {path.stem}",
         "version": 3,
         "asked": asked,
         "disturbances": disturbances_as_json(problem.disturbances),
@@ -414,5 +380,5 @@ def write_json(
         "stopped": stopped or None,
         "found": found,
     }
-    with replacing(folder / f"{name}.json") as unfinished:
+    with replacing(path) as unfinished:
         unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")

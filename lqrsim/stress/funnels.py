@@ -2,29 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import Bounds, Chance, Index, NonNegative, Positive, Seed, TextProgress, Want, checked
 from lqrsim.control.controllers import ControllerLike, as_controller
 from lqrsim.control.tubes import Tube
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_items,
-    check_kind,
-    check_name,
-    check_number,
-    check_progress,
-    check_seed,
-    check_symmetric,
-    excerpt,
-    keep,
-    numbers_of,
-)
+from lqrsim.errors import Array, InputError, check_array, check_name, check_symmetric, excerpt, keep, numbers_of
 from lqrsim.problem.noise import Noise
 from lqrsim.process import keeping
 from lqrsim.results.coordinates import Coordinates
@@ -37,7 +23,6 @@ from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, LevelTest, find_level, smallest_test
-from lqrsim.stress.multilevel_splitting import Progress
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.versions import versions
@@ -46,25 +31,30 @@ KNOTS = 5  # default number of knots
 FAR = 2.0**20  # largest level, relative to the first level that is tried
 DRAWN = 2**31  # number of the random stream for a trial's start; disturbances use the first streams
 
+Confidence = Annotated[float, Bounds(at_least=0.5, below=1.0)]
+Knots = Annotated[Sequence[int], Want("numbers of knots")]
+States = Annotated[Sequence[str], Want("names of states")]
 
+
+@checked
 def funnel(
     plant: Plant,
     solution: Solution,
     *,
     disturbances: Sequence[Disturbance | Noise] = (),
     controller: ControllerLike | None = None,
-    rate: float = 0.99,
-    confidence: float = CONFIDENCE,
-    knots: Sequence[int] | None = None,
-    states: Sequence[str] | None = None,
+    rate: Chance = 0.99,
+    confidence: Confidence = CONFIDENCE,
+    knots: Knots | None = None,
+    states: States | None = None,
     shape: Tube | npt.ArrayLike | None = None,
-    largest: float | None = None,
+    largest: Positive | None = None,
     failures: int = 3,
-    seed: int = 0,
+    seed: Seed = 0,
     goal_radius: float | None = None,
     goal_tolerance: float | None = None,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: TextProgress | None = None,
 ) -> Funnel:
     """Find the largest ellipsoids about a plan from which runs reach the goal with a given success rate.
 
@@ -88,7 +78,6 @@ def funnel(
         a covariance (n, n), or one per knot, (T+1, n, n). The certificate holds for any shape, but levels depend on it.
       largest: largest level that is tried; by default the level at which an angle is off by half a turn.
       failures: number of trials of a test that may fail. With more, tests take more trials, and levels are larger.
-      seed: seed of all random numbers.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
       threads: as in `simulate`.
@@ -97,68 +86,14 @@ def funnel(
     Raises:
       KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
     """
-    trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
-    check_progress(progress, text=True)
-    space, steps = solution.policy.state_coordinates, solution.trajectory.steps
-    asked = FunnelOptions.of(space, steps, rate, confidence, knots, states, failures, seed, largest)
-    blank = _blank(trials, asked, shape)
-    found: list[FoundLevel] = []
-
-    def so_far() -> Funnel:
-        left = FoundLevel(0.0, 0, 0, "stopped before this knot was done", 0.0, 0)
-        every = [*found, *[left] * (len(blank.knots) - len(found))]
-        return replace(
-            blank,
-            levels=np.array([one.level for one in every]),
-            trials=np.array([one.trials for one in every]),
-            successes=np.array([one.successes for one in every]),
-            reasons=tuple(one.reason for one in every),
-            simulated=sum(one.simulated for one in every),
-        )
-
-    with keeping(lambda _: so_far() if found else None):
-        _search(blank, trials, asked, progress, found)
-    return so_far()
-
-
-class FunnelOptions(NamedTuple):
-    """Checked options of `funnel`, without those that need a solution.
-
-    Attributes:
-      rate, confidence, failures, largest, seed: as in `funnel`.
-      knots: in order. states: names.
-      test: the test that a level has to pass.
-    """
-
-    rate: float
-    confidence: float
-    knots: list[int]
-    states: tuple[str, ...]
-    failures: int
-    largest: float | None
-    seed: int
-    test: LevelTest
-
-    @classmethod
-    def of(
-        cls, space: Coordinates, steps: int, rate: float, confidence: float, knots: Sequence[int] | None,
-        states: Sequence[str] | None, failures: int, seed: int, largest: float | None = None,
-    ) -> "FunnelOptions":  # fmt: skip
-        """Raises InputError for options that do not fit a plan with this number of steps and these states."""
-        starts, names = _knots(knots, steps), _states(states, space)
-        confidence = check_number("confidence", confidence, at_least=0.5, below=1.0)
-        if largest is not None:
-            largest = check_number("largest", largest, above=0.0)
-        test = smallest_test(rate, 1 - (1 - confidence) / len(starts), failures)
-        return cls(rate, confidence, starts, names, failures, largest, check_seed("seed", seed), test)
-
-
-def _blank(trials: "_Trials", asked: FunnelOptions, shape: Tube | npt.ArrayLike | None) -> Funnel:
-    """A funnel without levels. Raises InputError for a shape that does not fit."""
-    solution = trials.solution
-    plan, law = solution.trajectory, solution.policy
-    starts, names = asked.knots, asked.states
-    shapes = _shapes(solution, shape, [law.state_coordinates.names.index(name) for name in names])
+    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
+    plan, policy, tell = solution.trajectory, solution.policy, progress or (lambda done, total, text: None)
+    space = policy.state_coordinates
+    starts, names, test = level_test(
+        space, plan.steps, rate=rate, confidence=confidence, knots=knots, states=states, failures=failures
+    )
+    chosen = [space.names.index(name) for name in names]
+    shapes = _shapes(solution, shape, chosen)
     for knot in starts:
         if flat(shapes[knot]):
             raise InputError(
@@ -166,42 +101,70 @@ def _blank(trials: "_Trials", asked: FunnelOptions, shape: Tube | npt.ArrayLike 
             )
     none = np.zeros(len(starts), dtype=np.int64)
     family = "cost_to_go" if shape is None else "tube" if isinstance(shape, Tube) else "given"
-    return Funnel(
-        plan=plan, state_coordinates=law.state_coordinates, control_coordinates=law.control_coordinates, states=names,
-        shape=shapes, family=family, knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
-        reasons=("",) * len(starts), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
-        disturbances=trials.described, versions=versions(),
-        rate=asked.rate, confidence=asked.confidence, seed=asked.seed,
-        options={"failures": asked.failures, "largest": asked.largest},
+    blank = Funnel(
+        plan=plan, state_coordinates=space, control_coordinates=policy.control_coordinates, states=names, shape=shapes,
+        family=family, knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
+        reasons=("",) * len(starts), simulated=0, policy_digest=runner.law.digest, goal_radius=runner.radius,
+        disturbances=runner.described, versions=versions(), rate=rate, confidence=confidence, seed=seed,
+        options={"failures": failures, "largest": largest},
     )  # fmt: skip
+    found: list[FoundLevel] = []
+
+    def so_far() -> Funnel:
+        left = FoundLevel(0.0, 0, 0, "stopped before this knot was done", 0.0, 0)
+        levels = [*found, *[left] * (len(starts) - len(found))]
+        return replace(
+            blank,
+            levels=np.array([each.level for each in levels]),
+            trials=np.array([each.trials for each in levels]),
+            successes=np.array([each.successes for each in levels]),
+            reasons=tuple(each.reason for each in levels),
+            simulated=sum(each.simulated for each in levels),
+        )
+
+    with keeping(lambda _: so_far() if found else None):
+        run = 0
+        for done, knot in enumerate(starts):
+            last = f", level {found[-1].level:.3g} at the one before" if found else ""
+            guess = _reach(plant, space.position, chosen, shapes[knot])
+            end = min(_half_turn(solution, chosen, shapes[knot]), guess * FAR if largest is None else largest)
+
+            def runs(
+                level: float, numbers: npt.NDArray[np.intp], knot: int = knot, done: int = done, last: str = last
+            ) -> npt.NDArray[np.bool_]:
+                nonlocal run
+                tell(done, len(starts), f"trying level {level:.3g} at knot {knot}{last}; {run:,} trials")
+                run += len(numbers)
+                points = points_of(numbers, seed, len(chosen))
+                return runner.reached(blank.states_at(knot, points, level), knot, seed, numbers)
+
+            found.append(find_level(runs, test, guess=guess, largest=end, rate=rate))
+        tell(len(starts), len(starts), f"level {found[-1].level:.3g} at knot {starts[-1]}; {run:,} trials")
+    return so_far()
 
 
-def _search(
-    whole: Funnel, trials: "_Trials", asked: FunnelOptions, progress: Progress | None, found: list[FoundLevel]
-) -> None:  # fmt: skip
-    """Find the level at each knot of a funnel without levels, and append it."""
-    size, chosen, largest, run = len(whole.knots), whole.chosen, asked.largest, 0
-    for done, knot in enumerate(whole.knots.tolist()):
-        last = f", level {found[-1].level:.3g} at the one before" if found else ""
-        shape = whole.shape[knot]
-        guess = _reach(trials.plant, whole.state_coordinates.position, chosen, shape)
-        end = min(_half_turn(trials.solution, chosen, shape), guess * FAR if largest is None else largest)
+@checked
+def level_test(
+    space: Coordinates, steps: int, *, rate: Chance = 0.99, confidence: Confidence = CONFIDENCE,
+    knots: Knots | None = None, states: States | None = None, failures: int = 3,
+) -> tuple[list[int], tuple[str, ...], LevelTest]:  # fmt: skip
+    """The knots of a funnel in order, its states, and the test of a level at each knot; arguments as in `funnel`.
 
-        def runs(
-            level: float, numbers: npt.NDArray[np.intp], knot: int = knot, done: int = done, last: str = last
-        ) -> npt.NDArray[np.bool_]:
-            nonlocal run
-            if progress is not None:
-                progress(done, size, f"trying level {level:.3g} at knot {knot}{last}; {run:,} trials")
-            run += len(numbers)
-            points = points_of(numbers, whole.seed, len(chosen))
-            return trials.reached(whole.states_at(knot, points, level), knot, whole.seed, numbers)
-
-        found.append(find_level(runs, asked.test, guess=guess, largest=end, rate=whole.rate))
-    if progress is not None:
-        progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}; {run:,} trials")
+    The states are of `space`, and the knots of a plan with this number of steps.
+    """
+    if knots is None:
+        knots = np.linspace(0, steps, min(KNOTS, steps) + 1)[:-1].astype(int).tolist()
+    chosen, names = sorted(set(knots)), space.names if states is None else tuple(states)
+    if not chosen or chosen[0] < 0 or chosen[-1] >= steps:
+        raise InputError(f"knots: got {excerpt(knots)}, want some of 0 to {steps - 1}, before the plan's end")
+    for name in names:
+        check_name("states", name, space.names)
+    if not names or len(set(names)) < len(names):
+        raise InputError(f"states: got {excerpt(names)}, want different names, at least one")
+    return chosen, names, smallest_test(rate, 1 - (1 - confidence) / len(chosen), failures)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class FunnelCheck:
     """New trials at a knot of a funnel.
@@ -213,15 +176,12 @@ class FunnelCheck:
       successes: whether each trial reached the goal, (K,).
     """
 
-    knot: int
-    level: float
+    knot: Index
+    level: NonNegative
     reached: Estimate
     successes: npt.NDArray[np.bool_] = field(repr=False)
 
     def __post_init__(self) -> None:
-        check_count("FunnelCheck: knot", self.knot, at_least=0)
-        check_number("FunnelCheck: level", self.level, at_least=0.0)
-        check_kind("FunnelCheck: reached", self.reached, Estimate, "an Estimate")
         keep(self, successes=check_array("FunnelCheck: successes", self.successes, (None,)) != 0)
 
     def __str__(self) -> str:
@@ -230,6 +190,7 @@ class FunnelCheck:
         return f"knot {self.knot}, level {self.level:.3g}: {rate}"
 
 
+@checked
 def check_funnel(
     funnel: Funnel,
     plant: Plant,
@@ -237,9 +198,9 @@ def check_funnel(
     *,
     disturbances: Sequence[Disturbance | Noise] = (),
     controller: ControllerLike | None = None,
-    trials: int = 1000,
-    between: tuple[float, float] = (0.0, 1.0),
-    seed: int = 1,
+    trials: Annotated[int, Bounds(at_least=1, at_most=MOST_TRIALS)] = 1000,
+    between: tuple[NonNegative, NonNegative] = (0.0, 1.0),
+    seed: Seed = 1,
     goal_radius: float | None = None,
     goal_tolerance: float | None = None,
     threads: int | None = None,
@@ -248,7 +209,6 @@ def check_funnel(
     a level.
 
     Args:
-      funnel: the funnel to check.
       plant: as for `funnel`.
       solution: as for `funnel`.
       disturbances: as for `funnel`.
@@ -260,28 +220,25 @@ def check_funnel(
       goal_tolerance: as for `funnel`.
       threads: as for `funnel`.
     """
-    check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
         raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
-    check_count("trials", trials, at_most=MOST_TRIALS)
-    shares = check_array("between", between, (2,))
-    if not 0 <= shares[0] < shares[1]:
+    if between[0] >= between[1]:
         raise InputError(f"between: got {excerpt(between)}, want two shares of the level, in order, from 0 on")
-    if check_seed("seed", seed) == funnel.seed:
+    if seed == funnel.seed:
         raise InputError(f"seed: got {seed}, the funnel's own, want another one, for new trials")
-    found, size = [], len(funnel.states)
+    checks, size = [], len(funnel.states)
     for knot, level in zip(funnel.knots.tolist(), funnel.levels.tolist(), strict=True):
         if level == 0:
             continue
         parts = []
         for first in range(0, trials, BATCH):
             numbers = np.arange(first, min(first + BATCH, trials))
-            starts = funnel.states_at(knot, points_of(numbers, seed, size, (shares[0], shares[1])), level)
+            starts = funnel.states_at(knot, points_of(numbers, seed, size, between), level)
             parts.append(runner.reached(starts, knot, seed, numbers))
         reached = np.concatenate(parts)
-        found.append(FunnelCheck(knot, level, rate_of(int(reached.sum()), trials), reached))
-    return tuple(found)
+        checks.append(FunnelCheck(knot, level, rate_of(int(reached.sum()), trials), reached))
+    return tuple(checks)
 
 
 def points_of(numbers: npt.NDArray[np.intp], seed: int, size: int, between: tuple[float, float] = (0.0, 1.0)) -> Array:
@@ -302,8 +259,7 @@ class _Trials:
         self, plant: Plant, solution: Solution, disturbances: Sequence[Disturbance | Noise],
         controller: ControllerLike | None, near: tuple[float | None, float | None], threads: int | None,
     ) -> None:  # fmt: skip
-        self.plant = check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
-        self.solution = check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
+        self.plant, self.solution = plant, solution
         self.law, _ = as_controller(controller, solution, plant.robot.dynamics)
         self.disturbances = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
         # The tolerance of a goal without a position is relative to the range of the whole plan, not of its rest.
@@ -332,28 +288,6 @@ class _Trials:
         return outcome == "reached"
 
 
-def _knots(knots: Sequence[int] | None, steps: int) -> list[int]:
-    """The chosen knots in order. Raises InputError for knots that the plan does not have."""
-    if knots is None:
-        return sorted({int(knot) for knot in np.linspace(0, steps, min(KNOTS, steps) + 1)[:-1]})
-    given = check_items("knots", knots, (int, np.integer), "numbers of knots", at_most=10_000)
-    found = sorted({check_count("knots", knot, at_least=0) for knot in given})
-    if not found or found[-1] >= steps:
-        raise InputError(f"knots: got {excerpt(given)}, want some of 0 to {steps - 1}, before the plan's end")
-    return found
-
-
-def _states(states: Sequence[str] | None, space: Coordinates) -> tuple[str, ...]:
-    """Names of the chosen states. Raises InputError for states that do not exist."""
-    known = space.names
-    if states is None:
-        return known
-    given = check_items("states", states, str, "names of states")
-    if not given or len(set(given)) < len(given):
-        raise InputError(f"states: got {excerpt(given)}, want different names, at least one")
-    return tuple(check_name("states", name, known) for name in given)
-
-
 def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list[int]) -> Array:
     """Covariances (T+1, d, d) of the chosen states; zero at knots without one."""
     plan = solution.trajectory
@@ -367,9 +301,9 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
         if not np.array_equal(shape.plan.states, plan.states):
             raise InputError("shape: got a tube of another plan, want a tube of the solution")
         shape = shape.covariance
-    given = numbers_of("shape", shape, "a Tube, or a covariance (n, n) or (T+1, n, n)")
-    given = check_array("shape", given, (n, n) if given.ndim == 2 else (knots, n, n))
-    return np.broadcast_to(check_symmetric("shape", given), (knots, n, n))[:, chosen][:, :, chosen]
+    covariance = numbers_of("shape", shape, "a Tube, or a covariance (n, n) or (T+1, n, n)")
+    covariance = check_array("shape", covariance, (n, n) if covariance.ndim == 2 else (knots, n, n))
+    return np.broadcast_to(check_symmetric("shape", covariance), (knots, n, n))[:, chosen][:, :, chosen]
 
 
 def _inverse(curve: Array) -> Array:

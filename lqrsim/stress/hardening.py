@@ -17,27 +17,17 @@ import os
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from math import ceil, log, log1p
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.special import ndtri
 
+from lqrsim.annotations import Bounds, Chance, Count, Seed, TextProgress, checked
 from lqrsim.control.chance_constrained import smooth_chance_constrained
 from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import STRAY, predict_tube
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_function,
-    check_kind,
-    check_name,
-    check_number,
-    check_path,
-    check_progress,
-    check_seed,
-)
+from lqrsim.errors import Array, InputError, check_name, check_path
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
 from lqrsim.results import save_load
@@ -48,7 +38,7 @@ from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.solvers.compiled import costs_of
 from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report, write_json
-from lqrsim.stress.multilevel_splitting import NoFailure, Progress
+from lqrsim.stress.multilevel_splitting import NoFailure
 from lqrsim.stress.policies import DESIGNED, design_uncertainty, make_controller
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
@@ -59,7 +49,7 @@ COUNTED = 5e-3  # requests from which failures are counted by default; smaller p
 FAILING = 10  # trials of each repetition that fail at the requested probability, if failures are counted
 MOST_COUNTED = 100_000  # trials that are run where splitting found no failure: about as many as two splittings
 SHOWN = 300  # failing runs that are run again, to see where they fail
-MOST = 20  # rounds
+MOST_ROUNDS = 20
 REMEDY = "more range of the controls, less lag, or other tolerances may help"
 
 
@@ -156,36 +146,32 @@ class HardenedPlan:
 
     __str__ = summary
 
-    def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout | None:
-        """Write solution.npz, harden.json, and, if there are failures, the files of `rare`.
-
-        Returns:
-          The typical failures that were written.
-        """
+    @checked
+    def save(self, folder: str | os.PathLike[str], *, shown: Count = 8) -> Rollout | None:
+        """Write solution.npz and harden.json, and the files of `rare` if there are failures; returns those it wrote."""
         folder = check_path("folder", folder, "the path of a folder")
         rounds = [
             {"cost": one.cost, "hit": one.hit, "strays": one.strays, "probability": asdict(one.probability)}
             for one in self.rounds
         ]
-        found = {
-            "success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds,
-        }  # fmt: skip
+        found = {"success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds}
         save_load.save(self.solution, folder / "solution.npz")
         asked = {"chance": self.chance, **self.options}
-        write_json(self.problem, self.solution, folder, "harden", asked, found, self.stopped)
+        write_json(self.problem, self.solution, folder / "harden.json", asked, found, self.stopped)
         return None if self.rare is None else self.rare.save(folder, shown=shown)
 
 
+@checked
 def harden(
     problem: ReliabilityProblem,
     *,
-    chance: float = 1e-3,
-    rounds: int = 4,
-    particles: int | None = None,
-    repetitions: int = 10,
-    seed: int | None = None,
+    chance: Chance = 1e-3,
+    rounds: Annotated[int, Bounds(at_least=1, at_most=MOST_ROUNDS)] = 4,
+    particles: Annotated[int, Bounds(at_least=20)] | None = None,
+    repetitions: Annotated[int, Bounds(at_least=2)] = 10,
+    seed: Seed | None = None,
     report: Report | None = None,
-    progress: Progress | None = None,
+    progress: TextProgress | None = None,
 ) -> HardenedPlan:
     """Find a plan with a measured probability of failure of at most the requested one, at little additional cost.
 
@@ -210,16 +196,9 @@ def harden(
     Raises:
       KeyboardInterrupt: Ctrl-C; its `found` is the HardenedPlan after the rounds that are done, or None.
     """
-    check_kind("problem", problem, ReliabilityProblem, "a ReliabilityProblem")
-    chance = check_number("chance", chance, above=0.0, below=1.0)
-    rounds = check_count("rounds", rounds, at_most=MOST)
     if particles is None:
         particles = 250 if chance < COUNTED else max(20, ceil(FAILING / chance))
-    check_count("particles", particles, at_least=20)
-    check_count("repetitions", repetitions, at_least=2)
-    seed = problem.seed if seed is None else check_seed("seed", seed)
-    check_function("report", report, "a function of a line of text", arguments=1)
-    check_progress(progress, text=True)
+    seed = problem.seed if seed is None else seed
     options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}
     search, say = _Search(problem, chance, options), report or (lambda line: None)
     seeds, total = count(seed), 2 * rounds * repetitions
@@ -326,7 +305,7 @@ class _Search:
         wanted[critical] = near[critical] * np.clip(quantile / measured, LESS, MORE)
         return wanted
 
-    def failures(self, solution: Solution, seed: int, progress: Progress) -> RareFailures | NoFailure:
+    def failures(self, solution: Solution, seed: int, progress: TextProgress) -> RareFailures | NoFailure:
         """The failures of a plan; the NoFailure if none is found, also by enough trials, unless these are too many."""
         options: dict[str, Any] = {name: self.options[name] for name in ("particles", "repetitions")} | {"seed": seed}
         keep = 0.0 if self.chance * options["particles"] >= FAILING else 0.1

@@ -11,11 +11,13 @@ bound of Clopper and Pearson is at least the rate.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_count, check_number
+from lqrsim.annotations import Bounds, Chance, checked
+from lqrsim.errors import InputError
 from lqrsim.stress.statistics import rate as rate_of
 
 SHARES = (0.7, 0.9, 1.0)  # fractions of the pilot's level, in the order in which they are tested
@@ -42,11 +44,11 @@ class LevelTest:
     aim: int
 
 
-def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
+@checked
+def smallest_test(
+    rate: Chance, confidence: Chance, failures: Annotated[int, Bounds(at_least=0, at_most=10_000)]
+) -> LevelTest:
     """The test with the fewest trials that proves the rate with the given confidence if `failures` trials fail."""
-    rate = check_number("rate", rate, above=0.0, below=1.0)
-    confidence = check_number("confidence", confidence, above=0.0, below=1.0)
-    check_count("failures", failures, at_least=0, at_most=10_000)
 
     def proves(trials: int) -> bool:
         return lowest_rate(trials - failures, trials, confidence) >= rate

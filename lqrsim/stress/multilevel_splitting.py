@@ -24,26 +24,21 @@ vary so much that they give no upper bound, it ends at 1.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_function,
-    check_memory,
-    check_number,
-    check_progress,
-    check_seed,
-    shaped,
-)
+from lqrsim.annotations import Bounds, Count, Seed, TextProgress, Want, checked
+from lqrsim.errors import Array, InputError, check_memory, shaped
 from lqrsim.process import keeping
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate, rounded
 
-Score = Callable[[Array], Array]
-Progress = Callable[[int, int, str], object]  # called with the amount done, the whole amount, and the result so far
 MOST = 10_000  # largest number of repetitions, moves, levels and rounds
+Score = Annotated[Callable[[Array], Array], Want("a function of vectors (K, size)")]
+OnLevel = Annotated[Callable[[float], object], Want("a function of a level")]
+Rounds = Annotated[int, Bounds(at_least=1, at_most=MOST)]
+Repetitions = Annotated[int, Bounds(at_least=2, at_most=MOST)]
+Keep = Annotated[float, Bounds(at_least=0.0, at_most=0.5)]
 ACCEPTANCE = 0.4  # fraction of accepted moves at which the pilot run aims
 ABOVE = 10  # vectors above a tie with which the pilot run goes on; their number then varies by a third
 MOST_BATCHES = 64  # batches of vectors that the pilot run draws at a tie
@@ -105,18 +100,19 @@ class SplittingResult:
     __str__ = summary
 
 
+@checked
 def failure_probability(
     score: Score,
-    size: int,
+    size: Count,
     *,
-    particles: int = 500,
-    keep: float = 0.1,
-    moves: int = 5,
-    repetitions: int = 10,
-    seed: int = 0,
-    most_levels: int = 40,
-    level: Callable[[float], object] | None = None,
-    progress: Progress | None = None,
+    particles: Annotated[int, Bounds(at_least=10)] = 500,
+    keep: Keep = 0.1,
+    moves: Rounds = 5,
+    repetitions: Repetitions = 10,
+    seed: Seed = 0,
+    most_levels: Rounds = 40,
+    level: OnLevel | None = None,
+    progress: TextProgress | None = None,
 ) -> SplittingResult:
     """Estimate the probability that the score of a standard normal vector is positive, by multilevel splitting.
 
@@ -138,19 +134,12 @@ def failure_probability(
       NoFailure: no failure was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the result of the repetitions that are done, None if none has failed.
     """
-    check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
-    size = check_count("size", size)
-    particles = check_count("particles", particles, at_least=10)
     check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved vectors, and copies of both
-    keep = check_keep(keep, particles)
-    moves = check_count("moves", moves, at_most=MOST)
-    repetitions = check_count("repetitions", repetitions, at_least=2, at_most=MOST)
+    check_keep(keep, particles)
     check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
-    most_levels = check_count("most_levels", most_levels, at_most=MOST)
-    check_function("level", level, "a function of a level", arguments=1)
-    check_progress(progress, text=True)
+    tell = progress or (lambda done, total, text: None)
     counted = CountedScore(score)
-    first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
+    first, *rest = np.random.SeedSequence(seed).spawn(repetitions + 1)
     levels, step_sizes, batches = np.zeros(1), np.zeros(0), [1]
     if keep:
         rng = np.random.default_rng(first)
@@ -169,24 +158,22 @@ def failure_probability(
 
     with keeping(lambda _: so_far()):
         for number, key in enumerate(rest):
-            if progress is not None:
-                mean = np.mean([shares.prod() for shares, _, _ in done]) if done else None
-                progress(number, repetitions, "" if mean is None else f"{mean:.2g}")
+            estimates = [shares.prod() for shares, _, _ in done]
+            tell(number, repetitions, f"{np.mean(estimates):.2g}" if estimates else "")
             rng = np.random.default_rng(key)
             done.append(_repetition(counted, size, particles, moves, levels, step_sizes, batches, rng))
-    found = so_far()
-    if progress is not None:
-        progress(repetitions, repetitions, f"{0.0 if found is None else found.probability.value:.2g}")
-    if found is None:
+    result = so_far()
+    tell(repetitions, repetitions, f"{0.0 if result is None else result.probability.value:.2g}")
+    if result is None:
         trials = repetitions * particles * batches[0] if len(levels) == 1 else 0
         raise NoFailure(f"particles: got {particles}, none of which failed, want more of them", trials)
-    return found
+    return result
 
 
-def check_keep(keep: object, particles: int) -> float:
-    """The fraction of vectors that exceeds the next level. Raises InputError if it is out of range."""
-    kept = check_number("keep", keep, at_least=0.0, at_most=0.5)
-    return check_number("keep", kept, at_least=2 / particles) if kept else kept
+def check_keep(keep: float, particles: int) -> None:
+    """Raises InputError if fewer than two vectors would exceed a level."""
+    if 0 < keep < 2 / particles:
+        raise InputError(f"keep: got {keep:g}, want a finite number >= {2 / particles:g}, or 0")
 
 
 def _estimate(shares: Array, particles: int, batches: Sequence[int]) -> Estimate:
@@ -232,7 +219,7 @@ def _pilot_run(
     moves: int,
     most_levels: int,
     rng: np.random.Generator,
-    on_level: Callable[[float], object] | None,
+    on_level: OnLevel | None,
 ) -> tuple[Array, Array, list[int]]:
     """Find the levels, the last of which is 0; the step size at all levels except the last; the batches at each."""
     vectors = rng.standard_normal((particles, size))

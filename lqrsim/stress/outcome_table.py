@@ -1,29 +1,23 @@
 """The outcomes of trials: a table with one row per trial, small enough for millions of trials."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_flag,
-    check_kind,
-    check_shape,
-    excerpt,
-    keep,
-    numbers_of,
-    shaped,
-)
+from lqrsim.annotations import Count, checked
+from lqrsim.errors import Array, InputError, check_shape, excerpt, keep, numbers_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.solvers import compiled
 
+Column = Annotated[Array, "K"]
 
+
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcomes:
     """The outcomes of K trials, an array (K,) for each measure. Measures cover the time until the trial ended.
@@ -47,30 +41,28 @@ class Outcomes:
     trial: npt.NDArray[np.int64]
     outcome: npt.NDArray[np.str_]
     obstacle: npt.NDArray[np.str_]
-    ended: Array
-    worst: Array
-    rms: Array
-    final: Array
-    goal: Array
-    clearance: Array
-    effort: Array
-    saturated: Array
-    cost: Array
+    ended: Column
+    worst: Column
+    rms: Column
+    final: Column
+    goal: Column
+    clearance: Column
+    effort: Column
+    saturated: Column
+    cost: Column
     deterministic: bool = False
+
+    _want = "Outcomes, such as results.outcomes(cell)"
 
     def __post_init__(self) -> None:
         trial = numbers_of("Outcomes: trial", self.trial)
-        check_shape("Outcomes: trial", trial, (None,))
+        check_shape("Outcomes: trial", trial, self.cost.shape)
         if not ((trial >= 0) & (trial == np.floor(trial)) & (trial < 2**63)).all():
             raise InputError(f"Outcomes: trial: got {excerpt(self.trial)}, want whole numbers >= 0")
         if type(self.trial) is not np.ndarray or self.trial.dtype != np.int64:
             keep(self, trial=trial.astype(np.int64))
-        check_flag("Outcomes: deterministic", self.deterministic)
-        for field in COLUMNS[1:]:
+        for field in ("outcome", "obstacle"):
             value, name = getattr(self, field), f"Outcomes: {field}"
-            if field not in ("outcome", "obstacle"):
-                keep(self, **{field: shaped(name, value, trial.shape)})
-                continue
             if not isinstance(value, np.ndarray) or value.dtype.kind != "U":
                 raise InputError(f"{name}: got {excerpt(value)}, want an array of texts")
             check_shape(name, value, trial.shape)
@@ -80,13 +72,9 @@ class Outcomes:
     def __len__(self) -> int:
         return len(self.trial)
 
-    def first(self, count: int) -> "Outcomes":
-        """The outcomes of the first trials.
-
-        Args:
-          count: number of trials; more than there are means all.
-        """
-        check_count("count", count)
+    @checked
+    def first(self, count: Count) -> "Outcomes":
+        """The outcomes of the first `count` trials; more than there are means all."""
         return replace(self, **{name: column[:count] for name, column in self.columns().items()})
 
     def columns(self) -> dict[str, npt.NDArray[np.generic]]:
@@ -97,6 +85,7 @@ class Outcomes:
 COLUMNS = tuple(field.name for field in fields(Outcomes) if field.name != "deterministic")
 
 
+@checked
 def outcomes(
     rollout: Rollout,
     problem: Problem | None = None,
@@ -107,13 +96,10 @@ def outcomes(
     """Compute the outcomes of a rollout's trials.
 
     Args:
-      rollout: returned by `simulate`.
       problem: the problem that defines the cost; without it the cost is NaN.
       goal_radius: radius in metres, in place of the rollout's; see `simulate`.
       goal_tolerance: a scaled error, in place of the rollout's; see `simulate`.
     """
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    check_kind("problem", problem, (Problem, type(None)), "a Problem or None")
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         got = f"{problem.steps} steps of {problem.dt:g} s"
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")

@@ -1,13 +1,14 @@
 """Checking a certificate: the measurement of `RareFailures.certificate` again, as `lqrsim certify`."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
-from lqrsim.errors import InputError, check_count, check_kind
+from lqrsim.annotations import Bounds, Seed, TextProgress, checked
+from lqrsim.errors import InputError
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.scenarios.references import names_code
 from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report
-from lqrsim.stress.multilevel_splitting import Progress
+from lqrsim.stress.multilevel_splitting import MOST
 from lqrsim.versions import changed
 
 
@@ -44,14 +45,15 @@ class Recheck:
     __str__ = summary
 
 
+@checked
 def certify(
     certificate: FailureCertificate,
     *,
-    repetitions: int | None = None,
-    seed: int | None = None,
+    repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST)] | None = None,
+    seed: Seed | None = None,
     scenario: str | None = None,
     report: Report | None = None,
-    progress: Progress | None = None,
+    progress: TextProgress | None = None,
 ) -> Recheck:
     """Repeat the measurement of a certificate, in whole or in part.
 
@@ -63,15 +65,13 @@ def certify(
       report: as in `ReliabilityProblem.rare_failures`.
       progress: as in `ReliabilityProblem.rare_failures`.
 
-    Returns:
-      A Recheck.
-
     Raises:
       NoFailure: no failure was found.
     """
-    check_kind("certificate", certificate, FailureCertificate, "a FailureCertificate, such as rare.certificate()")
     every = len(certificate.repetitions)
-    count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
+    count = every if repetitions is None else repetitions
+    if count > every:
+        raise InputError(f"repetitions: got {count}, want at most the certificate's {every}")
     if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     stated: dict[str, Any] = {one.name: getattr(certificate, one.name) for one in fields(ReliabilityProblem)}

@@ -6,20 +6,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from lqrsim.errors import (
-    InputError,
-    check_count,
-    check_flag,
-    check_kind,
-    check_name,
-    check_path,
-    check_text,
-    excerpt,
-)
+from lqrsim.annotations import LINE, Count, Index, Want, checked
+from lqrsim.errors import InputError, check_name, check_path, excerpt
 from lqrsim.results import notebook, save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.goal import OUTCOMES
@@ -52,16 +44,23 @@ class Results:
       cells: the cells of the campaign.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
+    _prefix = ""
+
+    @checked
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        scenario: Annotated[str, Want("the campaign's reference"), 10 * LINE] | None = None,
+    ) -> None:
         self.folder = check_path("folder", folder, "the path of a campaign's folder")
         self.manifest = read_manifest(self.folder)
         self.cells = cells_of(self.manifest)
         self._scenario = scenario
         reference = self.manifest["campaign"]["scenario"]
         if scenario is not None:
-            check_kind("scenario", scenario, str, "the campaign's reference")
-            given, known = (os.path.normpath(from_anywhere(one)) for one in (scenario, reference))
-            if given != known:
+            named, known = (os.path.normpath(from_anywhere(text)) for text in (scenario, reference))
+            if named != known:
                 raise InputError(f"scenario: got {excerpt(scenario)}, want {reference}, which {self.folder} was run on")
 
     @cached_property
@@ -95,12 +94,7 @@ class Results:
         return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in on_disk]
 
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
-        """The outcomes of a cell's trials, in order.
-
-        Args:
-          cell: one of `cells`.
-          partial: whether to accept a cell that is not finished.
-        """
+        """The outcomes of a cell's trials, in order; with `partial` also if the cell is not finished."""
         tables = list(self.tables(cell, partial=partial))
         if not tables:
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
@@ -110,15 +104,7 @@ class Results:
         return Outcomes(**columns, deterministic=deterministic)
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
-        """Count the outcomes of a cell's trials, reading one file after the other.
-
-        Args:
-          cell: one of `cells`.
-          partial: whether to accept a cell that is not finished.
-
-        Returns:
-          Outcome -> number of trials.
-        """
+        """The number of trials of each outcome of a cell, which need not be finished if `partial`."""
         counts: Counter[str] = Counter()
         for table in self.tables(cell, partial=partial):
             counts.update(table["outcome"].tolist())
@@ -250,14 +236,7 @@ class Results:
         return lines
 
     def reasons(self, cell: Cell) -> dict[int, str]:
-        """The reasons of a cell's trials that ended with an error or a diverged filter.
-
-        Args:
-          cell: one of `cells`.
-
-        Returns:
-          Number of the trial -> reason.
-        """
+        """The reasons of a cell's trials that ended with an error or a diverged filter, by number of the trial."""
         return {
             int(trial): str(reason)
             for table in self.tables(cell, partial=True)
@@ -266,11 +245,7 @@ class Results:
         }
 
     def solution(self, policy: str) -> Solution:
-        """The solution that a policy runs.
-
-        Args:
-          policy: name of the policy.
-        """
+        """The solution that a policy runs."""
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
         hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
@@ -278,11 +253,7 @@ class Results:
         return solution
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
-        """The shards of a cell, or of all cells.
-
-        Args:
-          cell: one of `cells`; None for all.
-        """
+        """The shards of a cell; by default of all cells."""
         trials, size = self.manifest["campaign"]["trials"], self.manifest["campaign"]["shard"]
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
             for first in range(0, trials, size):
@@ -294,46 +265,30 @@ class Results:
         names = set(os.listdir(folder)) if os.path.isdir(folder) else set()
         return {shard for shard in self.shards() if shard.file in names}
 
+    @checked
     def number(self, cell: Cell) -> int:
-        """The index of a cell among `cells`.
-
-        Args:
-          cell: one of `cells`.
-        """
-        check_kind("cell", cell, Cell, "a Cell of the campaign")
+        """The index of a cell among `cells`."""
         if cell not in self.cells:
             first, last = self.cells[0], self.cells[-1]
             raise InputError(f"cell: got {cell}, want one of the {len(self.cells)}, from {first} to {last}")
         return self.cells.index(cell)
 
+    @checked
     def path(self, shard: Shard) -> Path:
-        """The path of a shard's file.
-
-        Args:
-          shard: one of `shards`.
-        """
-        check_kind("shard", shard, Shard, "a Shard of the campaign")
-        check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
+        """The path of a shard's file."""
+        if shard.cell >= len(self.cells):
+            raise InputError(f"shard: cell: got {shard.cell}, want a whole number from 0 to {len(self.cells) - 1}")
         return self.folder / "shards" / shard.file
 
+    @checked
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[Table]:
-        """The tables of a cell, shard by shard: name -> column.
-
-        Args:
-          cell: one of `cells`.
-          partial: whether to skip shards that are missing.
-        """
-        check_flag("partial", partial)
+        """The tables of a cell, shard by shard: name -> column. If `partial`, shards that are missing are skipped."""
         for shard in self.shards(cell):
             if self.path(shard).is_file() or not partial:
                 yield self.table(shard)
 
     def table(self, shard: Shard) -> Table:
-        """The rows of a shard.
-
-        Args:
-          shard: one of `shards`.
-        """
+        """The rows of a shard."""
         path = self.path(shard)
         if not path.is_file():
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
@@ -349,19 +304,16 @@ class Results:
         reference = self.manifest["campaign"]["scenario"]
         return shlex.join(["lqrsim", "stress", reference, "--resume", "--out", str(self.folder.absolute())])
 
-    def command_of(self, command: str, *options: str) -> str:
+    @checked
+    def command_of(self, command: Literal["report", "replay"], *options: str) -> str:
         """The command line of `lqrsim report` or `lqrsim replay` for this campaign. It runs in any working directory.
 
         Args:
-          command: "report" or "replay".
           *options: further words of the command line.
         """
-        check_name("command", command, ("report", "replay"))
-        for option in options:
-            check_text("options", option, "an option, such as --cell", at_most=4000)
         reference = self.manifest["campaign"]["scenario"]
-        own = ["--scenario", reference] if names_code(reference) else []
-        return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
+        code = ["--scenario", reference] if names_code(reference) else []
+        return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *code])
 
 
 def _described(disturbance: Mapping[str, Any]) -> str:
@@ -369,12 +321,13 @@ def _described(disturbance: Mapping[str, Any]) -> str:
     return f"{disturbance['kind']}({', '.join(f'{name}={value}' for name, value in disturbance['settings'].items())})"
 
 
+@checked
 def replay(
     results: Results | str | os.PathLike[str],
     cell: Cell,
-    trial: int,
+    trial: Index,
     *,
-    trials: int = 1,
+    trials: Count = 1,
     frames: bool = True,
     contacts: bool = True,
 ) -> Rollout:
@@ -383,27 +336,17 @@ def replay(
     It needs the kind of processor and the versions in `results.manifest["versions"]`.
 
     Args:
-      results: the campaign.
-      cell: one of its cells.
+      results: the campaign, or its folder.
       trial: number of the first trial, from 0.
-      trials: number of trials.
       frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
-    frames, contacts = check_flag("frames", frames), check_flag("contacts", contacts)
-    each = results.manifest["campaign"]["trials"]
-    if check_count("trial", trial, at_least=0) >= each:
-        raise InputError(f"trial: got {trial}, want less than {each}")
-    check_count("trials", trials, at_most=each - trial)
+    last = results.manifest["campaign"]["trials"] - 1
+    if trial + trials - 1 > last:
+        raise InputError(f"trial: got {trial} to {trial + trials - 1}, want numbers up to {last}")
     return results.trials.run(cell, trial, trials, frames=frames, contacts=contacts)
-
-
-def row(results: Results, cell: Cell, trial: int) -> dict[str, Any]:
-    """The row of a trial in the campaign's tables, by column. Raises InputError if its file is missing or damaged."""
-    shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
-    return {name: column[trial - shard.first] for name, column in results.table(shard).items()}
 
 
 def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> list[str]:
@@ -411,7 +354,9 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
 
     A row describes the time until the trial ended, so it does not matter whether obstacles then stopped the robot.
     """
-    was, now = row(results, cell, trial), results.trials.outcomes(again).columns()
+    shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
+    was = {name: column[trial - shard.first] for name, column in results.table(shard).items()}
+    now = results.trials.outcomes(again).columns()
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"
         for name, value in now.items()

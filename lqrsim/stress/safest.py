@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_array, check_count, check_items, check_kind, check_seed, check_text, keep
+from lqrsim.annotations import Bounds, Line, Seed, Want, checked
+from lqrsim.errors import InputError, check_array, keep
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -21,6 +23,7 @@ from lqrsim.stress.statistics import rate as rate_of
 SAME = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class ComparedPlan:
     """A plan that was compared.
@@ -31,16 +34,15 @@ class ComparedPlan:
       successes: whether each of the common trials reached the goal, (K,).
     """
 
-    start: str
+    start: Line
     solution: Solution
     successes: npt.NDArray[np.bool_]
 
     def __post_init__(self) -> None:
-        check_text("ComparedPlan: start", self.start, "the name of a start", at_most=1000, empty=True)
-        check_kind("ComparedPlan: solution", self.solution, Solution, "a Solution")
         keep(self, successes=check_array("ComparedPlan: successes", self.successes, (None,)) != 0)
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SafestPlan:
     """The plan with which most of the common trials reached the goal.
@@ -53,33 +55,29 @@ class SafestPlan:
     """
 
     solution: Solution
-    compared: tuple[ComparedPlan, ...]
+    compared: Annotated[tuple[ComparedPlan, ...], Want("a tuple of ComparedPlan")]
     reached: Estimate
-
-    def __post_init__(self) -> None:
-        check_kind("SafestPlan: solution", self.solution, Solution, "a Solution")
-        keep(self, compared=check_items("SafestPlan: compared", self.compared, ComparedPlan, "a tuple of ComparedPlan"))
-        check_kind("SafestPlan: reached", self.reached, Estimate, "an Estimate")
 
     def summary(self) -> str:
         """The success rate, and a line for each plan with its cost and successes."""
         lines = [f"{100 * self.reached.value:.1f} % of fresh trials reach the goal with the first of these plans:"]
         for plan in self.compared:
-            found = f"{int(plan.successes.sum())} of {len(plan.successes)} trials"
-            lines.append(f"  {plan.start}: cost {plan.solution.cost:.6g}, {found}")
+            count = f"{int(plan.successes.sum())} of {len(plan.successes)} trials"
+            lines.append(f"  {plan.start}: cost {plan.solution.cost:.6g}, {count}")
         return "\n".join(lines)
 
     __str__ = summary
 
 
+@checked
 def smooth_safest(
     problem: Problem,
     plant: Plant,
     disturbances: Sequence[Disturbance | Noise],
     *,
-    trials: int = 200,
+    trials: Annotated[int, Bounds(at_least=1, at_most=MOST_TRIALS)] = 200,
     starts: int | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     goal_radius: float | None = None,
     goal_tolerance: float | None = None,
     threads: int | None = None,
@@ -103,33 +101,32 @@ def smooth_safest(
     Raises:
       InputError: as `smooth` and `simulate`, or no candidate converges.
     """
-    count, seed = check_count("trials", trials, at_most=MOST_TRIALS), check_seed("seed", seed)
     first = smooth(problem, starts=starts, threads=threads)
-    found: list[tuple[str, Solution]] = []
+    plans: list[tuple[str, Solution]] = []
     for candidate in first.candidates:
         plan = candidate.trajectory
         if not plan.finite:
             continue
         one = first if candidate.status is not None and candidate.cost == first.cost else smooth(problem, start=plan)
-        if one.success and not any(_same(one, other) for _, other in found):
-            found.append((candidate.start, replace(one, candidates=first.candidates)))
-    if not found and first.success:
-        found.append(("the search's own", first))
-    if not found:
+        if one.success and not any(_same(one, other) for _, other in plans):
+            plans.append((candidate.start, replace(one, candidates=first.candidates)))
+    if not plans and first.success:
+        plans.append(("the search's own", first))
+    if not plans:
         raise InputError(f"problem: got no converged plan ({first.status.name}), want a problem that can be solved")
 
     def reached(solution: Solution, begin: int) -> npt.NDArray[np.bool_]:
         run = simulate(
-            plant, solution, disturbances=disturbances, seed=seed, trials=count, first_trial=begin, threads=threads,
+            plant, solution, disturbances=disturbances, seed=seed, trials=trials, first_trial=begin, threads=threads,
             goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=False, contacts=False,
         )  # fmt: skip
         return np.array([one == "reached" for one in run.outcome])
 
-    compared = [ComparedPlan(start, one, reached(one, 0)) for start, one in found]
+    compared = [ComparedPlan(start, one, reached(one, 0)) for start, one in plans]
     compared.sort(key=lambda plan: (-int(plan.successes.sum()), plan.solution.cost))
     best = compared[0].solution
-    fresh = int(reached(best, count).sum())
-    return SafestPlan(solution=best, compared=tuple(compared), reached=rate_of(fresh, count))
+    fresh = int(reached(best, trials).sum())
+    return SafestPlan(solution=best, compared=tuple(compared), reached=rate_of(fresh, trials))
 
 
 def _same(one: Solution, other: Solution) -> bool:

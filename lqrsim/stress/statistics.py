@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import checked
-from lqrsim.errors import Array, InputError, check_array, check_count, check_function, check_number, check_seed, excerpt
+from lqrsim.annotations import Bounds, Chance, Count, Index, Seed, Want, checked
+from lqrsim.errors import Array, InputError, check_array, excerpt
 
 CONFIDENCE = 0.95
 
@@ -27,23 +27,18 @@ class Estimate:
         return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"
 
 
-def rate(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """A success rate with its exact (Clopper-Pearson) interval, whose coverage is at least the confidence."""
-    return _rate(successes, trials, confidence, "exact")
+@checked
+def rate(
+    successes: Index, trials: Count, *, confidence: Chance = CONFIDENCE, method: Literal["exact", "wilson"] = "exact"
+) -> Estimate:
+    """A success rate with its exact (Clopper-Pearson) interval, whose coverage is at least the confidence.
 
-
-def wilson(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """A success rate with Wilson's interval, for plots: it is narrower, and its coverage is right on average."""
-    return _rate(successes, trials, confidence, "wilson")
-
-
-def _rate(successes: int, trials: int, confidence: float, method: Literal["exact", "wilson"]) -> Estimate:
+    Wilson's interval is for plots: it is narrower, and its coverage is right on average.
+    """
     from scipy import stats  # in functions here: it takes half a second to import, and much of lqrsim.stress needs none
 
-    check_count("trials", trials)
-    if check_count("successes", successes, at_least=0) > trials:
+    if successes > trials:
         raise InputError(f"successes: got {successes}, want at most the {trials} trials")
-    check_number("confidence", confidence, above=0, below=1)
     interval = stats.binomtest(successes, trials).proportion_ci(confidence, method=method)
     return Estimate(successes / trials, float(interval.low), float(interval.high), confidence)
 
@@ -82,7 +77,10 @@ def _flags(field: str, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     return array.astype(bool)
 
 
-def paired_difference(only_first: int, only_second: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
+@checked
+def paired_difference(
+    only_first: Index, only_second: Index, trials: Count, *, confidence: Chance = CONFIDENCE
+) -> Estimate:
     """The difference of the success rates of two policies on the same trials, with Tango's score interval.
 
     The interval contains each difference that the score test does not reject, with the fractions that are most likely
@@ -94,11 +92,9 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
     """
     from scipy import stats
 
-    check_count("trials", trials)
-    apart = check_count("only_first", only_first, at_least=0) + check_count("only_second", only_second, at_least=0)
+    apart = only_first + only_second
     if apart > trials:
         raise InputError(f"trials: got {trials}, want at least the {apart} in which only one succeeded")
-    check_number("confidence", confidence, above=0, below=1)
     surplus, z = only_first - only_second, float(stats.norm.ppf(0.5 + confidence / 2))
 
     def accepted(difference: float) -> bool:
@@ -130,7 +126,7 @@ def independent_difference(
     """
     from scipy import stats
 
-    one, other = (wilson(*counts, confidence=confidence) for counts in (first, second))
+    one, other = (rate(*counts, confidence=confidence, method="wilson") for counts in (first, second))
     value = one.value - other.value
     low = value - float(np.hypot(one.value - one.low, other.high - other.value))
     high = value + float(np.hypot(one.high - one.value, other.value - other.low))
@@ -146,14 +142,14 @@ def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> f
     return inside
 
 
-def mean(sample: npt.ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
+@checked
+def mean(sample: npt.ArrayLike, *, confidence: Chance = CONFIDENCE) -> Estimate:
     """The mean of a sample (K,) with Student's interval."""
     from scipy import stats
 
     numbers = check_array("sample", sample, (None,))
     if len(numbers) < 2:
         raise InputError(f"sample: got {len(numbers)} numbers, want at least 2")
-    check_number("confidence", confidence, above=0, below=1)
     reach = stats.t.ppf(0.5 + confidence / 2, len(numbers) - 1) * numbers.std(ddof=1) / np.sqrt(len(numbers))
     middle = float(numbers.mean())
     return Estimate(middle, middle - float(reach), middle + float(reach), confidence)
@@ -169,12 +165,13 @@ def holm(p_values: npt.ArrayLike) -> Array:
     return adjusted
 
 
+@checked
 def bootstrap(
-    statistic: Callable[..., Array | float],
+    statistic: Annotated[Callable[..., Array | float], Want("a function of the samples and axis")],
     *samples: npt.ArrayLike,
-    confidence: float = CONFIDENCE,
-    resamples: int = 10_000,
-    seed: int = 0,
+    confidence: Chance = CONFIDENCE,
+    resamples: Annotated[int, Bounds(at_least=1, at_most=1_000_000)] = 10_000,
+    seed: Seed = 0,
 ) -> Estimate:
     """A statistic of paired samples, (K,) each, with its percentile bootstrap interval.
 
@@ -182,19 +179,13 @@ def bootstrap(
       statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example `lambda a, b, axis:
         a.mean(axis) / b.mean(axis)`.
       samples: numbers (K,); row i of each belongs to the same trial.
-      confidence: confidence of the interval.
       resamples: number of bootstrap samples.
-      seed: seed of the resampling.
     """
     from scipy import stats
 
     arrays = [check_array("samples", sample, (None,)) for sample in samples]
     if not arrays or any(len(array) != len(arrays[0]) for array in arrays) or len(arrays[0]) < 2:
         raise InputError(f"samples: got lengths {[len(array) for array in arrays]}, want one length of at least 2")
-    check_function("statistic", statistic, "a function of the samples and axis", optional=False)
-    check_number("confidence", confidence, above=0, below=1)
-    check_count("resamples", resamples, at_most=1_000_000)
-    seed = check_seed("seed", seed)
     try:
         value = float(statistic(*arrays, axis=0))
     except (TypeError, ValueError) as error:

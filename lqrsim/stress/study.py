@@ -13,23 +13,12 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from lqrsim.errors import (
-    InputError,
-    check_count,
-    check_items,
-    check_kind,
-    check_name,
-    check_number,
-    check_seed,
-    check_text,
-    excerpt,
-    keep,
-    keep_positive,
-)
+from lqrsim.annotations import Count, Index, Line, NonNegative, OneOf, Positive, Seed, Want, checked
+from lqrsim.errors import InputError, check_kind, check_name, excerpt, keep
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.packaged import Scenario
@@ -47,7 +36,12 @@ from lqrsim.stress.policies import (
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
 
+Name = Annotated[str, Want("a name")]
+SetName = Annotated[str, Want("a name, such as 'light'")]
+Disturbances = Annotated[tuple[Disturbance, ...], Want("a tuple of disturbances, such as (ControlNoise(0.05),)")]
 
+
+@checked
 @dataclass(frozen=True)
 class Cell:
     """A combination of policy, disturbances and strength. All cells use the same random numbers.
@@ -58,30 +52,19 @@ class Cell:
       strength: factor by which they are scaled, 0 or more.
     """
 
-    policy: str
-    sweep: str
-    strength: float
-
-    def __post_init__(self) -> None:
-        for name in ("policy", "sweep"):
-            check_text(f"Cell: {name}", getattr(self, name), "a name")
-        keep(self, strength=check_number("Cell: strength", self.strength, at_least=0.0))
+    policy: Name
+    sweep: Name
+    strength: NonNegative
 
     def __str__(self) -> str:
         return f"{self.policy},{self.sweep},{self.strength:g}"
 
     @classmethod
-    def named(cls, text: str, cells: Sequence["Cell"]) -> "Cell":
-        """The cell of a number or of a text, policy,sweep,strength.
-
-        Args:
-          text: the number, from 0, or the three parts separated by commas.
-          cells: the cells to choose from.
-        """
-        cells = check_items("cells", cells, Cell, "a list of Cell")
+    @checked
+    def named(cls, text: Line, cells: Annotated[Sequence["Cell"], Want("a list of Cell")]) -> "Cell":
+        """The cell of a text: its number, from 0, or policy,sweep,strength."""
         if not cells:
             raise InputError("cells: got none, want at least one")
-        check_kind("cell", text, str, f"text: a number from 0 to {len(cells) - 1}, or as {cells[0]}")
         if text.isdecimal() and len(text) < 10 and int(text) < len(cells):
             return cells[int(text)]
         for cell in cells:
@@ -90,17 +73,14 @@ class Cell:
         raise InputError(f"cell: got {excerpt(text)}, want 0 to {len(cells) - 1}, or as {cells[0]} to {cells[-1]}")
 
 
+@checked
 @dataclass(frozen=True)
 class Shard:
     """Consecutive trials of a cell that are run together and stored in one file."""
 
-    cell: int
-    first: int
-    count: int
-
-    def __post_init__(self) -> None:
-        for name, least in (("cell", 0), ("first", 0), ("count", 1)):
-            check_count(f"Shard: {name}", getattr(self, name), at_least=least)
+    cell: Index
+    first: Index
+    count: Count
 
     @property
     def file(self) -> str:
@@ -108,6 +88,7 @@ class Shard:
         return f"{self.cell:04d}-{self.first:09d}.parquet"
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Setup:
     """What every study of a scenario states, of one policy or of many: the base of `Study` and `Campaign`.
@@ -124,21 +105,20 @@ class Setup:
       seed: seed of all random numbers.
     """
 
-    scenario: str
+    _prefix = ""
+
+    scenario: Annotated[str, Want("a reference, such as 'quadrotor'"), 10_000]
     _: KW_ONLY
     solution: Solution | str | os.PathLike[str] | None = None
     design_disturbances: tuple[Disturbance, ...] | str | None = None
-    goal_radius: float | None = None
-    goal_tolerance: float | None = None
-    seed: int = 0
+    goal_radius: Positive | None = None
+    goal_tolerance: Positive | None = None
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
-        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
         keep(self, scenario=from_anywhere(self.scenario))  # workers and reports may run in other folders
         kinds = (Solution, str, os.PathLike, type(None))
         check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
-        keep_positive(self, "goal_radius", "goal_tolerance")
-        keep(self, seed=check_seed("seed", self.seed))
 
     @cached_property
     def resolved(self) -> Scenario:
@@ -157,6 +137,7 @@ class Setup:
         return self.resolved.near_enough(self.goal_radius, self.goal_tolerance)
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Study(Setup):
     """A policy of a scenario under disturbances. The scenario is solved when first needed.
@@ -168,24 +149,20 @@ class Study(Setup):
       policy: as in `Campaign`.
     """
 
-    design_disturbances: str | None = None
-    sweep: str = "scenario"
-    strength: float = 1.0
-    policy: str = "smooth"
+    design_disturbances: SetName | None = None
+    sweep: SetName = "scenario"
+    strength: Positive = 1.0
+    policy: Annotated[str, OneOf(POLICIES)] = "smooth"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_text("sweep", self.sweep, "a name, such as 'light'")
-        keep(self, strength=check_number("strength", self.strength, above=0.0))
-        check_name("policy", self.policy, POLICIES)
         if self.design_disturbances is not None:
             check_designed((self.policy,))
-            check_text("design_disturbances", self.design_disturbances, "a name, such as 'light'")
 
     @cached_property
     def disturbances(self) -> list[Disturbance]:
         """The disturbances of the set, scaled by the strength. Raises InputError if there is no such set."""
-        return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
+        return [kind.scaled(self.strength) for kind in disturbance_set(self.sweep, self.resolved)]
 
     @cached_property
     def closed_loop(self) -> dict[str, Any]:
@@ -198,6 +175,7 @@ class Study(Setup):
         return {"plant": plant, "solution": solution, "controller": controller, **goal}
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Campaign(Setup):
     """A stress test: trials of policies under disturbances of growing strength.
@@ -215,54 +193,38 @@ class Campaign(Setup):
       time_limit: seconds after which a shard counts as hung and its trials as errors.
     """
 
-    design_disturbances: tuple[Disturbance, ...] | None = None
-    sweeps: Mapping[str, tuple[Disturbance, ...]]
-    strengths: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0)
-    policies: tuple[str, ...] = DEFAULT_POLICIES
-    trials: int = 200
-    replan_every: float | None = None
-    shard: int = 500
-    time_limit: float = 300.0
+    design_disturbances: Disturbances | None = None
+    sweeps: Mapping[str, Disturbances]
+    strengths: tuple[NonNegative, ...] = (0.0, 0.5, 1.0, 1.5, 2.0)
+    policies: tuple[Annotated[str, OneOf(CAMPAIGN_POLICIES)], ...] = DEFAULT_POLICIES
+    trials: Count = 200
+    replan_every: Positive | None = None
+    shard: Count = 500
+    time_limit: Positive = 300.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.sweeps, Mapping) or not self.sweeps:
-            raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
-        wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
+        if not self.sweeps:
+            raise InputError("sweeps: got none, want at least one: name -> disturbances")
         for name in self.sweeps:
-            check_text("sweeps: name", name, "a name without a comma")
-            if "," in name:
+            if "," in name or not name:
                 raise InputError(f"sweeps: got the name {excerpt(name)}, want one without a comma")
-        sweeps = self.sweeps.items()
-        keep(self, sweeps={name: check_items(f"sweeps: {name}", some, Disturbance, wanted) for name, some in sweeps})
-        strengths = check_items("strengths", self.strengths, object, "a tuple of numbers", at_most=1000)
-        keep(self, strengths=tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths))
-        policies = check_items(
-            "policies", self.policies, object, f"a tuple of {', '.join(CAMPAIGN_POLICIES)}", at_most=100
-        )
-        keep(self, policies=tuple(check_name("policies", policy, CAMPAIGN_POLICIES) for policy in policies))
         for field in ("strengths", "policies"):
             values = getattr(self, field)
             if not values or len(set(values)) < len(values):
                 raise InputError(f"{field}: got {excerpt(values)}, want at least one entry, each at most once")
         if self.design_disturbances is not None:
             check_designed(self.policies)
-            design = check_items("design_disturbances", self.design_disturbances, Disturbance, wanted)
-            if not design:
+            if not self.design_disturbances:
                 raise InputError(
                     "design_disturbances: got none, want at least one disturbance, or None for the default"
                 )
-            keep(self, design_disturbances=design)
-        for field in ("trials", "shard"):
-            keep(self, **{field: check_count(field, getattr(self, field))})
         files = -(-self.trials // self.shard) * len(self.cells)
         if files > _MOST_FILES:
             raise InputError(
                 f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which takes {files}"
                 f" files, want at most {_MOST_FILES}: fewer trials, or larger shards"
             )
-        keep_positive(self, "replan_every")
-        keep(self, time_limit=check_number("time_limit", self.time_limit, above=0.0))
 
     @classmethod
     def of_sets(cls, setup: Setup, sets: Sequence[str], *, policies: Sequence[str] = (), **options: Any) -> "Campaign":
@@ -292,13 +254,9 @@ class Campaign(Setup):
         combinations = itertools.product(self.sweeps, self.strengths, self.policies)
         return [Cell(policy, sweep, strength) for sweep, strength, policy in combinations]
 
+    @checked
     def disturbances(self, cell: Cell) -> list[Disturbance]:
-        """The disturbances of a cell's trials.
-
-        Args:
-          cell: one of the campaign's cells.
-        """
-        check_kind("cell", cell, Cell, "a Cell of the campaign")
+        """The disturbances of a cell's trials."""
         check_name("cell: sweep", cell.sweep, self.sweeps)
         return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
@@ -306,33 +264,30 @@ class Campaign(Setup):
         """The campaign as plain data without its solution, from which `from_json` makes it again."""
         design = self.design_disturbances
         fields = {name: getattr(self, name) for name in CAMPAIGN_FIELDS} | {
-            "sweeps": {name: disturbances_as_json(disturbances) for name, disturbances in self.sweeps.items()},
+            "sweeps": {name: disturbances_as_json(sweep) for name, sweep in self.sweeps.items()},
             "design_disturbances": None if design is None else disturbances_as_json(design),
         }
         return json.loads(json.dumps(fields))
 
     @classmethod
+    @checked
     def from_json(
         cls, fields: Mapping[str, Any], scenario: Scenario, solution: str | os.PathLike[str] | None = None
     ) -> "Campaign":
         """The campaign that `as_json` describes.
 
-        Args:
-          fields: the result of `as_json`.
-          scenario: its scenario, which is resolved before because this may define disturbances.
-          solution: the path of its solution.
+        Its scenario is resolved before, because this may define disturbances.
         """
-        check_kind("campaign", fields, Mapping, "what lqrsim wrote")
         try:
             design = fields["design_disturbances"]
-            sweeps = {name: disturbances_from_json(some) for name, some in fields["sweeps"].items()}
+            sweeps = {name: disturbances_from_json(sweep) for name, sweep in fields["sweeps"].items()}
             design = None if design is None else disturbances_from_json(design)
             campaign = cls(**{**fields, "solution": solution, "sweeps": sweeps, "design_disturbances": design})
         except InputError:
             raise
         except Exception as error:  # a disturbance may raise anything for settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want one that lqrsim wrote ({error})") from None
-        keep(campaign, resolved=check_kind("scenario", scenario, Scenario, "the campaign's Scenario"))
+        keep(campaign, resolved=scenario)
         return campaign
 
 
@@ -341,17 +296,14 @@ CAMPAIGN_FIELDS = tuple(one.name for one in dataclasses.fields(Campaign) if one.
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:
     """The kind and the settings of each disturbance. Raises InputError if a setting is not plain data."""
-    return [_disturbance_as_json(one) for one in disturbances]
-
-
-def _disturbance_as_json(disturbance: Disturbance) -> dict[str, Any]:
-    if not dataclasses.is_dataclass(disturbance):
-        raise InputError(f"{type(disturbance).__name__}: got a class that is no dataclass, want a dataclass")
-    settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}
-    return {
-        "kind": type(disturbance).__qualname__,
-        "settings": {name: _as_json(value) for name, value in settings.items()},
-    }
+    items = list[dict[str, Any]]()
+    for disturbance in disturbances:
+        if not dataclasses.is_dataclass(disturbance):
+            raise InputError(f"{type(disturbance).__name__}: got a class that is no dataclass, want a dataclass")
+        names = [field.name for field in dataclasses.fields(disturbance) if field.init]
+        settings = {name: _as_json(getattr(disturbance, name)) for name in names}
+        items.append({"kind": type(disturbance).__qualname__, "settings": settings})
+    return items
 
 
 def _as_json(value: Any) -> Any:

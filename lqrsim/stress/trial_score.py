@@ -6,25 +6,15 @@ space of reliability analysis. The score is its limit-state function with the op
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from lqrsim.annotations import Count, Index, Want, checked
 from lqrsim.control.controllers import ControllerLike
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_flag,
-    check_function,
-    check_items,
-    check_kind,
-    excerpt,
-    shaped,
-)
+from lqrsim.errors import Array, InputError, check_array, excerpt, shaped
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate
@@ -116,21 +106,18 @@ class _CountedDraws(PrescribedDraws):
 LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
 
 
-def collision_score(rollout: Rollout, *, first: int = 0) -> Array:
+@checked
+def collision_score(rollout: Rollout, *, first: Index = 0) -> Array:
     """The depth in metres to which each trial enters obstacles, (K,); minus the least clearance without a collision.
 
     The score is positive exactly for trials that collide, diverge or have a failing controller; infinite for the latter
     two. The depth needs a rollout without contacts, in which the robot moves through the obstacles.
 
     Args:
-      rollout: K trials.
       first: the first knot whose clearance counts in trials without a collision. See `TrialScore`.
-
-    Returns:
-      (K,), in metres; positive if the trial fails.
     """
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    first = check_count("first", first, at_least=0, at_most=rollout.plan.steps)
+    if first > rollout.plan.steps:
+        raise InputError(f"first: got {first}, want a whole number from 0 to {rollout.plan.steps}")
     depth = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
     outcome = np.array(rollout.outcome)
     clearance = np.where(rollout.counts, rollout.clearance, np.inf)[:, first:].min(axis=1)
@@ -138,16 +125,15 @@ def collision_score(rollout: Rollout, *, first: int = 0) -> Array:
     return np.where(np.isin(outcome, ("diverged", "error")), np.inf, score)
 
 
-def miss_score(rollout: Rollout, *, first: int = 0) -> Array:
+@checked
+def miss_score(rollout: Rollout, *, first: Index = 0) -> Array:
     """The distance by which each trial misses its goal, or a larger `collision_score`, (K,); positive if it fails.
 
     The unit is metres; for a goal without a position, it is the scaled error by which the trial is judged.
 
     Args:
-      rollout: K trials.
       first: as in `collision_score`.
     """
-    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
     return np.maximum(collision_score(rollout, first=first), outside)
 
@@ -163,6 +149,7 @@ def _departure(clearance: Array) -> int:
     return first if first and clearance[:first].min() <= clearance[first:].min() else 0
 
 
+@checked
 @dataclass(eq=False)
 class TrialScore:
     """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
@@ -192,25 +179,21 @@ class TrialScore:
       simulations: number of trials that have been run.
     """
 
+    _prefix = ""
+
     plant: Plant
     solution: Solution
-    disturbances: Sequence[Disturbance]
+    disturbances: Annotated[Sequence[Disturbance], Want("disturbances, such as ControlNoise(0.05)")]
     controller: ControllerLike | None = None
-    failure: Callable[[Rollout], Array] = collision_score
+    failure: Annotated[Callable[[Rollout], Array], Want("a function of a Rollout")] = collision_score
     goal_radius: float | None = None
     goal_tolerance: float | None = None
     contacts: bool = False
-    batch: int = 256
+    batch: Count = 256
     threads: int | None = None
-    simulations: int = 0
+    simulations: Index = 0
 
     def __post_init__(self) -> None:
-        wanted = "disturbances, such as ControlNoise(0.05)"
-        self.disturbances = check_items("disturbances", self.disturbances, Disturbance, wanted)
-        check_function("failure", self.failure, "a function of a Rollout", arguments=1, optional=False)
-        self.contacts = check_flag("contacts", self.contacts)
-        check_count("batch", self.batch)
-        check_count("simulations", self.simulations, at_least=0)
         draws = [_CountedDraws() for _ in self.disturbances]
         usual = self._simulate(1, lambda trial, stream: draws[stream], frames=False)
         self.sizes = tuple(one.used for one in draws)
@@ -231,11 +214,7 @@ class TrialScore:
         return sum(self.sizes)
 
     def __call__(self, numbers: npt.ArrayLike) -> Array:
-        """The scores of trials with the given random numbers.
-
-        Args:
-          numbers: (K, size).
-        """
+        """The scores (K,) of trials with the given random numbers (K, size)."""
         vectors = check_array("numbers", numbers, (None, self.size))
         parts: Iterable[Array] = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
         scores = [self._score(self.rollout(part, frames=False)) for part in parts]
@@ -252,11 +231,9 @@ class TrialScore:
         return scores
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
-        """Run the trials with the given random numbers. The `seed` of the result means nothing.
+        """The trials with the given random numbers (K, size), with frames for drawing or without.
 
-        Args:
-          numbers: (K, size).
-          frames: whether to record for drawing.
+        Their `seed` means nothing.
         """
         vectors = check_array("numbers", numbers, (None, self.size))
         ends = np.cumsum((0, *self.sizes))
