@@ -6,20 +6,9 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-if TYPE_CHECKING:
-    from lqrsim.problem.problem import Problem
-    from lqrsim.results.coordinates import Coordinates
-    from lqrsim.results.funnel import Funnel
-    from lqrsim.results.rollout import Rollout
-    from lqrsim.results.solution import Solution
-    from lqrsim.scenarios.packaged import Scenario
-    from lqrsim.stress.data_table import DataTable
-    from lqrsim.stress.results import Results
-    from lqrsim.verify.verdict import Verification
+import lqrsim as ls
 
 Object = dict[str, Any]
 
@@ -29,7 +18,7 @@ def text_of(value: object) -> str:
     return json.dumps(_plain(value), allow_nan=False)
 
 
-def of_scenario(name: str, scenario: "Scenario") -> Object:
+def of_scenario(name: str, scenario: "ls.Scenario") -> Object:
     """A scenario, as in `lqrsim list`."""
     problem = scenario.problem
     return {
@@ -39,7 +28,7 @@ def of_scenario(name: str, scenario: "Scenario") -> Object:
     }  # fmt: skip
 
 
-def of_funnel(funnel: "Funnel") -> Object:
+def of_funnel(funnel: "ls.types.Funnel") -> Object:
     """Settings and levels of a funnel; the ellipsoids are in its file."""
     times = [knot * funnel.plan.dt for knot in funnel.knots]
     columns = {
@@ -50,12 +39,12 @@ def of_funnel(funnel: "Funnel") -> Object:
     return {**_fields(funnel, names), "knots": _rows(columns)}
 
 
-def of_solution(solution: "Solution") -> Object:
+def of_solution(solution: "ls.Solution") -> Object:
     """Status, log and certificate of a solution; the arrays are in its file."""
     plan, target = solution.trajectory, solution.target
     clearance = None
     if solution.clearance is not None:
-        knot = int(np.argmin(solution.clearance))
+        knot = int(solution.clearance.argmin())
         clearance = {"least": solution.clearance[knot], "time": plan.times[knot]}
     away = target.distance(plan.states[-1])
     names = (
@@ -71,7 +60,7 @@ def of_solution(solution: "Solution") -> Object:
     }
 
 
-def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
+def of_rollout(rollout: "ls.Rollout", problem: "ls.Problem | None" = None) -> Object:
     """The outcomes of a rollout's trials, as in the tables of a stress test.
 
     Args:
@@ -95,12 +84,12 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
     }
 
 
-def of_verification(found: "Verification") -> Object:
+def of_verification(found: "ls.types.Verification") -> Object:
     """All fields of a verification, including the positions in every frame."""
     return {**{one.name: getattr(found, one.name) for one in dataclasses.fields(found)}, "passed": found.passed}
 
 
-def of_campaign(results: "Results") -> Object:
+def of_campaign(results: "ls.stress.Results") -> Object:
     """The outcomes of each cell of a campaign so far."""
     from lqrsim.results.goal import OUTCOMES
 
@@ -121,7 +110,7 @@ def of_campaign(results: "Results") -> Object:
     }
 
 
-def of_table(table: "DataTable") -> list[Object]:
+def of_table(table: "ls.types.DataTable") -> list[Object]:
     """The rows of a table, by the names of its columns."""
     return _rows(table.columns)
 
@@ -136,13 +125,13 @@ def _rows(columns: Mapping[str, Any]) -> list[Object]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def _named(space: "Coordinates") -> list[Object]:
+def _named(space: "ls.types.Coordinates") -> list[Object]:
     return [{"name": name, "unit": unit} for name, unit in zip(space.names, space.units, strict=True)]
 
 
-def _plain(value: object) -> Any:
+def _plain(value: Any) -> Any:
     """Convert a value to types of JSON; null for numbers that are not finite."""
-    if isinstance(value, (np.ndarray, np.generic)):
+    if hasattr(value, "tolist"):  # an array or a number of NumPy
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None

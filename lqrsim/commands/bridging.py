@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+import lqrsim as ls
+from lqrsim.commands import console
 from lqrsim.commands.options import Json, optional, options_of, stated
 
 
@@ -42,19 +44,16 @@ class Bridge:
     def run(self) -> int:
         """Run the command. Returns the exit code."""
         from lqrsim import bridge
-        from lqrsim.commands import console
-        from lqrsim.errors import InputError
-        from lqrsim.results import save_load
 
         pairs = [pair.partition("=") for pair in self.names]
         if any(not (state and equals and name) for state, equals, name in pairs):
-            raise InputError(f"--names: got {' '.join(self.names)}, want pairs such as theta=heading")
+            raise ls.InputError(f"--names: got {' '.join(self.names)}, want pairs such as theta=heading")
         names = {state: name for state, _, name in pairs}
         if self.robot:
             return self._be_robot(names)
         if not self.safe:
-            raise InputError("--safe: got none, want the command for a robot that nobody controls, such as 0 0 0 0")
-        policy: Any = save_load.load(self.policy)
+            raise ls.InputError("--safe: got none, want the command for a robot that nobody controls, such as 0 0 0 0")
+        policy: Any = ls.load(self.policy)
         ran = bridge.run(policy, **stated(self, bridge.run, names=names))
         console.say(ran.summary())
         numbers = {"held": ran.held, "refused": ran.refused[0], "response": ran.response, "late": ran.late}
@@ -63,12 +62,10 @@ class Bridge:
 
     def _be_robot(self, names: dict[str, str]) -> int:
         from lqrsim import bridge
-        from lqrsim.commands import console
-        from lqrsim.simulation.closed_loop import simulate
 
         solution, scenario = console.load_with_scenario(self.policy, self.scenario)
         with bridge.SimulatedRobot(solution, **stated(self, bridge.SimulatedRobot, names=names)) as robot:
-            rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough())
+            rollout = ls.simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough())
         console.say(rollout.summary())
         console.say(robot.summary())
         console.result(outcome=rollout.outcome, round_trips=robot.round_trips)

@@ -11,17 +11,13 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import lqrsim as ls
 from lqrsim import process
 from lqrsim.commands import as_json
-from lqrsim.errors import InputError
-from lqrsim.results.archive import excerpt_of
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from lqrsim.results.solution import Solution
-    from lqrsim.results.solution_parts import Iteration
-    from lqrsim.scenarios.packaged import Scenario
 
 # The result that the running command prints with `--json`; None without.
 _RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
@@ -98,6 +94,8 @@ def say(text: str = "") -> None:
 
 def check_output(field: str, folder: Path, name: str = "") -> None:
     """Check before the work starts that `folder`, or the file `name` in it, can be written."""
+    from lqrsim.results.archive import excerpt_of
+
     existing = folder.absolute()
     while not os.path.exists(existing) and existing != existing.parent:
         existing = existing.parent
@@ -108,7 +106,7 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
     except (OSError, ValueError) as error:
         reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
         place = excerpt_of(folder / name)
-        raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
+        raise ls.InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
 
 
 @contextlib.contextmanager
@@ -122,7 +120,7 @@ def keeping(write: Callable[[Any], object]) -> Iterator[None]:
         raise
 
 
-def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "Solution":
+def solve(scenario: "ls.Scenario", solver: str = "smooth", **options: object) -> "ls.Solution":
     """Solve a scenario; print iterations as they end, then the status. The options are the solver's options.
 
     Of the hundredth to the thousandth iteration every tenth is printed, then every hundredth, and so on.
@@ -132,7 +130,7 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
 
     count = 0
 
-    def show(iteration: "Iteration") -> None:
+    def show(iteration: Iteration) -> None:
         nonlocal count
         count += 1
         if count % 10 ** max(len(str(count)) - 2, 0) == 0:
@@ -144,15 +142,13 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
     return solution
 
 
-def load_with_scenario(path: Path, named: str | None) -> "tuple[Solution, Scenario]":
+def load_with_scenario(path: Path, named: str | None) -> "tuple[ls.Solution, ls.Scenario]":
     """The solution in a file, and its scenario: the named one, else its own if `lqrsim list` has it."""
-    from lqrsim.results import save_load
-    from lqrsim.results.solution import Solution
     from lqrsim.scenarios.references import resolve
 
-    solution = save_load.load(path, Solution)
+    solution = ls.load(path, ls.Solution)
     if not named and not solution.scenario:
-        raise InputError(
+        raise ls.InputError(
             "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
         )
     return solution, resolve(named or solution.scenario, registered_only=not named).settled(solution)

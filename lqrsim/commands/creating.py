@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import lqrsim as ls
+from lqrsim.commands import console
 from lqrsim.commands.options import Json, optional
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
@@ -36,8 +38,6 @@ class New:
     """Folder in which the robot's folder is made."""
 
     def run(self) -> int:
-        from lqrsim.commands import console
-        from lqrsim.errors import InputError
         from lqrsim.results.archive import excerpt_of
 
         check_robot_name(self.name)
@@ -46,9 +46,9 @@ class New:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            raise InputError(f"name: got {self.name!r}, want one without a folder {excerpt_of(folder)}") from None
+            raise ls.InputError(f"name: got {self.name!r}, want one without a folder {excerpt_of(folder)}") from None
         except OSError as error:
-            raise InputError(
+            raise ls.InputError(
                 f"--out: got {excerpt_of(self.out)}, want a folder that can be written ({error})"
             ) from None
         for template in sorted(TEMPLATES.glob("*.*")):
@@ -104,13 +104,12 @@ class Export:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.errors import InputError
 
         if (self.c is None) == (self.minari is None):
-            raise InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
+            raise ls.InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
         unused, target = (OF_C, "--c") if self.c is None else (OF_MINARI, "--minari")
         if given := [one.name for one in fields(self) if one.name in unused and getattr(self, one.name) != one.default]:
-            raise InputError(f"--{given[0]}: got {getattr(self, given[0])} without {target}, want it with that")
+            raise ls.InputError(f"--{given[0]}: got {getattr(self, given[0])} without {target}, want it with that")
         if self.c is not None:
             self._to_c(self.c)
         if self.minari is not None:
@@ -118,13 +117,10 @@ class Export:
         return 0
 
     def _to_c(self, folder: Path) -> None:
-        from lqrsim.commands import console
-        from lqrsim.results import save_load
-        from lqrsim.results.export_c import export_c
 
         console.check_output("--c", folder)
-        policy: Any = save_load.load(self.source)  # `export_c` refuses anything that cannot be exported
-        found = export_c(
+        policy: Any = ls.load(self.source)  # `export_c` refuses anything that cannot be exported
+        found = ls.export_c(
             policy, folder, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
         )
         for path in found.files:
@@ -133,29 +129,23 @@ class Export:
         console.result(sha256=found.sha256, table_bytes=found.table_bytes, rounding=found.rounding)
 
     def _to_minari(self, name: str) -> None:
-        from lqrsim.commands import console
-        from lqrsim.errors import InputError
-        from lqrsim.results import save_load
-        from lqrsim.results.rollout import Rollout
-        from lqrsim.stress.results import Results, replay
-        from lqrsim.stress.study import Cell
 
         try:
             from lqrsim.gym import make_env, write_minari
         except ImportError as error:
-            raise InputError(f"--minari: {error}, and 'lqrsim[minari]'") from None
+            raise ls.InputError(f"--minari: {error}, and 'lqrsim[minari]'") from None
         if self.source.is_dir():
-            results = Results(self.source, scenario=self.scenario)
-            cells = [Cell.named(one, results.cells) for one in self.cell] or results.cells
+            results = ls.stress.Results(self.source, scenario=self.scenario)
+            cells = [ls.stress.Cell.named(one, results.cells) for one in self.cell] or results.cells
             shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
-            runs = (replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
+            runs = (ls.stress.replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
             named = self.scenario or results.manifest["campaign"]["scenario"]
             _ = results.resolved  # raises an exception if that is code which was not named
         else:
             if self.cell:
-                raise InputError(f"--cell: got {self.cell[0]} with {self.source}, want the folder of a stress test")
-            runs = save_load.load(self.source, Rollout)
+                raise ls.InputError(f"--cell: got {self.cell[0]} with {self.source}, want the folder of a stress test")
+            runs = ls.load(self.source, ls.Rollout)
             solution = self.solution or self.source.with_name("solution.npz")
             named = self.scenario or console.load_with_scenario(solution, None)[0].scenario
         # A path as text, from which `recover_environment` can make it.
@@ -168,20 +158,20 @@ class Export:
 
 def check_robot_name(name: str) -> None:
     """Raise InputError unless a new module can have this name."""
-    from lqrsim.errors import InputError, excerpt
+    from lqrsim.errors import excerpt
 
     wanted = "lower-case letters, digits and underscores, beginning with a letter, such as my_robot"
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
-        raise InputError(f"name: got {excerpt(name)}, want {wanted}")
+        raise ls.InputError(f"name: got {excerpt(name)}, want {wanted}")
     reserved = TAKEN | {one.lower() for one in (*dir(builtins), *keyword.kwlist)}
     if name in reserved:
-        raise InputError(
+        raise ls.InputError(
             f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another name"
         )
     found = importlib.util.find_spec(name)
     if found is not None and found.origin is not None:  # a folder without modules has no origin
-        raise InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")
+        raise ls.InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")
 
 
 def next_commands(name: str, folder: Path) -> list[list[str]]:

@@ -29,12 +29,6 @@ TABLE = (
 def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick: bool) -> int:
     """Run the demo for each scenario.
 
-    Args:
-      references: the scenarios; see `scenarios/references.py`.
-      out: folder that gets a folder for each scenario.
-      seed: seed of the disturbances.
-      video: whether to render videos. quick: small videos with fewer frames.
-
     Returns:
       1 if a plan did not converge, or an undisturbed run left its plan by more than the scenario's bound; else 0.
     """

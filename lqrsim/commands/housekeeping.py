@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+import lqrsim as ls
+from lqrsim.commands import console
 from lqrsim.commands.options import Json
 
 
@@ -85,8 +87,6 @@ class Cache:
 
     def run(self) -> int:
         from lqrsim.codegen import disk_cache
-        from lqrsim.commands import console
-        from lqrsim.errors import InputError
 
         if self.clear:
             try:
@@ -94,7 +94,7 @@ class Cache:
                 console.say(f"removed {removed} items from {disk_cache.folder()}")
                 console.result(removed=removed, folder=disk_cache.folder())
             except OSError as error:
-                raise InputError(
+                raise ls.InputError(
                     f"--clear: got {disk_cache.folder()}, want files that can be removed ({error})"
                 ) from None
             return 0

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, Suppress, arg
 
+import lqrsim as ls
+from lqrsim.commands import as_json, console
 from lqrsim.commands.options import Folder, Json, OwnScenario, StudyOptions, optional, options_of, stated
 
 if TYPE_CHECKING:
     from lqrsim.results.funnel import Funnel
-    from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, SmallestFailure
+    from lqrsim.stress.failure_search import RareFailures, SmallestFailure
     from lqrsim.stress.hardening import HardenedPlan
 
 
@@ -30,12 +32,9 @@ class FailureOptions(StudyOptions):
     """Output folder. By default runs/, the name of the command, and the name of the scenario."""
 
     def run(self) -> int:
-        from lqrsim.commands import console
         from lqrsim.scenarios.references import folder_name
-        from lqrsim.stress.failure_search import ReliabilityProblem
-        from lqrsim.stress.multilevel_splitting import NoFailure
 
-        problem = ReliabilityProblem(**stated(self, ReliabilityProblem))
+        problem = ls.stress.ReliabilityProblem(**stated(self, ls.stress.ReliabilityProblem))
         folder = self.out or Path("runs") / type(self).__name__.lower() / folder_name(problem.resolved)
         console.check_output("--out", folder)
 
@@ -45,13 +44,13 @@ class FailureOptions(StudyOptions):
         try:
             with console.keeping(write), console.progress(*self.SEARCH) as progress:
                 found = self._search(problem, report=console.say, progress=progress)
-        except NoFailure as none:
+        except ls.stress.NoFailure as none:
             return _say_none(none)
         return write(found)
 
     SEARCH: ClassVar[tuple[str, str]]  # what the command does, and in which units, for its progress
 
-    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> Any:
+    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> Any:
         """The result of the search, with these callbacks."""
         raise NotImplementedError
 
@@ -79,12 +78,11 @@ class Rare(FailureOptions):
 
     SEARCH = "splitting", "repetition"
 
-    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "RareFailures":
+    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "RareFailures":
         _check_shown(self.shown)
         return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
 
     def _write(self, found: "RareFailures", folder: Path) -> int:
-        from lqrsim.commands import console
 
         console.say(found.summary())
         failures = len(found.splitting.failures)
@@ -110,11 +108,10 @@ class Break(FailureOptions):
 
     SEARCH = "searching", "round"
 
-    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
+    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
         return problem.smallest_failure(**stated(self, problem.smallest_failure, **callbacks))
 
     def _write(self, found: "SmallestFailure", folder: Path) -> int:
-        from lqrsim.commands import console
 
         console.say(found.summary())
         console.say(found.save(folder).summary())
@@ -146,14 +143,12 @@ class Harden(FailureOptions):
 
     SEARCH = "hardening", "repetition"
 
-    def _search(self, problem: "ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
-        from lqrsim.stress.hardening import harden
+    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
 
         _check_shown(self.shown)
-        return harden(problem, **stated(self, harden, **callbacks))
+        return ls.stress.harden(problem, **stated(self, ls.stress.harden, **callbacks))
 
     def _write(self, found: "HardenedPlan", folder: Path) -> int:
-        from lqrsim.commands import console
 
         console.say(found.verdict())
         shown, files = found.save(folder, shown=self.shown), ["solution.npz", "harden.json"]
@@ -183,18 +178,13 @@ class Certify:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands import console
-        from lqrsim.results import save_load
-        from lqrsim.results.certificate import FailureCertificate
-        from lqrsim.stress.multilevel_splitting import NoFailure
-        from lqrsim.stress.recheck import certify
 
-        certificate = save_load.load(self.file, FailureCertificate)
+        certificate = ls.load(self.file, ls.stress.FailureCertificate)
         console.say(certificate.summary())
         try:
             with console.progress("splitting", "repetition") as progress:
-                found = certify(certificate, **stated(self, certify, progress=progress))
-        except NoFailure as none:
+                found = ls.stress.certify(certificate, **stated(self, ls.stress.certify, progress=progress))
+        except ls.stress.NoFailure as none:
             return _say_none(none)
         console.say(found.summary())
         one = found.measured.probability
@@ -208,7 +198,6 @@ class Certify:
 
 
 def _say_none(none: Exception) -> int:
-    from lqrsim.commands import console
 
     console.say(f"no failure was found ({none})")
     console.result(found=None, reason=str(none))
@@ -223,7 +212,6 @@ def _check_shown(shown: int) -> None:
 
 def _wrote(folder: Path, result: str, files: Sequence[str]) -> None:
     """Say which files were written. The result for `--json` is the content of one of them."""
-    from lqrsim.commands import console
 
     for name in files:
         console.wrote(folder / name)
@@ -257,15 +245,10 @@ class FunnelCommand(StudyOptions):
     """Output folder. By default runs/funnel/ and the name of the scenario."""
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
-        from lqrsim.results import save_load
         from lqrsim.scenarios.references import disturbance_set, folder_name
-        from lqrsim.simulation.disturbances import InitialStateError
-        from lqrsim.stress.funnels import funnel, level_test
-        from lqrsim.stress.study import Study
-        from lqrsim.view.plots import plot_funnel
+        from lqrsim.stress.funnels import level_test
 
-        study = Study(**stated(self, Study))
+        study = ls.stress.Study(**stated(self, ls.stress.Study))
         scenario = study.resolved
         folder = self.out or Path("runs/funnel") / folder_name(scenario)
         console.check_output("--out", folder)
@@ -273,21 +256,21 @@ class FunnelCommand(StudyOptions):
         level_test(space, steps, **stated(self, level_test))  # checked before the solve
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
-            if isinstance(one, InitialStateError):
+            if isinstance(one, ls.disturbances.InitialStateError):
                 console.say("without the InitialStateError of the set: runs begin in states of the funnel")
                 one = one.scaled(0.0)  # keeps the other disturbances' random numbers
             disturbances.append(one.scaled(self.strength))
-        options = stated(self, funnel, **study.closed_loop, disturbances=disturbances)
+        options = stated(self, ls.funnel, **study.closed_loop, disturbances=disturbances)
 
         def write(found: "Funnel") -> int:
             console.say(found.summary())
             console.result(funnel=as_json.of_funnel(found))
-            console.wrote(save_load.save(found, folder / "funnel.npz"))
+            console.wrote(ls.save(found, folder / "funnel.npz"))
             if space.position and set(space.position) <= set(found.chosen):
                 world, radius = scenario.scene.world, scenario.robot.radius
-                console.wrote(plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
+                console.wrote(ls.view.plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
             return 0 if found.levels.any() else 1
 
         with console.keeping(write), console.progress("looking", "knot") as progress:
-            found = funnel(**options, progress=progress)
+            found = ls.funnel(**options, progress=progress)
         return write(found)

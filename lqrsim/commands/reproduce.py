@@ -60,9 +60,6 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
     """Run the scripts, write `results.md`, `results.json` and the figures, and print which statements hold.
 
     Args:
-      scripts: names in `SCRIPTS`; none means all.
-      out: output folder.
-      quick: run a small part of each script.
       keep: whether results of other scripts in `results.json` stay.
 
     Returns:

@@ -6,22 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import (
-    ControllerName,
-    DesignSet,
-    Folder,
-    Json,
-    Strength,
-    optional,
-    options_of,
-    stated,
-)
+import lqrsim as ls
+from lqrsim.commands import as_json, console
+from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, Strength, optional, options_of, stated
 
 if TYPE_CHECKING:
-    from lqrsim.problem.problem import Problem
-    from lqrsim.results.rollout import Rollout
-    from lqrsim.scenarios.packaged import Scenario
-    from lqrsim.simulation.disturbances import Disturbance
     from lqrsim.solvers.initial_guess import StartLike
 
 
@@ -38,11 +27,9 @@ class List:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim import scenarios
-        from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import resolve
 
-        found = {name: resolve(name) for name in self.scenarios or scenarios.names()}
+        found = {name: resolve(name) for name in self.scenarios or ls.scenarios.names()}
         for name, scenario in found.items():
             problem = scenario.problem
             console.say(f"{name}: {scenario.summary}")
@@ -102,10 +89,6 @@ class Solve:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
-        from lqrsim.errors import InputError
-        from lqrsim.problem.clearance import Clearance
-        from lqrsim.results import save_load
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 
         scenario = resolve(self.scenario)
@@ -113,7 +96,7 @@ class Solve:
         console.check_output("--out", folder)
         problem = scenario.problem
         if self.clearance is not None:
-            kept = Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)
+            kept = ls.Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)
             problem = replace(problem, constraints=[*problem.constraints, kept])
         if self.control_limits is not None:
             problem = replace(problem, control_limits=self.control_limits)
@@ -123,7 +106,7 @@ class Solve:
             "--paper-start": self.paper_start,
         }
         if self.solver != "smooth" and (wrong := [name for name, given in of_smooth.items() if given]):
-            raise InputError(f"{', '.join(wrong)}: got --solver {self.solver}, want --solver smooth")
+            raise ls.InputError(f"{', '.join(wrong)}: got --solver {self.solver}, want --solver smooth")
         given = {name: getattr(self, name) for name in ("tolerance", "max_iterations", "time_limit", "starts")}
         options = {"stop": self.stop, **{name: value for name, value in given.items() if value is not None}}
         if self.finish == "none":
@@ -135,14 +118,13 @@ class Solve:
         except KeyboardInterrupt as stop:
             if (best := getattr(stop, "solution", None)) is not None:  # a file of its own: solution.npz may be better
                 console.say(best.summary())
-                console.wrote(save_load.save(replace(best, scenario=reference), folder / "stopped.npz"))
+                console.wrote(ls.save(replace(best, scenario=reference), folder / "stopped.npz"))
             raise
         solution = replace(solved, scenario=reference)
-        console.wrote(save_load.save(solution, folder / "solution.npz"))
+        console.wrote(ls.save(solution, folder / "solution.npz"))
         console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
             from lqrsim.simulation.uncertainty_of import tube_under
-            from lqrsim.view.plots import plot_policy
 
             ran = scenario.settled(solution)
             tube, remark = tube_under(ran.problem, solution, ran.plant(), ran.disturbances)
@@ -150,23 +132,22 @@ class Solve:
                 console.say(remark)
             world, robot = scenario.scene.world, scenario.robot
             radius = robot.shape.get("radius", 0.0)
-            console.wrote(plot_policy(solution, self.figure, world=world, radius=radius, tube=tube))
+            console.wrote(ls.view.plot_policy(solution, self.figure, world=world, radius=radius, tube=tube))
         return 0 if solution.success else 1
 
-    def _start(self, scenario: "Scenario") -> "StartLike":
+    def _start(self, scenario: "ls.Scenario") -> "StartLike":
         """The start of the solve. Raises InputError for several starts, or a start that the scenario lacks."""
-        from lqrsim.errors import InputError
         from lqrsim.scenarios.solutions import stored_start
 
         given = {"--start": self.start is not None, "--paper-start": self.paper_start, "--starts": self.starts}
         named = [name for name, one in given.items() if one]
         if len(named) > 1:
-            raise InputError(f"{', '.join(named)}: got {len(named)} of them, want one: each chooses the start")
+            raise ls.InputError(f"{', '.join(named)}: got {len(named)} of them, want one: each chooses the start")
         if self.start is not None:
             return stored_start(scenario, self.start)
         if self.paper_start:
             if scenario.paper_start is None:
-                raise InputError(f"--paper-start: got {scenario.name}, want a scenario of the paper")
+                raise ls.InputError(f"--paper-start: got {scenario.name}, want a scenario of the paper")
             return scenario.paper_start
         return None if self.starts is not None else scenario.start
 
@@ -215,16 +196,12 @@ class Simulate:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
-        from lqrsim.errors import InputError
-        from lqrsim.results import save_load
         from lqrsim.scenarios.references import disturbance_set
-        from lqrsim.simulation.closed_loop import simulate
         from lqrsim.simulation.uncertainty_of import tube_under
         from lqrsim.stress.policies import check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
-            raise InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
+            raise ls.InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
         solution, scenario = console.load_with_scenario(self.solution, self.scenario)
@@ -236,9 +213,9 @@ class Simulate:
         named = [one for name in self.disturbances for one in disturbance_set(name, scenario)]
         disturbances = [*(one.scaled(self.strength) for one in named), *self._single_disturbances()]
         plant, near = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
-        options = stated(self, simulate, controller=controller, disturbances=disturbances, **near)
+        options = stated(self, ls.simulate, controller=controller, disturbances=disturbances, **near)
         with console.progress("simulating", "step") as progress:
-            rollout = simulate(plant, solution, progress=progress, **options)
+            rollout = ls.simulate(plant, solution, progress=progress, **options)
         console.say(rollout.summary())
         violations = _violations(scenario.problem, rollout)
         for one in (one for one in violations or () if one["trials"]):
@@ -252,31 +229,30 @@ class Simulate:
         if remark:
             console.say(remark)
         rollout = rollout if tube is None else tube.added_to(rollout)
-        console.wrote(save_load.save(rollout, folder / "rollout.npz"))
+        console.wrote(ls.save(rollout, folder / "rollout.npz"))
         console.say(rollout.tally())
         if console.wants_result():
             run = as_json.of_rollout(rollout, scenario.problem)
             console.result(run=run, violations=violations, tube_leaves_out=remark)
         return 0
 
-    def _single_disturbances(self) -> "list[Disturbance]":
-        from lqrsim.simulation.disturbances import ControlNoise, ForceNoise, MeasurementNoise, Push
+    def _single_disturbances(self) -> "list[ls.disturbances.Disturbance]":
 
-        disturbances: list[Disturbance] = []
+        disturbances: list[ls.disturbances.Disturbance] = []
         if self.control_noise:
-            disturbances.append(ControlNoise(self.control_noise))
+            disturbances.append(ls.disturbances.ControlNoise(self.control_noise))
         if self.force_noise:
-            disturbances.append(ForceNoise(self.force_noise))
+            disturbances.append(ls.disturbances.ForceNoise(self.force_noise))
         if self.measurement_noise:
             std = self.measurement_noise
-            disturbances.append(MeasurementNoise(std[0] if len(std) == 1 else std))
+            disturbances.append(ls.disturbances.MeasurementNoise(std[0] if len(std) == 1 else std))
         if self.push:
             *impulse, at = self.push
-            disturbances.append(Push(impulse, at=at))
+            disturbances.append(ls.disturbances.Push(impulse, at=at))
         return disturbances
 
 
-def _violations(problem: "Problem", rollout: "Rollout") -> list[dict[str, Any]] | None:
+def _violations(problem: "ls.Problem", rollout: "ls.Rollout") -> list[dict[str, Any]] | None:
     """For each constraint, how many trials violate it, and the worst; None for a problem of another horizon."""
     if (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         return None

@@ -7,6 +7,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+import lqrsim as ls
+from lqrsim.commands import as_json, console
 from lqrsim.commands.options import (
     CampaignPolicyName,
     Folder,
@@ -49,21 +51,19 @@ class Stress(SetupOptions):
     """Resume the campaign in the folder with its own settings instead of the options above."""
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import folder_name, names_code
-        from lqrsim.stress.campaign import run_campaign
-        from lqrsim.stress.results import Results
-        from lqrsim.stress.study import Campaign, Setup
 
-        setup = Setup(**stated(self, Setup))
+        setup = ls.stress.Setup(**stated(self, ls.stress.Setup))
         folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
         if self.resume:
-            campaign = Results(folder, scenario=self.scenario).campaign
+            campaign = ls.stress.Results(folder, scenario=self.scenario).campaign
             campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
         else:
-            campaign = Campaign.of_sets(setup, self.sweep, **stated(self, Campaign))
+            campaign = ls.stress.Campaign.of_sets(setup, self.sweep, **stated(self, ls.stress.Campaign))
         with console.progress("stressing", "trial") as progress:
-            results = run_campaign(campaign, folder, **stated(self, run_campaign, progress=progress))
+            results = ls.stress.run_campaign(
+                campaign, folder, **stated(self, ls.stress.run_campaign, progress=progress)
+            )
         console.say(results.summary())
         console.wrote(folder)
         own = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
@@ -94,18 +94,15 @@ class Replay:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
-        from lqrsim.results import save_load
-        from lqrsim.stress.results import Results, differences, replay
-        from lqrsim.stress.study import Cell
+        from lqrsim.stress.results import differences
         from lqrsim.versions import changed
 
         console.check_output("--out", self.out.parent, self.out.name)
-        results = Results(self.folder, scenario=self.scenario)
-        cell = Cell.named(self.cell, results.cells)
+        results = ls.stress.Results(self.folder, scenario=self.scenario)
+        cell = ls.stress.Cell.named(self.cell, results.cells)
         if others := changed(results.manifest["versions"]):
             console.say(f"values may differ from the table in the last bits: got {others}")
-        rollout = replay(results, cell, self.trial)
+        rollout = ls.stress.replay(results, cell, self.trial)
         console.say(rollout.summary())
         if summary := rollout.controller_run.summary():
             console.say(summary)
@@ -114,7 +111,7 @@ class Replay:
             console.say(f"NOT as in the table: {one}")
         if not different:
             console.say("identical to the table")
-        console.wrote(save_load.save(rollout, self.out))
+        console.wrote(ls.save(rollout, self.out))
         if console.wants_result():
             run = as_json.of_rollout(rollout, results.trials.scenario.problem)
             console.result(cell=cell, run=run, differences=different)
@@ -139,23 +136,18 @@ class Report:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
-        from lqrsim.errors import InputError
         from lqrsim.stress.data_table import ENDINGS
-        from lqrsim.stress.results import Results
 
         path = self.out or self.folder / "report.html"
         if path.suffix not in (".html", *ENDINGS):
-            raise InputError(f"--out: got {path}, want a name that ends in .html, {', '.join(ENDINGS)}")
+            raise ls.InputError(f"--out: got {path}, want a name that ends in .html, {', '.join(ENDINGS)}")
         console.check_output("--out", path.parent, path.name)
-        results = Results(self.folder, scenario=self.scenario)
+        results = ls.stress.Results(self.folder, scenario=self.scenario)
         if path.suffix in ENDINGS:
             results.rates().save(path)
         else:
-            from lqrsim.reports.page import report
-
             with console.progress("reporting", "part") as progress:
-                report(results, **stated(self, report, out=path, progress=progress))
+                ls.report(results, **stated(self, ls.report, out=path, progress=progress))
         console.wrote(path)
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
@@ -184,14 +176,12 @@ class Compare:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands import as_json, console
-        from lqrsim.stress.comparison import compare
         from lqrsim.stress.data_table import check_table_path
 
         if self.out is not None:
             check_table_path("--out", self.out)
             console.check_output("--out", self.out.parent, self.out.name)
-        table = compare(self.folder, self.other, policies=self.policies)
+        table = ls.stress.compare(self.folder, self.other, policies=self.policies)
         console.say(str(table))
         if self.out is not None:
             console.wrote(table.save(self.out))

@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import lqrsim as ls
+from lqrsim.commands import as_json, console
 from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional, options_of, stated
 from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.control.replanner import LiveReplanner
-    from lqrsim.problem.problem import Problem
-    from lqrsim.results.solution import Solution
-    from lqrsim.scenarios.packaged import Scenario
     from lqrsim.view.viewer import MovableGoal
     from lqrsim.view.viewer_base import Viewer
 
@@ -69,26 +67,20 @@ class Render:
     """In a still, show the robot also where it was at each multiple of this."""
 
     def run(self) -> int:
-        from lqrsim.commands import console
-        from lqrsim.errors import InputError
-        from lqrsim.results import save_load
         from lqrsim.results.funnel import Funnel
-        from lqrsim.results.rollout import Rollout
-        from lqrsim.results.solution import Solution
         from lqrsim.view import html_file, rerun_file
-        from lqrsim.view.render import render, render_still
 
         if not self.rollouts:
-            raise InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
+            raise ls.InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
         out = self.out or self.rollouts[0].with_suffix(".mp4")
         self._check_options(out)
         console.check_output("--out", out.parent, out.name)
-        runs = [save_load.load(path, Rollout) for path in self.rollouts]
+        runs = [ls.load(path, ls.Rollout) for path in self.rollouts]
         if self.overlays != OVERLAYS and "tube" in self.overlays:
             for path in (path for path, run in zip(self.rollouts, runs, strict=True) if run.tube is None):
                 console.say(f"no tube in {path}: none was predicted for it")
-        solution = _one_or_all([save_load.load(path, Solution) for path in self.solution])
-        funnel = _one_or_all([save_load.load(path, Funnel) for path in self.funnel])
+        solution = _one_or_all([ls.load(path, ls.Solution) for path in self.solution])
+        funnel = _one_or_all([ls.load(path, Funnel) for path in self.funnel])
         drawn, rows = _one_or_all(runs), 0 if self.trial is None else _one_or_all(self.trial)
         content = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
         look = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
@@ -98,24 +90,23 @@ class Render:
             case ".rrd":
                 rerun_file.write(drawn, out, trial=rows, funnel=funnel)
             case ".png":
-                render_still(drawn, out, **stated(self, render_still, **look))
+                ls.view.render_still(drawn, out, **stated(self, ls.view.render_still, **look))
             case _:
                 with console.progress("rendering", "frame") as progress:
-                    render(drawn, out, **stated(self, render, **look, progress=progress))
+                    ls.render(drawn, out, **stated(self, ls.render, **look, progress=progress))
         console.wrote(out)
         return 0
 
     def _check_options(self, out: Path) -> None:
         """Raise InputError for another kind of file, or for options that do not belong to its kind."""
-        from lqrsim.errors import InputError
 
         kind = out.suffix.lower()
         if kind in (".mp4", ".gif") and (self.time is not None or self.every is not None):
-            raise InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
+            raise ls.InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
         if kind in (".mp4", ".gif", ".png"):
             return
         if kind not in (".html", ".rrd"):
-            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
+            raise ls.InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
         # Whoever opens such a file chooses the camera and the time.
         is_page = kind == ".html"
         taken = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if is_page else [])]
@@ -127,7 +118,7 @@ class Render:
             want = "one run, one --trial, at most one --funnel, and no other options"
             if is_page:
                 want = "one run, at most one --solution and --funnel, and of other options --trial and --overlays"
-            raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
+            raise ls.InputError(f"--out: got {out.name} with {got}, want it with {want}")
 
 
 def _one_or_all(items: Sequence[Any]) -> Any:
@@ -176,10 +167,7 @@ class View:
     """Change of the robot's velocity per key press."""
 
     def run(self) -> int:
-        from lqrsim.commands import console
-        from lqrsim.errors import InputError, check_count, check_number, check_seed
-        from lqrsim.results import save_load
-        from lqrsim.results.rollout import Rollout
+        from lqrsim.errors import check_count, check_number, check_seed
         from lqrsim.scenarios.references import resolve
         from lqrsim.stress.policies import check_designed, make_controller
         from lqrsim.view import viewer
@@ -197,8 +185,8 @@ class View:
             for name in ("controller", "design_disturbances", "solution", "replan"):
                 if (value := getattr(self, name)) not in (None, "feedback"):
                     option, got = name.replace("_", "-"), f"{value:g}" if isinstance(value, float) else value
-                    raise InputError(f"--{option}: got {got} with {self.what}, want it with a SCENARIO")
-            rollout = save_load.load(self.what, Rollout)
+                    raise ls.InputError(f"--{option}: got {got} with {self.what}, want it with a SCENARIO")
+            rollout = ls.load(self.what, ls.Rollout)
             arguments = viewer.arguments_for_rollout(rollout, self.trial)
 
             def go(screen: "Viewer") -> None:
@@ -228,9 +216,8 @@ class View:
         return 0
 
     @staticmethod
-    def _given(scenario: "Scenario", path: Path) -> "Solution":
+    def _given(scenario: "ls.Scenario", path: Path) -> "ls.Solution":
         """Load the solution of a file. Raises InputError if it cannot run in the scenario."""
-        from lqrsim.commands import console
         from lqrsim.scenarios.solutions import given, remarks
 
         solution = given(scenario, path)
@@ -239,9 +226,9 @@ class View:
             console.say(f"{path} {remark}")
         return solution
 
-    def _check_replanning(self, problem: "Problem") -> None:
+    def _check_replanning(self, problem: "ls.Problem") -> None:
         """Raise InputError for a rate that does not fit the problem, or options that exclude re-planning."""
-        from lqrsim.errors import InputError, check_number
+        from lqrsim.errors import check_number
 
         if self.replan is None:
             return
@@ -249,27 +236,24 @@ class View:
         slowest, fastest = 0.999 / (problem.steps * problem.dt), 1.001 / problem.dt
         check_number("--replan", self.replan, at_least=slowest, at_most=fastest)
         if self.controller != "feedback":
-            raise InputError(f"--controller: got {self.controller} with --replan, want one of the two")
+            raise ls.InputError(f"--controller: got {self.controller} with --replan, want one of the two")
         if self.speed > 1:
-            raise InputError(f"--speed: got {self.speed:g} with --replan, want at most 1: solves run in real time")
+            raise ls.InputError(f"--speed: got {self.speed:g} with --replan, want at most 1: solves run in real time")
 
     def _planning(
-        self, problem: "Problem", solution: "Solution"
-    ) -> tuple["Callable[[], LiveReplanner]", "MovableGoal | None"]:
+        self, problem: "ls.Problem", solution: "ls.Solution"
+    ) -> tuple["Callable[[], ls.types.LiveReplanner]", "MovableGoal | None"]:
         """A function that starts the re-planner, and the goal if it can be moved."""
-        from lqrsim.commands import console
-        from lqrsim.control.replanner import Replanner
-        from lqrsim.errors import InputError
         from lqrsim.view.viewer import MovableGoal
 
         assert self.replan is not None
         every = max(round(1 / (self.replan * problem.dt)), 1) * problem.dt
         console.say(f"plans again every {every:.4g} s, {1 / every:.4g} times a second")
         # Compiles, and reports errors, before a window opens.
-        replanner = Replanner(problem, solution, every=every, horizon="moving")
+        replanner = ls.Replanner(problem, solution, every=every, horizon="moving")
         try:
             return replanner.live, MovableGoal(problem)
-        except InputError as error:
+        except ls.InputError as error:
             console.say(f"the goal cannot be moved: {error}")
             return replanner.live, None
 
@@ -297,25 +281,23 @@ class Verify:
 
     def run(self) -> int:
         """Run the command. Returns the exit code: 1 if a test failed."""
-        from lqrsim.commands import as_json, console
-        from lqrsim.results import save_load
-        from lqrsim.results.rollout import Rollout
-        from lqrsim.results.solution import Solution
-        from lqrsim.verify.checks import ran_policy_of, run_beside, verify_run, verify_video
+        from lqrsim.verify.checks import ran_policy_of, run_beside
 
         is_run = self.file.suffix.lower() == ".npz"
         path = self.file if is_run else self.run_file or run_beside(self.file)
-        rollout, beside = save_load.load(path, Rollout), path.with_name("solution.npz")
+        rollout, beside = ls.load(path, ls.Rollout), path.with_name("solution.npz")
         solution = None
         if self.solution or os.path.isfile(beside):
-            solution = save_load.load(self.solution or beside, Solution)
+            solution = ls.load(self.solution or beside, ls.Solution)
             # The solution file next to a run may belong to another run; a given solution is used in any case.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:
-                verification = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
+                verification = ls.verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
             else:
-                verification = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
+                verification = ls.verify_video(
+                    self.file, rollout, trial=self.trial, solution=solution, progress=progress
+                )
         console.say(verification.summary())
         console.result(verification=as_json.of_verification(verification))
         return 0 if verification.passed else 1

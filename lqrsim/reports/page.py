@@ -177,9 +177,6 @@ def report(
       out: FILE.html.
       videos: number of the worst trials to repeat and render. Without OpenGL the page has no videos, and says so.
 
-    Returns:
-      The path of the page.
-
     Raises:
       InputError: no trial has been run yet; a file is damaged; `results` lacks a scenario that is your own function; or
         the page cannot be written.

@@ -187,14 +187,10 @@ class Coordinates:
 
     @checked
     def in_world(self, places: npt.ArrayLike, *, height: Finite = 0.0) -> Array:
-        """Points (..., 3) in the world of positions (..., 2 or 3).
+        """Points (..., 3) in the world of positions (..., 2 or 3), in metres.
 
         Args:
-          places: (..., d), d position coordinates in metres.
           height: height in metres of positions in a horizontal plane without a height.
-
-        Raises:
-          InputError: the places are not numbers of this shape, or there is no position.
         """
         if not self.position:
             raise InputError("places: got positions, but the coordinates have none, want position=(names) with them")
@@ -204,11 +200,7 @@ class Coordinates:
         return points
 
     def of_world(self, points: npt.ArrayLike) -> Array:
-        """The positions (..., 2 or 3) of points (..., 3) in the world, projected onto the plane.
-
-        Args:
-          points: (..., 3), in metres.
-        """
+        """The positions (..., 2 or 3) of points (..., 3) in the world, projected onto the plane; in metres."""
         return vectors_of("points", points, 3)[..., list(self.world_axes)]
 
     @property
@@ -220,7 +212,6 @@ class Coordinates:
         """The representative of `vector` nearest to `near`; angles and rotation vectors are equal up to whole turns.
 
         Args:
-          vector: (..., n).
           near: (..., n); leading dimensions broadcast.
         """
         out, near = vectors_of("vector", vector, len(self)), vectors_of("near", near, len(self))
@@ -240,7 +231,6 @@ class Coordinates:
         """The difference `vector - near`, with angles and rotation vectors in the representative nearest to `near`.
 
         Args:
-          vector: (..., n).
           near: (..., n); leading dimensions broadcast.
         """
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
@@ -248,15 +238,7 @@ class Coordinates:
     def _by_name(
         self, field: str, given: Mapping[str, object], check: Callable[[str, object], _Value]
     ) -> dict[int, _Value]:
-        """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit.
-
-        Args:
-          given: name of an entry, or a unit -> the value for it, or for all entries in this unit.
-          check: a function of a field and a value, which returns the value, or raises.
-
-        Returns:
-          Index of each entry that is named -> the value that `check` returned.
-        """
+        """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit."""
         units, found = set(self.units) - {""} - set(self.names), {}
         for key in sorted(given, key=lambda key: key not in units):  # units first, so that names take precedence
             check_name(field, key, [*self.names, *sorted(units)])
@@ -266,14 +248,7 @@ class Coordinates:
         return found
 
     def _numbers(self, field: str, given: Mapping[str, float]) -> Array:
-        """Numbers by name or by unit as an array (n,), with 0 for entries without a number.
-
-        Args:
-          given: number by name or unit of an entry.
-
-        Returns:
-          (n,).
-        """
+        """Numbers by name or by unit as an array (n,), with 0 for entries without a number."""
         out = np.zeros(len(self))
         for i, number in self._by_name(field, given, check_number).items():
             out[i] = number
@@ -310,14 +285,7 @@ class Coordinates:
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def within(self, other: "Coordinates") -> "Coordinates":
-        """The same coordinates with the narrower of both limits.
-
-        Args:
-          other: coordinates with the same number of entries.
-
-        Raises:
-          InputError: the numbers of entries differ, or nothing is within both limits.
-        """
+        """The same coordinates with the narrower of both limits, between which something must be."""
         check_kind("other", other, Coordinates, f"Coordinates of {len(self)} entries")
         if len(other) != len(self):
             raise InputError(f"other: got {len(other)} entries, want {len(self)}: {', '.join(self.names)}")
@@ -325,11 +293,7 @@ class Coordinates:
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def clip(self, vector: npt.ArrayLike) -> Array:
-        """The `vector` (..., n), clipped to the limits.
-
-        Args:
-          vector: (..., n).
-        """
+        """The `vector` (..., n), clipped to the limits."""
         return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
 
 

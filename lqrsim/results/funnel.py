@@ -125,9 +125,6 @@ class Funnel:
         """The level `t` seconds after the start of the plan, linear between two knots.
 
         It is certified at `knots` only. It is constant before the first and after the last knot.
-
-        Args:
-          t: seconds since the start of the plan.
         """
         return float(np.interp(self._knot(t), self.knots, self.levels))
 
@@ -138,8 +135,6 @@ class Funnel:
         the state is not finite.
 
         Args:
-          x: (..., n).
-          t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
         """
         knot, size = self._knot(t), len(self.state_coordinates)
@@ -157,8 +152,6 @@ class Funnel:
         If the level is 0, no state is in the funnel.
 
         Args:
-          x: (..., n).
-          t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
         """
         level = self.level(t)
@@ -166,11 +159,7 @@ class Funnel:
 
     @checked
     def left_at(self, rollout: Rollout) -> Array:
-        """The time at which each run first left the funnel, (K,), in seconds; infinite if it never did.
-
-        Args:
-          rollout: K trials of the funnel's plan.
-        """
+        """The time at which each run first left the funnel, (K,), in seconds; infinite if it never did."""
         if not np.array_equal(rollout.plan.states, self.plan.states):
             raise InputError("rollout: got a run of another plan, want a run of the funnel's plan")
         inside = np.array([self.contains(rollout.states[:, i], t) for i, t in enumerate(self.plan.times)])
@@ -178,17 +167,7 @@ class Funnel:
 
     @checked
     def states_at(self, knot: int, points: npt.ArrayLike, level: NonNegative) -> Array:
-        """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot.
-
-        Args:
-          points: (..., d).
-
-        Returns:
-          The states (..., n).
-
-        Raises:
-          InputError: there is no such knot, the points have another shape, or the ellipsoid is flat.
-        """
+        """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot."""
         knot = check_count("knot", knot, at_least=0, at_most=self.plan.steps)
         points = vectors_of("points", points, len(self.states))
         states = np.tile(self.plan.states[knot], (*points.shape[:-1], 1))

@@ -181,7 +181,6 @@ class Target:
         Args:
           robot_radius: radius of the robot in metres; the default goal radius if distances are in metres, see
             `on_the_way`.
-          goal_radius: radius in metres.
           goal_tolerance: bound of the scaled error, by default TOLERANCE; see `on_the_way`.
         """
         if self.places:

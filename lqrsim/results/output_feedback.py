@@ -97,7 +97,6 @@ class OutputFeedbackPolicy:
         Args:
           z: (..., Z), from `start` or the previous call; it is not changed.
           measurement: (..., Y), angles in any representative; None if it was lost: z is then only predicted.
-          t: seconds since the start.
         """
         z, t = vectors_of("z", z, self.nominal.shape[1]), check_number("t", t, at_least=0.0)
         k, n = int(min(t / self.dt + 1e-9, self.steps - 1)), len(self.state_coordinates)

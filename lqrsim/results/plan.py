@@ -79,7 +79,6 @@ class Plan:
 
         Args:
           steps: steps that are over, fewer than the plan has.
-          horizon: "moving" or "shrinking".
         """
         if steps >= self.trajectory.steps:
             raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the plan")

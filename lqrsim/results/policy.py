@@ -60,23 +60,14 @@ class AffinePolicy:
 
     @checked
     def shifted(self, steps: int, *, horizon: Horizon = "moving") -> "AffinePolicy":
-        """The rest of the policy after `steps` steps; see `Solution.shifted`.
-
-        Args:
-          horizon: "moving" or "shrinking", as in `Solution.shifted`.
-        """
+        """The rest of the policy after `steps` steps; see `Solution.shifted`."""
         steps = check_count("steps", steps, at_least=0, at_most=self.steps - 1)
         filled = horizon == "moving"
         parts = {name: left_after(steps, getattr(self, name), filled=filled) for name in ("gain", "offset", "nominal")}
         return replace(self, **parts)
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
-        """Controls (..., m) of one step before saturation, at states (..., n) in the nominal's representative.
-
-        Args:
-          state: (..., n), in the nominal's representative.
-          step: number of the step, from 0.
-        """
+        """Controls (..., m) of one step before saturation, at states (..., n) in the nominal's representative."""
         step = check_count("step", step, at_least=0, at_most=self.steps - 1)
         return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
 
@@ -86,11 +77,6 @@ class AffinePolicy:
         Angles and rotation vectors may be in any representative. The result is clipped to the control limits. Between
         two knots the earlier law holds, as in the plan; `interpolate=True` blends the two, for controllers that run
         faster than the plan. After the horizon the last law holds.
-
-        Args:
-          state: (..., n), measured; angles and rotation vectors in any representative.
-          t: seconds since the start, 0 or more.
-          interpolate: whether to blend the laws of two knots.
         """
         state, t = vectors_of("state", state, self.gain.shape[-1]), check_number("t", t, at_least=0.0)
         if not np.isfinite(state).all():

@@ -86,11 +86,7 @@ class MovingObstacles:
     __repr__ = repr_of
 
     def at(self, time: float) -> Array:
-        """Their positions (O, 3) in metres.
-
-        Args:
-          time: seconds from the beginning of the run.
-        """
+        """Their positions (O, 3) in metres, `time` seconds from the beginning of the run."""
         return self.positions + time * self.velocities
 
 
@@ -282,10 +278,9 @@ class Rollout:
         return self.balls.planned[:, -1]
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
-        """Points (..., 3) in the world of places (..., 2 or 3).
+        """Points (..., 3) in the world of places (..., 2 or 3), in metres.
 
         Args:
-          places: (..., 2 or 3), in metres.
           height: height in metres of places in a horizontal plane without a height.
         """
         space = self.state_coordinates
@@ -294,11 +289,7 @@ class Rollout:
         return vectors_of("places", places, 3)
 
     def of_world(self, points: npt.ArrayLike) -> Array:
-        """The places (..., 2 or 3) of points (..., 3) in the world.
-
-        Args:
-          points: (..., 3), in metres.
-        """
+        """The places (..., 2 or 3) of points (..., 3) in the world, in metres."""
         points = vectors_of("points", points, 3)
         return self.state_coordinates.of_world(points) if self.state_coordinates.position else points
 

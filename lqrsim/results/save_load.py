@@ -70,7 +70,6 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     If the path is a link, the file that it points to changes. Only regular files are replaced.
 
     Args:
-      result: a Solution, a Rollout, a policy, a Funnel or a FailureCertificate.
       path: FILE.npz.
     """
     path = check_path("output", path)

@@ -67,7 +67,6 @@ class Solution(Plan):
 
         Args:
           later: name -> function that makes it, for parts without a default.
-          **parts: all other parts.
         """
         solution = object.__new__(cls)
         vars(solution).update(parts, _later=later)

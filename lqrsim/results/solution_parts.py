@@ -211,11 +211,7 @@ class Iteration:
 
     @checked
     def row(self, number: Index) -> str:
-        """The line of this iteration in the table under `HEADER`.
-
-        Args:
-          number: number of the iteration, from 1.
-        """
+        """The line of this iteration in the table under `HEADER`."""
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
         gap = "-" if np.isnan(self.gap) else f"{self.gap:.1e}"

@@ -51,11 +51,7 @@ class Quadratic:
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)
 
     def __call__(self, states: npt.ArrayLike) -> Array:
-        """The values at these states, one for each knot.
-
-        Args:
-          states: (T+1, n).
-        """
+        """The values at these states (T+1, n), one for each knot."""
         x = vectors_of("states", states, self.gradient.shape[-1])
         try:
             np.broadcast_shapes(x.shape, self.gradient.shape)

@@ -4,12 +4,13 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from lqrsim.annotations import Want, checked
 from lqrsim.control.uncertainty import per_entry
-from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
+from lqrsim.errors import Array, InputError, check_kind, excerpt
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.scenarios.packaged import Scenario
@@ -21,6 +22,7 @@ _log = logging.getLogger("lqrsim")
 Place = str | Mapping[str, float] | None
 
 
+@checked
 def mjcf(
     path: str,
     *,
@@ -35,16 +37,17 @@ def mjcf(
     turns_about: str | None = None,
     obstacles: bool | Sequence[str] = True,
     clearance: float | None = None,
-    parameters: Mapping[str, float] | None = None,
+    parameters: Annotated[Mapping[str, float], Want("numbers by name: {'mass': 0.6}")] | None = None,
     base: Base | None = None,
     servos: Servos | None = None,
     efforts: Mapping[str, float] | None = None,
     armature: float | Mapping[str, float] | None = None,
 ) -> Scenario:
-    """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
+    """Make a scenario that moves the robot of an MJCF or a URDF from a start to a goal, within its actuators' limits.
+
+    What is not named here is as in `MjcfRobot`, and of a URDF as in `load_scene`.
 
     Args:
-      path: path of the MJCF, or of a URDF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF. Mocap bodies are where the keyframe has them.
       goal: the goal, in the same form. Without a start and a goal, the robot is to stay at rest, and a warning says
@@ -54,17 +57,9 @@ def mjcf(
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; see
         `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.
-      steps: number of control periods.
-      body: as in `MjcfRobot`.
-      floors: as in `MjcfRobot`.
-      turns_about: as in `MjcfRobot`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       clearance: least distance to obstacles in metres, as in `MjcfRobot.problem`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
-      base: of a URDF, as in `load_scene`: "fixed" or "free".
-      servos: of a URDF, as in `load_scene`: {"shoulder": (200.0, 10.0)}.
-      efforts: of a URDF, as in `load_scene`: {"shoulder": 20.0}.
-      armature: of a URDF, as in `load_scene`: 0.01.
     """
     keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
     mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None
@@ -72,10 +67,8 @@ def mjcf(
     is_stated = any(one is not None for one in of_urdf.values())
     file = load_scene(path, **of_urdf) if is_stated else path
     robot = MjcfRobot(file, body=body, floors=floors, turns_about=turns_about, obstacles=obstacles, mocap=mocap)
-    given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
-    if given:
-        names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")
-        robot = robot.with_parameters(**{name: given[name] for name in names})
+    if parameters:
+        robot = robot.with_parameters(**parameters)
     space, controls = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
     begin, end = _state(robot, "start", start), _state(robot, "goal", goal)
     if np.array_equal(begin, end):

@@ -5,22 +5,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from lqrsim.errors import (
-    check_count,
-    check_flag,
-    check_items,
-    check_kind,
-    check_name,
-    check_number,
-    check_seed,
-    check_text,
-    keep,
-    keep_positive,
-)
+from lqrsim.annotations import Bounds, Line, Positive, Seed, Want, checked
+from lqrsim.errors import check_name
 from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
@@ -38,6 +28,7 @@ from lqrsim.simulation.simulator import Simulator
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, resolve
 
 
+@checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scenario(OneVersion):
     """A robot in a scene with a problem.
@@ -62,28 +53,23 @@ class Scenario(OneVersion):
       sensors: sensors of the MJCF that the policy "offset_free" reads; by default it has the measured states.
     """
 
-    name: str
-    summary: str
+    name: Annotated[str, Want("a name")]
+    summary: Line
     robot: Robot
     scene: Scene
     problem: Problem
-    tracking_bound: float
-    disturbances: tuple[Disturbance, ...] = ()
+    tracking_bound: Positive
+    disturbances: Annotated[tuple[Disturbance, ...], Want("disturbances, such as ControlNoise(0.05)")] = ()
     start: StartLike = None
     paper_start: InitialPrior | None = None
-    goal_radius: float | None = None
-    goal_tolerance: float | None = None
-    simulator: Simulator | None = None
+    goal_radius: Positive | None = None
+    goal_tolerance: Positive | None = None
+    simulator: Annotated[Simulator, Want("a Simulator, or None for MuJoCo")] | None = None
     fit_timestep: bool = False
-    sensors: tuple[Sensor, ...] = ()
+    sensors: Annotated[tuple[Sensor, ...], Want("a tuple of Sensor")] = ()
 
     def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
-        """The goal options of `simulate`: the given ones, or the scenario's own if neither is given.
-
-        Args:
-          goal_radius: radius in metres, or None.
-          goal_tolerance: a scaled error, or None.
-        """
+        """The goal options of `simulate`: the given ones, or the scenario's own if neither is given."""
         if goal_radius is None and goal_tolerance is None:
             goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance
         return {"goal_radius": goal_radius, "goal_tolerance": goal_tolerance}
@@ -94,8 +80,6 @@ class Scenario(OneVersion):
         """The distance from the goal within which it counts as reached, in `Target.unit`.
 
         Args:
-          goal_radius: radius in metres, or None.
-          goal_tolerance: a scaled error, or None.
           target: target of a plan; by default, of a plan that starts at the problem's start.
         """
         if target is None:
@@ -108,21 +92,8 @@ class Scenario(OneVersion):
         return f"Scenario({self.name!r}: {self.summary})"
 
     def __post_init__(self) -> None:
-        check_text("Scenario: name", self.name, "a name")
-        check_text("Scenario: summary", self.summary, "a line of description", at_most=1000, empty=True)
-        check_kind("Scenario: robot", self.robot, Robot, "a Robot, such as Quadrotor()")
-        check_kind("Scenario: scene", self.scene, Scene, "a Scene, such as load_scene('cage')")
-        check_kind("Scenario: problem", self.problem, Problem, "a Problem")
-        check_number("Scenario: tracking_bound", self.tracking_bound, above=0.0)
-        keep_positive(self, "goal_radius", "goal_tolerance", who="Scenario: ")
-        wanted = "disturbances, such as ControlNoise(0.05)"
-        keep(self, disturbances=check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted))
         if not is_function(self.start):  # a function is called when the scenario is solved
             resolve(self.start, self.problem)
-        check_flag("Scenario: fit_timestep", self.fit_timestep)
-        check_kind("Scenario: simulator", self.simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
-        keep(self, sensors=check_items("Scenario: sensors", self.sensors, Sensor, "a tuple of Sensor"))
-        check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:
         """The robot in its scene, ready to run: one plant, which is made when first needed."""
@@ -133,35 +104,24 @@ class Scenario(OneVersion):
         plant = Plant(self.robot, self.scene, self.simulator)
         return plant.for_period(self.problem.dt) if self.fit_timestep else plant
 
+    @checked
     def settled(self, plan: Solution) -> "Scenario":
         """The scenario in which a plan runs: if its problem has a free duration, that with the duration of the plan.
 
         The physics step of its plant then divides the control period of the plan.
-
-        Args:
-          plan: a solution of the scenario.
         """
-        check_kind("plan", plan, Solution, "a Solution of the scenario")
         if self.problem.duration is None:
             return self
         return replace(self, problem=self.problem.settled(plan), fit_timestep=True)
 
 
 def names() -> list[str]:
-    """The names of the registered scenarios.
-
-    Returns:
-      The names, sorted.
-    """
+    """The names of the registered scenarios."""
     return sorted(_functions())
 
 
 def get(name: str) -> Scenario:
-    """The registered scenario of a name, with its default settings.
-
-    Args:
-      name: one of `names()`.
-    """
+    """The registered scenario of a name, with its default settings."""
     return _functions()[check_name("scenario", name, names())]()
 
 
@@ -202,14 +162,14 @@ def differential_drive() -> Scenario:
     )
 
 
-def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
+@checked
+def quadrotor(query: Annotated[int, Bounds(at_least=0, at_most=999_999)] = 0, seed: Seed = 0) -> Scenario:
     """The quadrotor through a cage of twelve beams, from one edge to the antipode: Fig. 3.
 
     Args:
       query: number of the random start and goal, from 0; see `quadrotor_queries`.
-      seed: seed of the random starts and goals.
     """
-    starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
+    starts, goals = quadrotor_queries(query + 1, seed=seed)
     robot, scene = Quadrotor(), load_scene("cage")
     weight = np.full(12, 500.0)
     problem = Problem(
@@ -239,21 +199,19 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
     )
 
 
-def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+@checked
+def quadrotor_queries(
+    count: Annotated[int, Bounds(at_least=0, at_most=1_000_000)], *, seed: Seed = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw random starts and goals at rest, (count, 12) each. The first ones of a seed do not depend on `count`.
 
     A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
     jitter of +-0.01 m; its goal is the antipode.
 
-    Args:
-      count: number of pairs.
-      seed: seed of the random numbers.
-
     Returns:
       Starts and goals, each (count, 12).
     """
-    check_count("count", count, at_least=0, at_most=1_000_000)
-    rng = np.random.default_rng(check_seed("seed", seed))
+    rng = np.random.default_rng(seed)
     goals = np.zeros((count, 12))
     for goal in goals:
         edge = int(rng.integers(12))

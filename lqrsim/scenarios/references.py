@@ -37,7 +37,6 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     """The scenario that `reference` names; see the top of this file for its forms.
 
     Args:
-      reference: the user's input.
       registered_only: refuse users' functions. For references from a file, which must not choose the code that runs.
     """
     from lqrsim.scenarios.packaged import Scenario

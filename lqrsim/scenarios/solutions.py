@@ -32,7 +32,6 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
     """Solve a scenario's problem from the scenario's start.
 
     Args:
-      scenario: the scenario with the problem and the start.
       solver: one of SOLVERS. "ilqr" uses only the controls of a start that is an InitialPrior.
       **options: options of the solver; a `start` among them replaces the scenario's.
     """
@@ -48,11 +47,7 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
     """Load a start for a solve of the scenario from a file.
 
     Args:
-      scenario: the scenario to solve.
       path: path of a solution, of a policy, of a certificate, or of a rollout or funnel, for its plan.
-
-    Returns:
-      The solution, the policy or the plan.
     """
     found = load(path)
     if isinstance(found, FailureCertificate):
@@ -75,10 +70,6 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     """Check a solution that is given instead of solving the scenario.
 
     The solution may not have converged, or may be of another problem; `remarks` then says so.
-
-    Args:
-      scenario: the scenario in which it is to run.
-      solution: a Solution, or the path of one.
     """
     stored = isinstance(solution, str | os.PathLike)
     what = str(solution) if stored else "one"

@@ -41,12 +41,12 @@ from lqrsim.stress.campaign_files import (
 )
 from lqrsim.stress.policies import (
     CAMPAIGN_POLICIES,
+    DEFAULT_POLICIES,
     DESIGNED,
     POLICY_KINDS,
     check_used,
     design_uncertainty,
     impossible_policies,
-    left_out,
     make_controller,
     solve,
 )
@@ -212,16 +212,24 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
     if given is not None:
         save_load.save(given, folder / GIVEN)
     remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
-    missing = left_out(campaign.policies, impossible_policies(scenario, given))
+    impossible = impossible_policies(scenario, given)
+    # Policies that were chosen leave out others on purpose.
+    missing = impossible if {*campaign.policies} == {*DEFAULT_POLICIES} - {*impossible} else {}
+    left_out = "; ".join(f"{policy}, {why}" for policy, why in missing.items())
     about = {
-        "versions": versions(), "machine": description(), "left_out": missing, "remarks": remarks,
+        "versions": versions(), "machine": description(), "remarks": remarks,
+        "left_out": f"left out: {left_out}" if left_out else "",
         "deterministic": [list(pair) for pair in deterministic],
     }  # fmt: skip
     write_manifest(folder, specification | {"policies": policies} | about)
 
 
 def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
-    now, before = (_flat(one["campaign"]) for one in (specification, manifest))
+    # Each sweep is compared as one field.
+    now, before = (
+        {f"sweeps: {name}": sweep for name, sweep in stated["sweeps"].items()} | {**stated, "sweeps": None}
+        for stated in (specification["campaign"], manifest["campaign"])
+    )
     for field in [*now, *before]:
         value, was = now.get(field), before.get(field)
         if field != "time_limit" and value != was:
@@ -276,12 +284,6 @@ def _code(campaign: Campaign) -> dict[str, str | None]:
     return hashes
 
 
-def _flat(campaign: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a campaign, each sweep as one field."""
-    sweeps = {f"sweeps: {name}": sweep for name, sweep in campaign["sweeps"].items()}
-    return sweeps | {name: value for name, value in campaign.items() if name != "sweeps"}
-
-
 def _unfinished(results: Results) -> list[Shard]:
     """The shards that are still to be run. Removes half-written files, and moves damaged ones aside."""
     for remains in results.folder.glob("**/.unfinished-*"):
@@ -291,6 +293,7 @@ def _unfinished(results: Results) -> list[Shard]:
 
 
 def _is_intact(results: Results, shard: Shard) -> bool:
+    """Whether a shard's file is as it was written; if it is not, it is moved aside."""
     path = results.path(shard)
     try:
         read(path, shard, results.manifest["digest"])

@@ -184,8 +184,7 @@ def _exit(code: int | None) -> str:
     return f"exit code {code}"
 
 
-@contextlib.contextmanager
-def _worker_environment() -> Iterator[None]:
+def _worker_environment() -> contextlib.AbstractContextManager[None]:
     """Processes started in this block use one thread each, and the GLFW library that this process has loaded.
 
     Without the latter, importing MuJoCo starts a process that looks for GLFW. That process would outlive a worker that
@@ -195,8 +194,7 @@ def _worker_environment() -> Iterator[None]:
     glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)
     if glfw is not None and sys.platform != "win32":  # on Windows it starts no process
         ours["PYGLFW_LIBRARY"] = glfw._name
-    with process.environment(**ours):
-        yield
+    return process.environment(**ours)
 
 
 @contextlib.contextmanager
@@ -270,10 +268,16 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
             for future, shard in list(submitted.items()):
                 if future.done():
                     del submitted[future]
-                    yield shard, _contents(job, shard, future)
+                    if future.status in ("cancelled", "lost"):
+                        raise CancelledError
+                    failed = future.status != "finished"
+                    yield shard, job.failed(shard, format_error(future.exception())) if failed else future.result()
                 elif time.monotonic() - started.get(shard, ("", time.monotonic()))[1] > time_limit:
                     del submitted[future]
-                    _restart_worker(client, future, started[shard][0])
+                    future.cancel()
+                    # A thread that hangs cannot be stopped otherwise; the worker may have ended, or have no nanny.
+                    with contextlib.suppress(Exception):
+                        client.restart_workers([started[shard][0]], timeout=30, raise_for_error=False)
                     yield shard, job.failed(shard, f"took longer than {time_limit:g} s, and was stopped")
     except (CancelledError, asyncio.CancelledError):
         raise InputError(f"scheduler: got a scheduler that lost its tasks or was restarted, {RESUME}") from None
@@ -301,21 +305,6 @@ def _silenced() -> Iterator[None]:
     finally:
         for logger in loggers:
             logger.removeFilter(silent)
-
-
-def _contents(job: Job, shard: Shard, future: Any) -> bytes:
-    if future.status == "finished":
-        return future.result()
-    if future.status in ("cancelled", "lost"):
-        raise CancelledError
-    return job.failed(shard, format_error(future.exception()))
-
-
-def _restart_worker(client: Any, future: Any, worker: str) -> None:
-    """Restart a worker by its nanny: a thread that hangs cannot be stopped otherwise."""
-    future.cancel()
-    with contextlib.suppress(Exception):  # the worker may have ended, or have no nanny
-        client.restart_workers([worker], timeout=30, raise_for_error=False)
 
 
 def _task(job: Job, shard: Shard) -> bytes:

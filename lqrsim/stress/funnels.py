@@ -63,11 +63,10 @@ def funnel(
     confidence all levels are right at once: the error probability is divided among the knots. A level of 0, with its
     reason, means that no level was certified.
 
-    A run that begins at a later knot is assumed to have followed the plan until then; see `simulate_from`.
+    A run that begins at a later knot is assumed to have followed the plan until then; see `simulate_from`. What is not
+    named here is as in `simulate`.
 
     Args:
-      plant: as in `simulate`.
-      solution: as in `simulate`.
       disturbances: as in `simulate`, without those that change the start of a run, such as `InitialStateError`.
       controller: as in `simulate`; by default the solution's policy.
       rate: wanted fraction of runs that reach the goal, above 0 and below 1.
@@ -78,9 +77,6 @@ def funnel(
         a covariance (n, n), or one per knot, (T+1, n, n). The certificate holds for any shape, but levels depend on it.
       largest: largest level that is tried; by default the level at which an angle is off by half a turn.
       failures: number of trials of a test that may fail. With more, tests take more trials, and levels are larger.
-      goal_radius: as in `simulate`.
-      goal_tolerance: as in `simulate`.
-      threads: as in `simulate`.
       progress: called with the number of finished knots, the number of all knots, and a text on the current trial.
 
     Raises:
@@ -206,19 +202,12 @@ def check_funnel(
     threads: int | None = None,
 ) -> tuple[FunnelCheck, ...]:
     """The results of new trials from states drawn uniformly inside a funnel, or in a shell outside, for each knot with
-    a level.
+    a level. The other arguments are as for `funnel`.
 
     Args:
-      plant: as for `funnel`.
-      solution: as for `funnel`.
-      disturbances: as for `funnel`.
-      controller: as for `funnel`.
       trials: number of trials at each knot.
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
       seed: seed of all random numbers; it must differ from the funnel's, because the trials must be new.
-      goal_radius: as for `funnel`.
-      goal_tolerance: as for `funnel`.
-      threads: as for `funnel`.
     """
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):

@@ -124,7 +124,6 @@ def failure_probability(
         and failures are counted.
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
-      seed: seed of all random numbers.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds, and again for each batch that it draws where scores tie.
       progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so far

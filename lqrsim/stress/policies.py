@@ -1,7 +1,7 @@
 """The policies that a stress test compares, by name, with the solver and the controller of each."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -97,8 +97,6 @@ def solve(
     "smooth".
 
     Args:
-      policies: some of CAMPAIGN_POLICIES.
-      scenario: the scenario that is solved.
       design: the disturbances for which "track" and "offset_free" are designed.
       given: a solution from `solutions.given`, in place of the result of its solver.
       remark: whether to warn of plans that have not converged, or are of another problem.
@@ -141,24 +139,16 @@ def check_used(given: Solution | None, policies: Sequence[str]) -> None:
 
 def impossible_policies(scenario: Scenario, given: Solution | None = None) -> dict[str, str]:
     """The policies that cannot run in the scenario with the given solution, if any, each with the reason."""
-    found: dict[str, str] = {}
+    impossible: dict[str, str] = {}
     if scenario.problem.constraints:
-        found["ilqr"] = "which cannot keep the scenario's constraints"
+        impossible["ilqr"] = "which cannot keep the scenario's constraints"
     elif scenario.problem.duration is not None:
-        found["ilqr"] = "which cannot find the scenario's free duration"
+        impossible["ilqr"] = "which cannot find the scenario's free duration"
     replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
-    if replanned is not None and replanned.problem_digest != (own := scenario.settled(replanned).problem).digest:
-        other = solving.difference(replanned, own)
-        found["replan"] = f"which re-plans the scenario's problem, while the solution is of another problem{other}"
-    return found
-
-
-def left_out(policies: Sequence[str], impossible: Mapping[str, str]) -> str:
-    """A line with the impossible policies that were left out; empty if there are none, or policies were chosen."""
-    if {*policies} != {*DEFAULT_POLICIES} - {*impossible}:
-        return ""
-    missing = [f"{policy}, {why}" for policy, why in impossible.items() if policy not in policies]
-    return f"left out: {'; '.join(missing)}" if missing else ""
+    if replanned is not None and replanned.problem_digest != (stated := scenario.settled(replanned).problem).digest:
+        other = solving.difference(replanned, stated)
+        impossible["replan"] = f"which re-plans the scenario's problem, while the solution is of another problem{other}"
+    return impossible
 
 
 def make_controller(
@@ -174,8 +164,6 @@ def make_controller(
     Args:
       name: one of CONTROLLERS. "feedback" is the solution's policy; "track" and "offset_free" are `lqrsim.track` and
         `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
-      scenario: the scenario that was solved.
-      solution: the solution with the plan.
       design: the disturbances for which "track" and "offset_free" are designed.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
     """
@@ -196,14 +184,3 @@ def make_controller(
             every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
             return Replanner(problem, solution, every=every, deadline=0.0)
     return solution.policy
-
-
-def make_policy(
-    policy: str, scenario: Scenario, design: Design = None, given: Solution | None = None, *, remark: bool = True
-) -> tuple[Solution, Controller | AffinePolicy]:
-    """Solve for one policy. Returns its solution and the controller that runs it; see `solve`."""
-    if design is not None:
-        check_designed((policy,))
-        design = design_disturbances(scenario, design)  # before it is solved
-    solution = solve((policy,), scenario, design, given, remark=remark)[policy]
-    return solution, make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)

@@ -62,8 +62,6 @@ def certify(
       repetitions: number of its repetitions to run, at least 2; by default all.
       seed: another seed, for fresh random numbers: then intervals are compared. By default the certificate's.
       scenario: reference to the scenario if it is your own function: files never choose code to run.
-      report: as in `ReliabilityProblem.rare_failures`.
-      progress: as in `ReliabilityProblem.rare_failures`.
 
     Raises:
       NoFailure: no failure was found.

@@ -85,17 +85,11 @@ def smooth_safest(
     """Choose among the candidates of `smooth` by success rate instead of cost.
 
     Each candidate is solved to convergence; duplicates are dropped. All plans run in the same trials. The result is the
-    plan with the most successes; the cheapest plan if there are several.
+    plan with the most successes; the cheapest plan if there are several. What is not named here is as for `smooth` and
+    `simulate`.
 
     Args:
-      problem: as for `smooth`.
-      plant: as in `simulate`.
-      disturbances: as in `simulate`.
       trials: number of trials of each plan, and of fresh trials of the chosen plan.
-      starts: as for `smooth`.
-      seed: seed of the disturbances.
-      goal_radius: as in `simulate`.
-      goal_tolerance: as in `simulate`.
       threads: number of threads of the search and of the simulations.
 
     Raises:

@@ -28,10 +28,12 @@ from lqrsim.stress.policies import (
     CAMPAIGN_POLICIES,
     DEFAULT_POLICIES,
     POLICIES,
+    POLICY_KINDS,
     check_designed,
     design_disturbances,
     impossible_policies,
-    make_policy,
+    make_controller,
+    solve,
 )
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
@@ -167,12 +169,14 @@ class Study(Setup):
     @cached_property
     def closed_loop(self) -> dict[str, Any]:
         """The arguments of `funnel` and `TrialScore` but the disturbances: plant, solution, controller and goal."""
-        goal, design = self.goal_options, self.design_disturbances  # checked before the scenario is solved
+        scenario, policy, design = self.resolved, self.policy, self.design_disturbances
+        goal = self.goal_options  # like the set, checked before the scenario is solved
+        design = None if design is None else design_disturbances(scenario, design)
         # Whoever has a Solution at hand knows of which problem it is.
         remark = not isinstance(self.solution, Solution)
-        solution, controller = make_policy(self.policy, self.resolved, design, self.given, remark=remark)
-        plant = self.resolved.settled(solution).plant()
-        return {"plant": plant, "solution": solution, "controller": controller, **goal}
+        solution = solve((policy,), scenario, design, self.given, remark=remark)[policy]
+        controller = make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)
+        return {"plant": scenario.settled(solution).plant(), "solution": solution, "controller": controller, **goal}
 
 
 @checked

@@ -161,17 +161,11 @@ class TrialScore:
     does not tell which of them are near a failure. `collision_score` and `miss_score` then leave out the knots until it
     has left, as far as the clearance there is more than 20 of its standard deviations.
 
+    The other arguments are as in `simulate`.
+
     Args:
-      plant: the simulated robot.
-      solution: the plan, and the policy unless there is a controller.
-      disturbances: as in `simulate`.
-      controller: as in `simulate`.
       failure: returns the scores (K,) of a rollout.
-      goal_radius: as in `simulate`.
-      goal_tolerance: as in `simulate`.
-      contacts: as in `simulate`.
       batch: number of trials that are run at once.
-      threads: as in `simulate`.
 
     Attributes:
       sizes: number of random numbers that each disturbance draws.

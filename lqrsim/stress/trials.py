@@ -64,25 +64,19 @@ class Trials:
         parts: list[Table] = []
         for first in range(shard.first, last, batch):
             count = min(batch, last - first)
-            try:
-                rows = self._rows(cell, first, count)
-                alone = count > 1 and bool((rows["outcome"] == "error").any())
-            except Exception:  # a disturbance or a scenario may raise anything; it counts as a failed trial
-                rows, alone = {}, True
-            parts += [self._row(cell, trial) for trial in range(first, first + count)] if alone else [rows]
+            rows = self._rows(cell, first, count)
+            alone = count > 1 and bool((rows["outcome"] == "error").any())
+            parts += [self._rows(cell, trial, 1) for trial in range(first, first + count)] if alone else [rows]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _rows(self, cell: Cell, first: int, count: int) -> Table:
-        rollout = self.run(cell, first, count, frames=False, contacts=False)
-        reasons = np.array(rollout.reasons, dtype=np.str_)
-        table = self.outcomes(rollout).columns()
-        return table | {"reason": np.where(np.isin(table["outcome"], ("diverged", "error")), reasons, "")}
-
-    def _row(self, cell: Cell, trial: int) -> Table:
         try:
-            return self._rows(cell, trial, 1)
-        except Exception as error:
-            return _failed_rows(trial, 1, format_error(error))
+            rollout = self.run(cell, first, count, frames=False, contacts=False)
+            table = self.outcomes(rollout).columns()
+        except Exception as error:  # a disturbance or a scenario may raise anything; it counts as failed trials
+            return _failed_rows(first, count, format_error(error))
+        reasons = np.array(rollout.reasons, dtype=np.str_)
+        return table | {"reason": np.where(np.isin(table["outcome"], ("diverged", "error")), reasons, "")}
 
     def _controller(self, cell: Cell) -> Controller | AffinePolicy:
         """The controller of a cell, made once for its policy or for the cell, because its gains take time."""

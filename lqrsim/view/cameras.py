@@ -18,8 +18,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
 from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial
 
-_Number = Finite
-Vector = tuple[_Number, _Number, _Number]
+Vector = tuple[Finite, Finite, Finite]
 
 NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so a wide range loses no precision
 

@@ -63,12 +63,8 @@ def render_html(
     across 6 m are exact to 0.05 mm. The same run gives the same bytes.
 
     Args:
-      rollout: the result of `simulate`, with frames.
-      path: FILE.html.
       trial: row of the rollout, or several rows; by default all trials that have a finite state.
       overlays: as in `render`, except that there is always a caption.
-      solution: the solution that was run, for `cost_tube`.
-      funnel: a funnel about the plan of the run, for the overlay `funnel`.
 
     Raises:
       InputError: an overlay lacks its solution or funnel, or nothing of a trial can be drawn.

@@ -56,9 +56,7 @@ def plot_run(
     the chance of collision at each step.
 
     Args:
-      solution: the solution with the plan that the rollouts follow.
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
-      path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
       style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
     """
@@ -283,11 +281,9 @@ def plot_policy(
     the plan's states are shown instead, without `world` and `radius`.
 
     Args:
-      path: FILE.png, .pdf or .svg.
-      world: the obstacles, such as `scene.world`; none by default.
       radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle
         are grey. 0 leaves the grey out, which would be wrong for a robot of several balls.
-      tube: tube of the solution, from `predict_tube`.
+      tube: of the solution, from `predict_tube`.
       style: as in `plot_run`.
 
     Raises:
@@ -428,10 +424,6 @@ def plot_funnel(
 
     Args:
       funnel: a funnel with the position among its states.
-      path: FILE.png, .pdf or .svg.
-      world: the obstacles, such as `scene.world`.
-      radius: radius of the robot, in metres.
-      style: as in `plot_run`.
     """
     views = funnel_views(funnel, world, radius)
     with styles.figure(path, style=style) as figure:

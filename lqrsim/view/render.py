@@ -42,8 +42,6 @@ def encoder(
     """A function that appends a frame (height, width, 3), which must not change afterwards.
 
     Args:
-      size: width and height.
-      rate: frames per second.
       crf, preset: x264's settings of quality and compression.
     """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
@@ -145,8 +143,6 @@ def render(
     mp4 describes its content, so that `lqrsim verify` can measure it.
 
     Args:
-      runs: one rollout, or several rollouts to be shown side by side.
-      path: FILE.mp4 or FILE.gif.
       trial: row of the rollout; several rows are shown side by side. With several rollouts, one row for all or one for
         each.
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another camera of the model.
@@ -216,8 +212,6 @@ def render_still(
     The other arguments are as in `render`.
 
     Args:
-      runs: one rollout, or several rollouts to be shown side by side.
-      path: FILE.png.
       time: seconds after the start; by default the end.
       every: seconds; the robot is also drawn at each multiple of it.
 

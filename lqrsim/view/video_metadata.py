@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from av.container import OutputContainer
 
 FORMAT, VERSION = "lqrsim footage", 1
-Positive = Positive
 
 
 @checked
