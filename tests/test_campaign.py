@@ -590,7 +590,7 @@ def test_what_is_no_campaign_is_not_opened(tmp_path: Path, make: Callable[[Path]
         ("stress quadrotor --sweep hurricane", ["hurricane"]),
         ("stress quadrotor --sweep scenario:Gust", ["kind of disturbance in scenario: got 'Gust'", "ControlNoise"]),
         ("stress quadrotor --trials 0", ["trials: got 0"]),
-        ("stress quadrotor --strengths -1", ["strengths: got -1"]),
+        ("stress quadrotor --strengths -1", ["strengths[0]: got -1"]),
         ("stress quadrotor --strengths 1 1", ["strengths: got (1.0, 1.0)", "each at most once"]),
         ("stress quadrotor --replan-every 0.001", ["replan_every: got 0.001 s"]),
         ("stress quadrotor --workers -1", ["workers: got -1"]),

@@ -370,7 +370,7 @@ STATES = "policy.state_coordinates"
         ({STATES: {"names": [1, 2, 3]}}, f"{STATES}.units: got nothing, want this field"),
         (
             {STATES: lambda one: one | {"names": [1, 2, 3]}},
-            "state_coordinates: names: got 1 at 0, want a tuple",
+            r"state_coordinates: names\[0\]: got 1, want a name",
         ),
         ({STATES: lambda one: one | {"names": ["x", "x", "y"]}}, "a name twice"),
         ({STATES: lambda one: one | {"position": [0, 7]}}, "position: got"),

@@ -441,7 +441,7 @@ class TestDataThatUsersBuild:
             call = lambda name=label: lq.view.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
             assert refusal(call).startswith("rollouts: label: got ")
         assert "titles" in refusal(lambda: lq.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
-        assert "sweeps: name" in refusal(lambda: lq.stress.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
+        assert "sweeps: a name" in refusal(lambda: lq.stress.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
         lq.view.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
         assert path.is_file()
 

@@ -3,22 +3,18 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Finite, checked
+from lqrsim.annotations import Finite, Index, Want, checked
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
-    check_count,
-    check_items,
-    check_kind,
     check_name,
     check_number,
-    check_text,
     excerpt,
     keep,
     numbers_of,
@@ -42,6 +38,7 @@ _UNITS = {  # units of distances to obstacles and of whole turns
 _UPWARD = ("height", "altitude", "elevation", "vertical")  # such a name does not fit a plane seen from above
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Coordinates:
     """The meaning of the entries of a vector.
@@ -62,31 +59,22 @@ class Coordinates:
       high: upper limit of each entry, (len(names),); inf where there is none.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    position: tuple[int, ...] = ()
-    angles: tuple[int, ...] = ()
-    rotation_vectors: tuple[int, ...] = ()
+    _prefix = ""
+
+    names: tuple[Annotated[str, Want("a name")], ...]
+    units: tuple[Annotated[str, 200], ...]
+    position: tuple[Index, ...] = ()
+    angles: tuple[Index, ...] = ()
+    rotation_vectors: tuple[Index, ...] = ()
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
     plane: str = ""
-    offset: float | None = None
+    offset: Finite | None = None
 
     def __post_init__(self) -> None:
-        for field, least in (("names", False), ("units", True)):
-            given = check_items(
-                field, getattr(self, field), str, "a tuple of texts, one for each entry", at_most=10_000
-            )
-            keep(self, **{field: tuple(check_text(field, text, "texts", at_most=200, empty=least) for text in given)})
         size = len(self.names)
         if not size:
             raise InputError("names: got none, want at least one")
-        for field in ("position", "angles", "rotation_vectors"):
-            given = check_items(field, getattr(self, field), (int, np.integer), "a tuple of indices", at_most=size)
-            counted = tuple(check_count(field, index, at_least=0) for index in given)
-            if len(set(counted)) < len(counted):
-                raise InputError(f"{field}: got {excerpt(counted)}, want different indices")
-            keep(self, **{field: counted})
         if len(self.units) != size:
             raise InputError(
                 f"units: got {len(self.units)} of them, want {size}, one for each of {', '.join(self.names)}"
@@ -97,8 +85,10 @@ class Coordinates:
             raise InputError(f"position: got {len(self.position)} entries, want 2 (a planar robot), 3, or none")
         spans = {"position": self.position, "angles": self.angles, "rotation_vectors": self.rotation_vectors}
         for field, indices in spans.items():
+            if len(set(indices)) < len(indices):
+                raise InputError(f"{field}: got {excerpt(indices)}, want different indices")
             width = 3 if field == "rotation_vectors" else 1
-            if any(not 0 <= index <= size - width for index in indices):
+            if any(index > size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
             unit, why = _UNITS[field]
             for entry in (first + i for first in indices for i in range(width)):
@@ -116,18 +106,14 @@ class Coordinates:
                 f"offset: got {excerpt(self.offset)} without a plane, want it with a position of two entries"
             )
         offset = 0.0 if self.offset is None and len(plane) == 2 and plane not in _FROM_ABOVE else self.offset
-        keep(self, plane=plane, offset=None if offset is None else check_number("offset", offset))
-        for field, endless in (("low", -np.inf), ("high", np.inf)):
-            if isinstance(getattr(self, field), tuple) and not getattr(self, field):
-                keep(self, **{field: (endless,) * size})
-        low = check_array("low", self.low, (size,), infinite=True)
-        high = check_array("high", self.high, (size,), infinite=True)
+        low = check_array("low", self.low or (-np.inf,) * size, (size,), infinite=True)
+        high = check_array("high", self.high or (np.inf,) * size, (size,), infinite=True)
         if (low >= high).any():
             i = int(np.argmax(low >= high))
             raise InputError(
                 f"limits of {self.names[i]}: got {low[i]:g} to {high[i]:g}, want the first below the second"
             )
-        keep(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
+        keep(self, plane=plane, offset=offset, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -144,7 +130,6 @@ class Coordinates:
 
     def _plane(self) -> str:
         """The plane: as given, from the names, or the default. Raises InputError if these contradict each other."""
-        check_kind("plane", self.plane, str, f"one of: {', '.join(PLANES)}")
         names = tuple(self.names[index] for index in self.position)
         said = "".join(_letter(name) for name in names)
         listed = ", ".join(names)
@@ -284,9 +269,9 @@ class Coordinates:
                 )
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
+    @checked
     def within(self, other: "Coordinates") -> "Coordinates":
         """The same coordinates with the narrower of both limits, between which something must be."""
-        check_kind("other", other, Coordinates, f"Coordinates of {len(self)} entries")
         if len(other) != len(self):
             raise InputError(f"other: got {len(other)} entries, want {len(self)}: {', '.join(self.names)}")
         low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)

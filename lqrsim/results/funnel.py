@@ -167,7 +167,7 @@ class Funnel:
 
     @checked
     def states_at(self, knot: int, points: npt.ArrayLike, level: NonNegative) -> Array:
-        """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot."""
+        """The states (..., n) of points (..., d) of the unit ball, in the ellipsoid of a level at a knot."""
         knot = check_count("knot", knot, at_least=0, at_most=self.plan.steps)
         points = vectors_of("points", points, len(self.states))
         states = np.tile(self.plan.states[knot], (*points.shape[:-1], 1))

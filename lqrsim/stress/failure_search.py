@@ -95,7 +95,7 @@ class ReliabilityProblem(Study):
         report: Report | None = None,
         progress: TextProgress | None = None,
     ) -> "RareFailures":
-        """Estimate the probability of a rare failure by multilevel splitting: see `failure_probability`.
+        """The probability of a rare failure, estimated by multilevel splitting: see `failure_probability`.
 
         Args:
           particles: number of trials at each level. More of them give a shorter interval.
@@ -129,7 +129,7 @@ class ReliabilityProblem(Study):
         report: Report | None = None,
         progress: TextProgress | None = None,
     ) -> "SmallestFailure":
-        """Find the smallest disturbance that makes the policy fail: see `lqrsim.stress.smallest_failure`.
+        """The smallest disturbance that makes the policy fail, as found by `lqrsim.stress.smallest_failure`.
 
         Args:
           rounds: largest number of rounds; the search ends earlier if less than 1 % is left to gain.

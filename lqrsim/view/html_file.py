@@ -26,7 +26,7 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view.cameras import camera_view
-from lqrsim.view.options import OVERLAYS, Overlay
+from lqrsim.view.options import OVERLAYS
 from lqrsim.view.overlays import (
     Arrow,
     Dots,
@@ -34,7 +34,7 @@ from lqrsim.view.overlays import (
     Line,
     MovingBody,
     Overlays,
-    check_overlays,
+    Shown,
     common_scale,
     error_colours,
     legend_entries,
@@ -52,7 +52,7 @@ def render_html(
     path: str | os.PathLike[str],
     *,
     trial: int | Sequence[int] | None = None,
-    overlays: Sequence[Overlay] = OVERLAYS,
+    overlays: Shown = OVERLAYS,
     solution: Solution | None = None,
     funnel: Funnel | None = None,
 ) -> Path:
@@ -72,11 +72,11 @@ def render_html(
     path = check_path("path", path)
     if path.suffix.lower() != ".html":
         raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in .html")
-    shown, rows, arrays = check_overlays(overlays), _rows(rollout, trial), _Arrays()
+    rows, arrays = _rows(rollout, trial), _Arrays()
     scale = common_scale(RecordedTrial(rollout, row) for row in rows)
 
     def overlays_of(row: int) -> Overlays:  # one at a time, as each has a model of its own, which may be large
-        return Overlays(RecordedTrial(rollout, row), shown, scale, solution=solution, funnel=funnel)
+        return Overlays(RecordedTrial(rollout, row), overlays, scale, solution=solution, funnel=funnel)
 
     first = overlays_of(rows[0])
     geoms = drawn_geoms(first.recorded.model)

@@ -5,18 +5,21 @@ Each is drawn by MuJoCo (`geoms.py`), by a page in a browser (`html_file.py`) an
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import checked
-from lqrsim.errors import Array, InputError, check_items, check_name
+from lqrsim.annotations import Want, checked
+from lqrsim.errors import Array, InputError
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.results.solution import Solution
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
-from lqrsim.view.options import ALL_OVERLAYS, OVERLAY_KINDS, Colour, Overlay
+from lqrsim.view.options import OVERLAY_KINDS, Colour, Overlay
 from lqrsim.view.recorded_trial import RecordedTrial, interpolated
+
+Shown = Annotated[Sequence[Overlay], Want("a tuple of overlays")]
 
 # Opacities for planar robots and for robots in space.
 TUBE_OPACITY = {True: 0.43, False: 0.2}  # of a whole tube
@@ -155,14 +158,6 @@ def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.asarray(matplotlib.colormaps["cividis"](np.asarray(fractions, dtype=np.float64)))
 
 
-def check_overlays(overlays: object) -> tuple[Overlay, ...]:
-    """The overlays as a tuple. Raises InputError for other names."""
-    names = check_items("overlays", overlays, object, f"a tuple of: {', '.join(ALL_OVERLAYS)}", at_most=100)
-    for name in names:
-        check_name("overlays", name, ALL_OVERLAYS)
-    return names
-
-
 class Overlays:
     """The overlays of one trial that have something to draw.
 
@@ -181,7 +176,7 @@ class Overlays:
     def __init__(
         self,
         recorded: RecordedTrial,
-        show: Sequence[Overlay],
+        show: Shown,
         scale: Scale,
         *,
         solution: Solution | None = None,

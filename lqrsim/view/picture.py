@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 from mujoco.rendering.classic import gl_context
 
-from lqrsim.annotations import Want, checked
-from lqrsim.errors import Array, InputError, check_count, check_items, check_text, excerpt, keep
+from lqrsim.annotations import Bounds, Want, checked
+from lqrsim.errors import Array, InputError, check_items
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import geoms, gl
 from lqrsim.view.cameras import CameraView, camera_view
 from lqrsim.view.captions import Caption, Legend, Pixels
-from lqrsim.view.options import OVERLAYS, Box, Overlay, Quality, side_by_side, split_into_panes
-from lqrsim.view.overlays import Arrow, Overlays, check_overlays, common_scale
+from lqrsim.view.options import OVERLAYS, Box, Quality, side_by_side, split_into_panes
+from lqrsim.view.overlays import Arrow, Overlays, Shown, common_scale
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.video_metadata import Pane
 
@@ -151,6 +151,9 @@ MOST_INSETS = 3
 LEAST_HEIGHT = 16  # pixels of height that a caption must leave
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # colours between panes, and behind captions
 
+Pixel = Annotated[int, Bounds(at_least=64, at_most=LARGEST)]
+Title = Annotated[str, 100]
+
 
 @dataclass(frozen=True)
 class QualitySettings:
@@ -179,26 +182,21 @@ class PictureOptions:
 
     trial: int | Sequence[int] = 0
     camera: Annotated[str, Want("the name of a camera")] = "overview"
-    insets: Sequence[str] = ()
-    titles: Sequence[str] = ()
-    overlays: Sequence[Overlay] = OVERLAYS
+    insets: Annotated[Sequence[str], Want(f"a tuple of the names of cameras, {MOST_INSETS} at most")] = ()
+    titles: Annotated[Sequence[Title], Want("a tuple of texts, one for each run")] = ()
+    overlays: Shown = OVERLAYS
     solution: Solution | Sequence[Solution | None] | None = None
     funnel: Funnel | Sequence[Funnel | None] | None = None
     quality: Quality = "standard"
-    size: Annotated[tuple[int, int], Want("a width and a height in pixels")] | None = None
+    size: tuple[Pixel, Pixel] | None = None
     speed: float = 1.0
 
     def __post_init__(self) -> None:
-        size = _checked_size(self.pixels)
-        wanted = f"a tuple of the names of cameras, {MOST_INSETS} at most"
-        insets = check_items("insets", self.insets, str, wanted, at_most=100)
-        overlays = check_overlays(self.overlays)
-        titles = check_items("titles", self.titles, str, "a tuple of texts, one for each run", at_most=MOST_RUNS)
-        for title in titles:
-            check_text("titles", title, "a title", at_most=100, empty=True)
-        if len(insets) > MOST_INSETS:
-            raise InputError(f"insets: got {len(insets)}, want {MOST_INSETS} at most")
-        keep(self, insets=insets, overlays=overlays, titles=titles, size=size)
+        width, height = self.pixels
+        if width % 2 or height % 2:
+            raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
+        if len(self.insets) > MOST_INSETS:
+            raise InputError(f"insets: got {len(self.insets)}, want {MOST_INSETS} at most")
 
     @property
     def settings(self) -> QualitySettings:
@@ -342,16 +340,6 @@ class LivePicture:
         """Free the OpenGL context."""
         self._picture = None
         self._stack.close()
-
-
-def _checked_size(size: Any) -> tuple[int, int]:
-    pixels = check_items("size", size, object, "a width and a height in pixels", at_most=2)
-    if len(pixels) != 2:
-        raise InputError(f"size: got {excerpt(size)}, want a width and a height in pixels")
-    width, height = (check_count("size", side, at_least=64, at_most=LARGEST) for side in pixels)
-    if width % 2 or height % 2:
-        raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
-    return width, height
 
 
 def _runs_and_trials(

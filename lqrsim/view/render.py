@@ -28,7 +28,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.captions import Pixels
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
-from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, Picture, PictureOptions, open_picture
+from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, PictureOptions, open_picture
 from lqrsim.view.video_metadata import VideoMetadata
 
 QUEUE_LENGTH = 3  # largest number of frames that wait to be encoded
@@ -164,7 +164,9 @@ def render(
     animated = path.suffix.lower() == ".gif"
     fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)
-    size = size if size is not None or not animated else _gif_size(quality)
+    if animated and size is None:
+        width, height = (side // 2 for side in QUALITIES[quality].size)
+        size = max(width, SMALLEST_GIF[0]), max(height, SMALLEST_GIF[1])
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
         funnel=funnel, quality=quality, size=size, speed=speed,
@@ -225,13 +227,11 @@ def render_still(
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
         time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
-        earlier = [] if every is None else _multiples(every, time, drawn)
+        earlier = list[float]()
+        if every is not None:  # no more robots than can be told apart
+            earlier = np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
         Image.fromarray(drawn.draw(time, earlier=earlier)).save(unfinished)
     return PictureFile(path)
-
-
-def _multiples(every: float, time: float, drawn: Picture) -> list[float]:
-    return np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
 
 
 def _frame_count(end: float, speed: float, rate: Fraction) -> int:
@@ -240,12 +240,6 @@ def _frame_count(end: float, speed: float, rate: Fraction) -> int:
         frames = f"{count} frames, want at most {MOST_FRAMES}"
         raise InputError(f"speed, fps: got {speed:g} and {float(rate):g}, which are {frames}")
     return count
-
-
-@checked
-def _gif_size(quality: Quality) -> tuple[int, int]:
-    width, height = QUALITIES[quality].size  # pyright: ignore[reportArgumentType]
-    return max(width // 2, SMALLEST_GIF[0]), max(height // 2, SMALLEST_GIF[1])
 
 
 def _checked_path(path: str | os.PathLike[str], *suffixes: str) -> Path:

@@ -5,7 +5,6 @@ Rerun is the package `rerun-sdk`, in the extra `rerun`.
 
 import importlib
 import os
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -35,7 +34,12 @@ ENTITIES = {
 def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> None:
     """Write a trial as FILE.rrd, with a funnel about its plan. Raises InputError if the package is missing."""
     path = check_path("path", path, "the path of a file")
-    rerun, recorded = _package(path), RecordedTrial(rollout, trial)
+    try:
+        rerun = importlib.import_module("rerun")
+    except ImportError as error:
+        wanted = "the package rerun-sdk: pip install 'lqrsim[rerun]'"
+        raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
+    recorded = RecordedTrial(rollout, trial)
     shown: tuple[Overlay, ...] = OVERLAYS if funnel is None else (*OVERLAYS, "funnel")
     steps = rollout.plan.steps
     overlays = Overlays(recorded, shown, common_scale([recorded]), funnel=funnel, segments=steps)
@@ -50,14 +54,6 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
         recording.draw_tube()
         recording.draw_numbers()
         stream.disconnect()
-
-
-def _package(path: Path) -> Any:
-    try:
-        return importlib.import_module("rerun")
-    except ImportError as error:
-        wanted = "the package rerun-sdk: pip install 'lqrsim[rerun]'"
-        raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
 
 
 class _Recording:
