@@ -16,15 +16,9 @@ class FailureCertificate:
 
     Attributes:
       scenario: reference to the scenario, as in `ReliabilityProblem`.
-      strength: factor by which they are scaled.
-      goal_radius: as in `ReliabilityProblem`.
-      goal_tolerance: as in `ReliabilityProblem`.
       model: hash of the simulated MJCF.
       policy_digest: hash of everything that the controls depend on.
-      low: lower end of the interval.
-      high: upper end of the interval.
       repetitions: the estimate of each repetition, (R,).
-      particles: number of trials at each level.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       keep: fraction of the trials that exceeds the next level; 0 if failures were counted.
     """

@@ -50,7 +50,6 @@ class ExportedC:
 
     Attributes:
       sha256: hash of the policy's content, as in its file; it is also in the header.
-      table_bytes: size of the constant tables.
       rounding: (m,), the largest change of each control by rounding the gains, in the control's unit, if every state,
         including the filter's, is off its nominal value by one unit.
     """
@@ -168,7 +167,6 @@ class _Tables:
     """The constant tables of a policy, as C text.
 
     Attributes:
-      bytes: size of all tables.
       rounding: name of a table of matrices (T, rows, columns) -> the sum over the columns of the largest rounding error
         of each entry, (rows,).
       share: the largest rounding error of an entry, relative to the entry's largest magnitude over the steps.

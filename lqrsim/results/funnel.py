@@ -41,7 +41,6 @@ class Funnel:
     T steps, n states, k knots; d of the states may be off the plan, all others are on it.
 
     Attributes:
-      plan: nominal states and controls.
       states: names of the d states that may be off the plan.
       shape: (T+1, d, d), the ellipsoids of level 1, in the units of these states.
       family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
@@ -53,7 +52,6 @@ class Funnel:
       reasons: (k) why a level is 0, or why no larger level was tried; otherwise empty.
       rate: required fraction of runs that succeed.
       confidence: required confidence that all levels are right.
-      simulated: total number of trials that were run.
       goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
     """

@@ -89,7 +89,6 @@ class Target:
 
     Args:
       goal: (n,), NaN in the states that do not count; None without a goal.
-      plan: (T+1, n), the planned states.
 
     Attributes:
       state: (n,), the goal or the end of the plan; NaN in the states that do not count.

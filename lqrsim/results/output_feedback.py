@@ -32,18 +32,11 @@ class OutputFeedbackPolicy:
 
     Attributes:
       gain: (T, m, Z); u = clip(gain z + offset).
-      offset: (T, m).
       correction: the filter's gain, (T, Z, Y).
       sensor: (T, Y, n); the measurement of a state x is sensor x + sensor_offset.
-      sensor_offset: (T, Y).
       transition: (T, Z, Z), to the next control period: z = transition z + input u + drift.
-      input: (T, Z, m).
-      drift: (T, Z).
       nominal: (T, Z), z in an undisturbed run: the state, the actuator outputs if they lag, the states of the
         disturbances, and the pending commands if commands or measurements are late.
-      dt: seconds of a control period.
-      state_coordinates: names and units of the states, and which of them wrap.
-      control_coordinates: names, units and limits of the controls.
       measured_coordinates: names and units of the measured numbers, and which of them wrap.
     """
 

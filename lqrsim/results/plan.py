@@ -23,7 +23,6 @@ class Plan:
     A `Solution` and a `Replan` are plans with a `cost` and a `violation`.
 
     Attributes:
-      status: how the solve ended; see `Status`.
       detail: where and why it failed; for solutions also remarks.
       trajectory: the plan: the rollout of the policy by the model from its first state.
       cost_to_go: the value function of the law, a `Quadratic`; None if it is unknown, and for re-plans with
@@ -114,10 +113,8 @@ class Replan(Plan):
 
     Attributes:
       improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.
-      cost: cost of the plan, start and end included.
       before: cost of the rollout of the law that the solve began with.
       violation: violation of the worst constraint at the steps; 0 if all are kept.
-      seconds: time that the solve took.
       iterating: the part of `seconds` spent in iterations and in the first rollout.
     """
 

@@ -30,8 +30,6 @@ class AffinePolicy:
       offset: (T, m); bold l.
       nominal: (T, n), the state about which each law was computed. Angles of a measured state are taken nearest to it.
       dt: seconds between two laws.
-      state_coordinates: names and units of the states, and which of them wrap.
-      control_coordinates: names, units and limits of the controls.
     """
 
     gain: Annotated[Array, "T m n"]

@@ -36,7 +36,6 @@ class BallRecord:
     Attributes:
       driven: (K, T+1, B, 3) centres in the world, in metres; NaN where the states are NaN.
       planned: (T+1, B, 3) centres along the plan.
-      radii: (B,) radii in metres.
       anchors: (B, 4) number of the MJCF's body that a ball is fixed to, and its position in the body's axes in metres;
         NaN for a ball that names no site.
     """
@@ -69,7 +68,6 @@ class MovingObstacles:
     O obstacles, with axes and sizes as in an `Obstacle`.
 
     Attributes:
-      kinds: their kinds, such as "sphere".
       positions: (O, 3) at the beginning of the run, in metres.
       rotations: (O, 3, 3) with their axes as columns.
       sizes: (O, 3) in metres.
@@ -100,8 +98,6 @@ class Rollout:
 
     Attributes:
       model: the MJCF that was run, as text.
-      plan: the nominal states and controls.
-      state_coordinates: names and units of the states, and which of them wrap.
       goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan. If a
         `Replanner` had a goal that moved, the last one.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: in metres, or a scaled
@@ -125,7 +121,6 @@ class Rollout:
       failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
         from that knot on.
       reasons: (K) why the controller failed or its filter diverged; empty otherwise.
-      frame_times: (F,) seconds.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each disturbance, and whether the goal moved.
       first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.

@@ -27,17 +27,7 @@ def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
 @checked
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """States and the controls held between them.
-
-    Attributes:
-      states: (T+1, n).
-      controls: (T, m).
-      dt: seconds between two states.
-
-    Raises:
-      InputError: the shapes do not fit, there is no step, or dt is not above 0. NaN is allowed, because failed solves
-        contain it.
-    """
+    """States and the controls held between them, `dt` seconds each. Failed solves contain NaN, which is allowed."""
 
     states: Annotated[Array, "T+1 n"]
     controls: Annotated[Array, "T m"]

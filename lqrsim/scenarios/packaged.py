@@ -4,13 +4,12 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
 
 from lqrsim.annotations import Bounds, Line, Positive, Seed, Want, checked
-from lqrsim.errors import check_name
+from lqrsim.errors import check_name, keep
 from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
@@ -34,10 +33,6 @@ class Scenario(OneVersion):
     """A robot in a scene with a problem.
 
     Attributes:
-      name: name of the scenario on the command line.
-      summary: a line of description.
-      robot: the robot.
-      scene: its scene.
       problem: the problem to solve; change it with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: largest allowed distance of an undisturbed run from its plan, in metres.
       disturbances: the disturbances of the demo: clearly visible, but within the reach of the policy.
@@ -97,12 +92,10 @@ class Scenario(OneVersion):
 
     def plant(self) -> Plant:
         """The robot in its scene, ready to run: one plant, which is made when first needed."""
-        return self._plant
-
-    @cached_property
-    def _plant(self) -> Plant:
-        plant = Plant(self.robot, self.scene, self.simulator)
-        return plant.for_period(self.problem.dt) if self.fit_timestep else plant
+        if "_plant" not in vars(self):
+            plant = Plant(self.robot, self.scene, self.simulator)
+            keep(self, _plant=plant.for_period(self.problem.dt) if self.fit_timestep else plant)
+        return vars(self)["_plant"]
 
     @checked
     def settled(self, plan: Solution) -> "Scenario":

@@ -13,6 +13,7 @@ one kind of disturbance in a set.
 """
 
 import ast
+import contextlib
 import importlib
 import importlib.util
 import inspect
@@ -127,14 +128,14 @@ def _own_function(target: str) -> Callable[..., object]:
     module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     functions = {key: value for key, value in vars(module).items() if inspect.isfunction(value) and key[0] != "_"}
     if name not in functions:  # offered are the module's own, those that need arguments only if there are no others
-        own = [key for key, one in functions.items() if one.__module__ == module.__name__]
-        check_name(f"function in {place}", name, [key for key in own if not _needs_arguments(functions[key])] or own)
+        defined = {key: make for key, make in functions.items() if make.__module__ == module.__name__}
+        callable_so = []  # without arguments
+        for key, make in defined.items():
+            with contextlib.suppress(TypeError):
+                inspect.signature(make).bind()
+                callable_so.append(key)
+        check_name(f"function in {place}", name, callable_so or defined)
     return functions[name]
-
-
-def _needs_arguments(function: Callable[..., object]) -> bool:
-    parameters = inspect.signature(function).parameters.values()
-    return any(one.default is one.empty and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
 
 
 class _Uncached(SourceFileLoader):

@@ -107,10 +107,8 @@ class BreakingPoint:
     """The strength at which a policy breaks.
 
     Attributes:
-      below: the limit of the success rate.
       strength: the smallest tried strength at which the interval of the success rate lies below the limit; None without
         such a strength.
-      success: the success rate at this strength.
     """
 
     policy: str
@@ -139,7 +137,6 @@ class Comparison:
     """A comparison of two cells: on the same trials, or on trials of their own.
 
     Attributes:
-      rates: the success rate of each.
       success: success rate of the first minus that of the second, which is failure rate of the second minus that of the
         first. rms: the difference of the mean tracking errors, over the `both` trials in which both succeeded; None if
         there are fewer than two, or trials of their own.
@@ -190,7 +187,7 @@ def compared(
         of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
     """
     compared = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
-    tested = [place for place, one in enumerate(compared) if not np.isnan(one.p_value)]
+    tested = [place for place, pair in enumerate(compared) if not np.isnan(pair.p_value)]
     for place, adjusted in zip(tested, holm([compared[place].p_value for place in tested]).tolist(), strict=True):
         compared[place] = replace(compared[place], adjusted=adjusted)
     return compared

@@ -92,7 +92,10 @@ def run_campaign(
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
     deterministic = _check_runnable(campaign)
-    _check_folder(folder)
+    if os.path.isdir(folder) and not os.path.exists(folder / NAME):
+        names = (name for name in os.listdir(folder) if not name.startswith(".unfinished-"))
+        if others := sorted({*names} - _CAMPAIGN_FILES):
+            raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(sole_writer(folder))
@@ -176,16 +179,6 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
 def _is_own(kind: type[Disturbance]) -> bool:
     """Whether a class of disturbances is lqrsim's own."""
     return kind.__module__.partition(".")[0] == "lqrsim"
-
-
-def _check_folder(folder: Path) -> None:
-    """Raise InputError if the folder holds anything but a campaign."""
-    if os.path.isdir(folder) and not os.path.exists(folder / NAME):
-        others = sorted(
-            name for name in os.listdir(folder) if name not in _CAMPAIGN_FILES and not name.startswith(".unfinished-")
-        )
-        if others:
-            raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
 
 
 def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: list[tuple[str, float]]) -> None:

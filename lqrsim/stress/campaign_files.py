@@ -30,7 +30,7 @@ from lqrsim.annotations import Line, checked
 from lqrsim.errors import InputError, excerpt
 from lqrsim.results.archive import Other, blamed, canonical, parse, replacing, sha256
 from lqrsim.results.solution import Solution
-from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Cell, Shard
+from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Shard
 
 _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
 
@@ -107,7 +107,11 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
             raise ValueError(f"{file.metadata.num_rows} rows")
         arrow = file.read(use_threads=False)
         meta = json.loads((arrow.schema.metadata or {})[_KEY])
-        table = {name: _column(arrow[name]) for name in arrow.column_names}
+        texts = {field.name for field in arrow.schema if pa.types.is_string(field.type)}
+        table: Table = {
+            name: np.array(arrow[name].to_pylist(), dtype=np.str_) if name in texts else arrow[name].to_numpy()
+            for name in arrow.column_names
+        }
         good = meta == about | {"sha256": _digest(table, about)}
     except Exception as error:  # a parser may raise anything for damaged bytes
         raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
@@ -135,12 +139,6 @@ def read(path: Path, shard: Shard, campaign: str) -> Table:
 
 def _about(shard: Shard, campaign: str) -> dict[str, Any]:
     return {"campaign": campaign, "cell": shard.cell, "first": shard.first, "count": shard.count}
-
-
-def _column(column: pa.ChunkedArray) -> npt.NDArray[np.generic]:
-    if pa.types.is_string(column.type):
-        return np.array(column.to_pylist(), dtype=np.str_)
-    return column.to_numpy()
 
 
 def _digest(table: Table, about: Mapping[str, Any]) -> str:
@@ -243,11 +241,6 @@ def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
     # Disturbances are left out: they may be a user's, and the user's file is not loaded here.
     bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
     return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
-
-
-def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
-    """The cells of a manifest."""
-    return [Cell(*cell) for cell in manifest["cells"]]
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:

@@ -166,10 +166,7 @@ class FunnelCheck:
     """New trials at a knot of a funnel.
 
     Attributes:
-      knot: the knot at which the trials began.
-      level: level of the funnel at the knot.
       reached: the success rate with its exact interval.
-      successes: whether each trial reached the goal, (K,).
     """
 
     knot: Index

@@ -58,7 +58,6 @@ class HardeningRound:
     """A plan, and how its runs fail.
 
     Attributes:
-      solution: the plan.
       cost: its cost in the scenario's problem.
       rare: its failures; None if none was found.
       unfailing: number of independent trials that were run if none was found; none of them failed.

@@ -23,8 +23,6 @@ class Outcomes:
     """The outcomes of K trials, an array (K,) for each measure. Measures cover the time until the trial ended.
 
     Attributes:
-      trial: number of the trial.
-      outcome: one of OUTCOMES.
       obstacle: the obstacle that the trial collided with; empty if it ended otherwise.
       ended: time in seconds of its collision, divergence or error; the horizon without one.
       worst: largest tracking error, in `Rollout.tracking_unit`: metres for robots with a position.

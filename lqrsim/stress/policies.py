@@ -28,8 +28,6 @@ class PolicyKind(NamedTuple):
     """The way in which a policy is made.
 
     Attributes:
-      solver: the solver that computes its plan; a key of `scenarios.solutions.SOLVERS`.
-      controller: the controller that runs it; one of CONTROLLERS.
       designed: whether it is designed for disturbances that the user may choose.
       per_cell: whether it is designed anew for the disturbances of each cell, at their strength.
     """

@@ -17,7 +17,6 @@ class Recheck:
     """The repeated measurement of a certificate.
 
     Attributes:
-      certificate: the FailureCertificate.
       measured: the RareFailures with the same seed.
       differences: a line for each difference of the two; empty if there is none.
       changed: the reason why the bits may differ, so that only the intervals were compared: another seed, or changed

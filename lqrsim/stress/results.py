@@ -21,7 +21,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.analysis import Success, success
-from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
+from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, digest_of_solution, read, read_manifest
 from lqrsim.stress.data_table import DataTable, fraction_format
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
@@ -38,10 +38,6 @@ class Results:
     Args:
       folder: written by `run_campaign`.
       scenario: the campaign's reference, needed if the scenario is your own function: files never choose code to run.
-
-    Attributes:
-      manifest: the contents of manifest.json.
-      cells: the cells of the campaign.
     """
 
     _prefix = ""
@@ -55,7 +51,7 @@ class Results:
     ) -> None:
         self.folder = check_path("folder", folder, "the path of a campaign's folder")
         self.manifest = read_manifest(self.folder)
-        self.cells = cells_of(self.manifest)
+        self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
         self._scenario = scenario
         reference = self.manifest["campaign"]["scenario"]
         if scenario is not None:

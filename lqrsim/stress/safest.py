@@ -30,7 +30,6 @@ class ComparedPlan:
 
     Attributes:
       start: the start of its search.
-      solution: the result of the search.
       successes: whether each of the common trials reached the goal, (K,).
     """
 
@@ -48,7 +47,6 @@ class SafestPlan:
     """The plan with which most of the common trials reached the goal.
 
     Attributes:
-      solution: the solution with that plan.
       compared: all plans that were compared, the best first.
       reached: its success rate in fresh trials, with the exact interval. The trials by which it was selected would be
         biased.

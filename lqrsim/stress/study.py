@@ -147,8 +147,6 @@ class Study(Setup):
     Attributes:
       sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
         demo.
-      strength: factor by which they are scaled.
-      policy: as in `Campaign`.
     """
 
     design_disturbances: SetName | None = None

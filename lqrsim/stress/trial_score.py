@@ -29,9 +29,6 @@ class PrescribedDraws:
     """The methods of NumPy's generators that disturbances use, with numbers made from given standard normal numbers.
 
     Each draw uses the next given number. Uniform draws are its normal distribution function.
-
-    Attributes:
-      used: number of given numbers that have been used.
     """
 
     def __init__(self, numbers: Array) -> None:
@@ -170,7 +167,6 @@ class TrialScore:
     Attributes:
       sizes: number of random numbers that each disturbance draws.
       first: the first knot whose clearance counts in trials without a collision.
-      simulations: number of trials that have been run.
     """
 
     _prefix = ""

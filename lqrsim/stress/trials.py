@@ -99,7 +99,6 @@ class Job:
 
     Attributes:
       campaign: the campaign as in its manifest. digest: the manifest's. solutions: solutions by policy.
-      batch: number of trials to simulate together.
       run: an identifier that differs in every run, even of the same campaign.
     """
 

@@ -265,11 +265,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture of all runs at any time.
-
-    Attributes:
-      size: width and height in pixels.
-    """
+    """A picture of all runs at any time."""
 
     runs: Sequence[Rollout]
     parts: Sequence[RunPart]

@@ -42,13 +42,10 @@ GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still
 
 
 class MovableGoal:
-    """The goal position of a problem's final cost, which can be moved.
+    """The goal position of a problem's final cost, which can be moved. There must be exactly one.
 
     Attributes:
       place: the goal in the problem, (2 or 3,).
-
-    Raises:
-      InputError: the final cost has no goal position, or several.
     """
 
     def __init__(self, problem: Problem) -> None:
