@@ -173,13 +173,6 @@ def _short(bound: float) -> str:
     return text if float(text := f"{bound:g}") == bound else repr(float(bound))
 
 
-def keep_positive(record: object, *names: str, who: str = "") -> None:
-    """Check fields of a frozen record that are positive numbers, or None. `who` comes before them in messages."""
-    for name in names:
-        if (value := getattr(record, name)) is not None:
-            keep(record, **{name: check_number(f"{who}{name}", value, above=0.0)})
-
-
 def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = LARGEST_COUNT) -> int:
     """`value` as an int from `at_least` to `at_most`. Raises InputError otherwise."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
@@ -234,12 +227,6 @@ def check_function(
         ) from None
     except Exception:  # an object may raise anything when it is inspected
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
-
-
-def check_progress(progress: object, *, text: bool = False) -> None:
-    """Raises InputError unless it is None or a function of (done, total), with `text` of (done, total, text)."""
-    wanted = "a function progress(done, total, text)" if text else "a function progress(done, total)"
-    check_function("progress", progress, wanted, arguments=2 + text)
 
 
 def check_flag(field: str, value: object) -> bool:

@@ -466,7 +466,7 @@ def test_the_example_on_an_emulated_stm32f405(drive_solution: ls.Solution, tmp_p
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"policy": lambda x, t: [0, 0]}, "policy: got a function, want a Solution, an AffinePolicy"),
+        ({"policy": lambda x, t: [0, 0]}, "policy: got <function .*want a Solution, an AffinePolicy"),
         ({"number": "half"}, "number: got 'half', want one of: float, double"),
         ({"gains": "int8"}, "gains: got 'int8', want one of: full, int16"),
         ({"interpolate": 1}, "interpolate: got 1, want"),
@@ -529,7 +529,7 @@ def test_controllers_that_solve_or_estimate_are_named(
     )
     given: Any
     for given in (ls.Replanner(problem, drive_solution, every=1.0), law):
-        with pytest.raises(ls.InputError, match=f"got an? {type(given).__name__}, want a Solution"):
+        with pytest.raises(ls.InputError, match=f"got .*{type(given).__name__}.*, want a Solution"):
             ls.export_c(given, tmp_path)
     with pytest.raises(ls.InputError, match="policy: got a law with replan_every=1, want one without"):
         ls.export_c(law.policy, tmp_path)

@@ -34,7 +34,12 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     """
     console.check_output("--out", out)
     scenarios = {reference: resolve(reference) for reference in references}
-    video = video and _can_render()
+    if video:
+        try:
+            gl.bind()
+        except InputError as error:
+            console.say(f"No videos, everything else works: {error}")
+            video = False
     rows: list[str] = []
     failures: list[str] = []
     misses: list[str] = []
@@ -79,15 +84,6 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         console.say(f"FAILED {failure}")
     console.result(scenarios=results, misses=misses, failures=failures)
     return 1 if failures else 0
-
-
-def _can_render() -> bool:
-    try:
-        gl.bind()
-    except InputError as error:
-        console.say(f"No videos, everything else works: {error}")
-        return False
-    return True
 
 
 def _execute(

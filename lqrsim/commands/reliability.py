@@ -32,10 +32,12 @@ class FailureOptions(StudyOptions):
     """Output folder. By default runs/, the name of the command, and the name of the scenario."""
 
     def run(self) -> int:
+        from lqrsim.errors import check_count
         from lqrsim.scenarios.references import folder_name
 
         problem = ls.stress.ReliabilityProblem(**stated(self, ls.stress.ReliabilityProblem))
         folder = self.out or Path("runs") / type(self).__name__.lower() / folder_name(problem.resolved)
+        check_count("shown", getattr(self, "shown", 1))
         console.check_output("--out", folder)
 
         def write(found: Any) -> int:
@@ -79,7 +81,6 @@ class Rare(FailureOptions):
     SEARCH = "splitting", "repetition"
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "RareFailures":
-        _check_shown(self.shown)
         return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
 
     def _write(self, found: "RareFailures", folder: Path) -> int:
@@ -145,7 +146,6 @@ class Harden(FailureOptions):
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
 
-        _check_shown(self.shown)
         return ls.stress.harden(problem, **stated(self, ls.stress.harden, **callbacks))
 
     def _write(self, found: "HardenedPlan", folder: Path) -> int:
@@ -202,12 +202,6 @@ def _say_none(none: Exception) -> int:
     console.say(f"no failure was found ({none})")
     console.result(found=None, reason=str(none))
     return 1
-
-
-def _check_shown(shown: int) -> None:
-    from lqrsim.errors import check_count
-
-    check_count("shown", shown)
 
 
 def _wrote(folder: Path, result: str, files: Sequence[str]) -> None:

@@ -127,25 +127,19 @@ def videos_of_worst(results: Results, table: analysis.Table, count: int, folder:
         )
     for trial in chosen:
         command = results.command_of("replay", "--cell", str(trial.cell), "--trial", str(trial.trial))
-        video = {"label": _label(trial), "command": command, "data": "", "problem": problem}
-        yield video if problem else video | _video(results, trial, folder)
+        title = f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}"
+        outcome = f"{trial.outcome} with {trial.obstacle}" if trial.obstacle else trial.outcome
+        label = f"{title}: {outcome} after {trial.ended:.2f} s, least clearance {trial.clearance:.3f} m."
+        video = {"label": label, "command": command, "data": "", "problem": problem}
+        yield video if problem else video | _video(results, trial, title, folder)
 
 
-def _label(trial: analysis.Trial) -> str:
-    what = f" with {trial.obstacle}" if trial.obstacle else ""
-    return (
-        f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}:"
-        f" {trial.outcome}{what} after {trial.ended:.2f} s, least clearance {trial.clearance:.3f} m."
-    )
-
-
-def _video(results: Results, trial: analysis.Trial, folder: Path) -> dict[str, Any]:
+def _video(results: Results, trial: analysis.Trial, title: str, folder: Path) -> dict[str, Any]:
     """The video as text, or the reason why there is none."""
     from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
 
     try:
         rollout = replay(results, trial.cell, trial.trial)
-        title = f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}"
         for width, height in SIZES:
             path = render(rollout, folder / "video.mp4", titles=[title], size=(width, height), fps=FPS)
             if path.stat().st_size <= LARGEST:
@@ -223,22 +217,23 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
     if erred:
         warnings.append(f"{erred} trials ended with an error; they count as failures.")
     warnings += [f"{line}." for line in results.came_to_nothing()]
-    commands = {
-        "To resume or repair the campaign": results.command,
-        "This page": results.command_of("report"),
-    }
+    target = next(iter(results.trials.solutions.values())).target
+    radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance, target=target)
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
         "facts": _facts(results, table, scenario),
-        "commands": commands,
+        "commands": {
+            "To resume or repair the campaign": results.command,
+            "This page": results.command_of("report"),
+        },
         "asked": json.dumps(manifest["campaign"], indent=2, ensure_ascii=False),
         "breaks": breaks_table(table),
         "breaks_note": f"The lowest tested strength at which the 95 % interval of the success rate is entirely"
         f" below {100 * BROKEN_BELOW:g} %, in ascending order.",
-        "success_note": f"A trial succeeds if it ends within {_reach(results, scenario)}, without a collision"
-        " until then. Tables have exact (Clopper-Pearson) intervals of 95 %, the bands of the curves are Wilson's."
-        " If nothing is random all trials are the same run, and there is no interval.",
+        "success_note": f"A trial succeeds if it ends within {radius:g} {target.unit} of the {target.name}, without a"
+        " collision until then. Tables have exact (Clopper-Pearson) intervals of 95 %, the bands of the curves are"
+        " Wilson's. If nothing is random all trials are the same run, and there is no interval.",
         "compared": comparison_tables(whole, tracking_unit(scenario.problem.dynamics.state_coordinates)),
         "compared_note": "Trials of the same number have the same random numbers for all policies. Policies differ in"
         " the trials in which only one of them succeeded: p is from McNemar's exact test, corrected for the number of"
@@ -252,14 +247,6 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
         "worst": worst_table(table, tracking_unit(scenario.problem.dynamics.state_coordinates)),
         "worst_note": f"Of each policy and sweep the {WORST_EACH} worst. {analysis.RANKING}",
     }
-
-
-def _reach(results: Results, scenario: Scenario) -> str:
-    """The distance, as text, within which a trial has reached its goal."""
-    target = next(iter(results.trials.solutions.values())).target
-    campaign = results.campaign
-    radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance, target=target)
-    return f"{radius:g} {target.unit} of the {target.name}"
 
 
 def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, list[str]]:
@@ -497,12 +484,11 @@ def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) 
     points = [point for of_policy in curves.values() for point in of_policy]
     strengths = sorted({point.cell.strength for point in points})
     of_cell = {(point.cell.policy, point.cell.strength): point for point in points}
-    rows = [[f"{s:g}", *(_share(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
+
+    def share(point: analysis.Success | None) -> str:
+        if point is None:
+            return "not run"
+        return f"{point.reached}/{point.trials}, {'deterministic: 1 run' if point.alike else _percent(point.exact)}"
+
+    rows = [[f"{s:g}", *(share(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
     return PageTable(f"{sweep}: trials that reached their goal", ("strength", *curves), rows)
-
-
-def _share(point: analysis.Success | None) -> str:
-    if point is None:
-        return "not run"
-    count = f"{point.reached}/{point.trials}"
-    return f"{count}, deterministic: 1 run" if point.alike else f"{count}, {_percent(point.exact)}"

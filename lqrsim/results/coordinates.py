@@ -243,7 +243,11 @@ class Coordinates:
         """The lowest and the highest value of each entry, (n,) each, as `limited` takes them."""
         if isinstance(limits, Mapping):
             low, high = np.array(self.low), np.array(self.high)
-            for i, pair in self._by_name(field, limits, _pair).items():
+
+            def pair_of(entry: str, pair: object) -> Array:
+                return check_array(entry, pair, (2,), infinite=True)  # pyright: ignore[reportArgumentType]
+
+            for i, pair in self._by_name(field, limits, pair_of).items():
                 low[i], high[i] = pair
             return low, high
         try:
@@ -310,12 +314,6 @@ def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose
                 f"{field}: got {what} with the {kind} {', '.join(one.names)}, want {', '.join(other.names)}, as"
                 f" {whose} has them"
             )
-
-
-def _pair(field: str, given: object) -> tuple[float, float]:
-    """(lowest, highest), which may be infinite."""
-    low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
-    return low, high
 
 
 def _letter(name: str) -> str:

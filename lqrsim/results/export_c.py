@@ -15,8 +15,8 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Line, checked
-from lqrsim.errors import Array, InputError, check_flag, check_name, check_path, check_text, excerpt
+from lqrsim.annotations import Line, OneOf, Want, checked
+from lqrsim.errors import Array, InputError, check_path, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -40,6 +40,7 @@ LARGEST = 32767  # largest integer in 16 bits
 # in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
 SHARES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
 NUMBERS, GAINS = ("float", "double"), ("full", "int16")
+EXPORTED = "a Solution, an AffinePolicy, such as of track, or an OutputFeedbackPolicy, such as OffsetFree(...).policy"
 DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
 
 
@@ -66,14 +67,15 @@ class ExportedC:
         return "\n".join([*lines, *_bounds(self.controls, self.rounding)])
 
 
+@checked
 def export_c(
-    policy: Solution | AffinePolicy | OutputFeedbackPolicy,
+    policy: Annotated[Solution | AffinePolicy | OutputFeedbackPolicy, Want(EXPORTED)],
     folder: str | os.PathLike[str],
     *,
-    number: str = "float",
-    gains: str = "full",
+    number: Annotated[str, OneOf(NUMBERS)] = "float",
+    gains: Annotated[str, OneOf(GAINS)] = "full",
     interpolate: bool = False,
-    name: str = "policy",
+    name: Annotated[str, Want("a name of at most 40 letters"), 40] = "policy",
 ) -> ExportedC:
     """Write a policy as C99 with constant tables, and an example with a CMake file.
 
@@ -97,18 +99,13 @@ def export_c(
     Raises:
       InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
     """
-    wanted = "a Solution, an AffinePolicy, such as of track, or an OutputFeedbackPolicy, such as OffsetFree(...).policy"
-    kinds = Solution, AffinePolicy, OutputFeedbackPolicy
-    if not isinstance(policy, kinds):
-        raise InputError(f"policy: got {_kind_of(policy)}, want {wanted}")
-    folder, number = check_path("folder", folder, "the path of a folder"), check_name("number", number, NUMBERS)
-    gains, name = check_name("gains", gains, GAINS), check_text("name", name, at_most=40)
+    folder = check_path("folder", folder, "the path of a folder")
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):
         raise InputError(f"name: got {excerpt(name)}, want lower-case letters, digits and _, such as policy")
     if name in HEADERS.split():
         raise InputError(f"name: got {excerpt(name)}, the name of a header of C, want another, such as policy")
     law = policy.policy if isinstance(policy, Solution) else policy
-    if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
+    if interpolate and isinstance(law, OutputFeedbackPolicy):
         raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")
     kind = FILTER if isinstance(law, OutputFeedbackPolicy) else FEEDBACK
     measured = law.measured_coordinates if isinstance(law, OutputFeedbackPolicy) else law.state_coordinates
@@ -342,11 +339,6 @@ def _bounds(labels: Iterable[str], rounding: Iterable[float]) -> list[str]:
 def _up(value: float) -> str:
     """A bound with three digits, rounded up."""
     return f"{value * 1.005:.2e}"
-
-
-def _kind_of(value: object) -> str:
-    name = type(value).__name__
-    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
 
 
 def _rows(

@@ -8,17 +8,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Chance, Line, NonNegative, Positive, checked
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_name,
-    check_symmetric,
-    excerpt,
-    shaped,
-    vectors_of,
-)
+from lqrsim.annotations import Bounds, Chance, Index, Line, NonNegative, OneOf, Positive, checked
+from lqrsim.errors import Array, InputError, check_name, check_symmetric, excerpt, shaped, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
@@ -63,7 +54,7 @@ class Funnel:
     control_coordinates: Annotated[Coordinates, "m"]
     states: Annotated[tuple[Line, ...], "d"]
     shape: Annotated[Array, "T+1 d d", Bounds()]
-    family: Line
+    family: Annotated[str, OneOf(FAMILIES)]
     knots: Annotated[npt.NDArray[np.int64], "k"]
     levels: Annotated[Array, "k", Bounds(at_least=0.0)]
     trials: Annotated[npt.NDArray[np.int64], "k"]
@@ -80,7 +71,6 @@ class Funnel:
     versions: Mapping[str, Line] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_name("Funnel: family", self.family, FAMILIES)
         if not self.plan.finite:
             raise InputError("Funnel: plan: got NaN or infinity, want finite states and controls")
         if not self.states or len(set(self.states)) < len(self.states):
@@ -164,9 +154,10 @@ class Funnel:
         return np.where(inside.all(axis=0), np.inf, self.plan.dt * np.argmin(inside, axis=0))
 
     @checked
-    def states_at(self, knot: int, points: npt.ArrayLike, level: NonNegative) -> Array:
+    def states_at(self, knot: Index, points: npt.ArrayLike, level: NonNegative) -> Array:
         """The states (..., n) of points (..., d) of the unit ball, in the ellipsoid of a level at a knot."""
-        knot = check_count("knot", knot, at_least=0, at_most=self.plan.steps)
+        if knot > self.plan.steps:
+            raise InputError(f"knot: got {knot}, want a whole number from 0 to {self.plan.steps}")
         points = vectors_of("points", points, len(self.states))
         states = np.tile(self.plan.states[knot], (*points.shape[:-1], 1))
         states[..., self.chosen] += level * points @ self._root(knot).T

@@ -174,7 +174,9 @@ class Target:
         return np.where(np.isfinite(states).all(axis=-1), apart, np.nan)
 
     @checked
-    def radius(self, robot_radius: float | None, goal_radius: float | None, goal_tolerance: Positive | None) -> float:
+    def radius(
+        self, robot_radius: float | None, goal_radius: Positive | None, goal_tolerance: Positive | None
+    ) -> float:
         """The distance within which the target counts as reached.
 
         Args:
@@ -189,7 +191,7 @@ class Target:
                     " has a position"
                 )
             if goal_radius is not None:
-                return check_number("goal_radius", goal_radius, above=0.0)
+                return goal_radius
             return self.on_the_way(check_number("goal_radius", robot_radius, above=0.0))
         if goal_radius is not None:
             names = ", ".join(self.space.names)

@@ -10,8 +10,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Positive, checked, repr_of
-from lqrsim.errors import Array, InputError, check_number, excerpt, vectors_of
+from lqrsim.annotations import Bounds, NonNegative, Positive, checked, repr_of
+from lqrsim.errors import Array, InputError, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 
@@ -82,7 +82,8 @@ class OutputFeedbackPolicy:
         """The state of the filter before the first measurement, (Z,)."""
         return self.nominal[0].copy()
 
-    def step(self, z: npt.ArrayLike, measurement: npt.ArrayLike | None, t: float) -> tuple[Array, Array]:
+    @checked
+    def step(self, z: npt.ArrayLike, measurement: npt.ArrayLike | None, t: NonNegative) -> tuple[Array, Array]:
         """The controls (..., m) of this control period, and z (..., Z) for the next. Call it once in each period.
 
         After the horizon the last recursion holds.
@@ -91,7 +92,7 @@ class OutputFeedbackPolicy:
           z: (..., Z), from `start` or the previous call; it is not changed.
           measurement: (..., Y), angles in any representative; None if it was lost: z is then only predicted.
         """
-        z, t = vectors_of("z", z, self.nominal.shape[1]), check_number("t", t, at_least=0.0)
+        z = vectors_of("z", z, self.nominal.shape[1])
         k, n = int(min(t / self.dt + 1e-9, self.steps - 1)), len(self.state_coordinates)
         if not np.isfinite(z).all():
             raise InputError(f"z: got {excerpt(z)}, want finite numbers")

@@ -11,8 +11,8 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Positive, checked, repr_of
-from lqrsim.errors import Array, InputError, check_count, check_flag, check_number, excerpt, vectors_of
+from lqrsim.annotations import NonNegative, Positive, checked, repr_of
+from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Horizon, left_after
@@ -69,21 +69,22 @@ class AffinePolicy:
         step = check_count("step", step, at_least=0, at_most=self.steps - 1)
         return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
 
-    def __call__(self, state: npt.ArrayLike, t: float, *, interpolate: bool = False) -> Array:
+    @checked
+    def __call__(self, state: npt.ArrayLike, t: NonNegative, *, interpolate: bool = False) -> Array:
         """The control (..., m), within its limits, for a measured state (..., n), `t` seconds after the start.
 
         Angles and rotation vectors may be in any representative. The result is clipped to the control limits. Between
         two knots the earlier law holds, as in the plan; `interpolate=True` blends the two, for controllers that run
         faster than the plan. After the horizon the last law holds.
         """
-        state, t = vectors_of("state", state, self.gain.shape[-1]), check_number("t", t, at_least=0.0)
+        state = vectors_of("state", state, self.gain.shape[-1])
         if not np.isfinite(state).all():
             raise InputError(f"state: got {excerpt(state)}, want finite numbers")
         # Rounding must not put a time at a knot before it.
         knot = t / self.dt + 1e-9
         step = int(min(knot, self.steps - 1))
         gain, offset, nominal = self.gain[step], self.offset[step], self.nominal[step]
-        if check_flag("interpolate", interpolate) and step + 1 < self.steps:
+        if interpolate and step + 1 < self.steps:
             weight = max(knot - 1e-9 - step, 0.0)
             gain = (1 - weight) * gain + weight * self.gain[step + 1]
             offset = (1 - weight) * offset + weight * self.offset[step + 1]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import checked, repr_of
-from lqrsim.errors import Array, InputError, check_kind, check_shape, vectors_of
+from lqrsim.errors import Array, InputError, check_shape, vectors_of
 
 
 @contextlib.contextmanager
@@ -44,8 +44,8 @@ class Quadratic:
         if not self.gradient.shape[-1]:
             raise InputError("Quadratic: got no state, want at least one")
 
+    @checked
     def __add__(self, other: "Quadratic") -> "Quadratic":
-        check_kind("other", other, Quadratic, "a Quadratic")
         if other.hessian.shape != self.hessian.shape:
             raise InputError(f"other: got a hessian of shape {other.hessian.shape}, want {self.hessian.shape}")
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)

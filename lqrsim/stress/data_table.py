@@ -125,9 +125,15 @@ class DataTable:
     def _rows(self, text: Callable[[str], str], number: Callable[[str], str]) -> Iterator[list[str]]:
         """The headings, then the rows, as `text` and `number` write them."""
         specs = [self.formats.get(name, "g") for name in self.columns]
+
+        def written(entry: Entry, spec: str) -> str:
+            if isinstance(entry, str):
+                return text(entry)
+            return "" if entry is None else number(str(entry) if isinstance(entry, int) else format(entry, spec))
+
         yield [text(name) for name in self.columns]
         for row in zip(*self.columns.values(), strict=True):
-            yield [_shown(entry, spec, text, number) for entry, spec in zip(row, specs, strict=True)]
+            yield [written(entry, spec) for entry, spec in zip(row, specs, strict=True)]
 
 
 _WRITERS = {".csv": DataTable.csv, ".tex": DataTable.latex, ".md": DataTable.markdown}
@@ -155,14 +161,6 @@ def _entry(field: str, value: object) -> Entry:
     if isinstance(value, (int, np.integer)):
         return check_count(field, value, at_least=-(2**63), at_most=2**63 - 1)  # what readers of a CSV hold
     return check_number(field, value)
-
-
-def _shown(entry: Entry, spec: str, text: Callable[[str], str], number: Callable[[str], str]) -> str:
-    if entry is None:
-        return ""
-    if isinstance(entry, str):
-        return text(entry)
-    return number(str(entry) if isinstance(entry, int) else format(entry, spec))
 
 
 def _lines(*lines: str) -> str:

@@ -232,11 +232,6 @@ def harden(
     return search.result(search.shortfall())
 
 
-def _trials_for(chance: float) -> int:
-    """The number of trials without a failure whose exact upper bound is at most the chance."""
-    return ceil(log((1 - CONFIDENCE) / 2) / log1p(-chance))
-
-
 class _Search:
     """The plans so far."""
 
@@ -312,7 +307,8 @@ class _Search:
         try:
             return problem.rare_failures(**options, keep=keep, progress=progress)
         except NoFailure as none:
-            needed = _trials_for(self.chance)
+            # Without a failure among so many trials, the exact upper bound is at most the chance.
+            needed = ceil(log((1 - CONFIDENCE) / 2) / log1p(-self.chance))
             if none.trials >= needed or needed > MOST_COUNTED:
                 return none
         options["particles"] = max(20, ceil(needed / options["repetitions"]))

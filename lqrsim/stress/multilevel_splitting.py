@@ -238,7 +238,7 @@ def _pilot_run(
         return vectors, scores
 
     while len(levels) < most_levels:
-        level, drawn = min(_exceeded_by(keep, scores), 0.0), 1
+        level, drawn = min(float(np.quantile(scores, 1 - keep, method="inverted_cdf")), 0.0), 1
         if on_level is not None:
             on_level(level)
         above, enough = scores > level, min(ABOVE, int(keep * particles))
@@ -266,22 +266,12 @@ def _pilot_run(
         vectors, scores = _resample(vectors, scores, level, particles, rng)
         for _ in range(moves):
             vectors, scores, accepted = _crank_nicolson_step(score, vectors, scores, level, b, rng)
-            b = _adapted(b, accepted)
+            b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))  # larger if more are accepted than wanted
         levels.append(level)
         step_sizes.append(b)
     raise NoFailure(
         f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none exist"
     )
-
-
-def _exceeded_by(share: float, scores: Array) -> float:
-    """The score that this share of the scores exceeds."""
-    return float(np.quantile(scores, 1 - share, method="inverted_cdf"))
-
-
-def _adapted(b: float, accepted: float) -> float:
-    """The next step size, larger if more moves are accepted than wanted."""
-    return float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
 
 
 def _repetition(

@@ -3,7 +3,7 @@
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -182,7 +182,10 @@ class Results:
     def designs(self) -> dict[str, str]:
         """For which disturbances each policy was designed that is designed for any, by policy."""
         stated, found = self.manifest["campaign"]["design_disturbances"], dict[str, str]()
-        told = f"the preset {DEFAULT_DESIGN}" if stated is None else ", ".join(map(_described, stated))
+        told = f"the preset {DEFAULT_DESIGN}"
+        if stated is not None:  # as it is written in Python
+            settings = (", ".join(f"{name}={value}" for name, value in one["settings"].items()) for one in stated)
+            told = ", ".join(f"{one['kind']}({text})" for one, text in zip(stated, settings, strict=True))
         for policy in self.manifest["policies"]:
             kind = POLICY_KINDS[policy]
             if kind.designed:
@@ -310,11 +313,6 @@ class Results:
         reference = self.manifest["campaign"]["scenario"]
         code = ["--scenario", reference] if names_code(reference) else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *code])
-
-
-def _described(disturbance: Mapping[str, Any]) -> str:
-    """A disturbance of a manifest, as it is written in Python."""
-    return f"{disturbance['kind']}({', '.join(f'{name}={value}' for name, value in disturbance['settings'].items())})"
 
 
 @checked

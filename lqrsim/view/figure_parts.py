@@ -135,7 +135,9 @@ class Views:
             for path in self.paths:
                 looks = {"color": path.colour, "linewidth": path.width, "zorder": path.zorder}
                 axes.plot(*path.points[:, along].T, path.line, label=path.label, **looks)
-            mark_ends(axes, self.paths[-1].points[:, along])
+            start, end = self.paths[-1].points[[0, -1]][:, along]
+            axes.plot(*start, "o", color=PLAN, markersize=6, zorder=3, label="start")
+            axes.plot(*end, "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
             letters = "xyz" if in_space else self.space.plane
             draw_moved(axes, self.moved, ["xyz".index(letters[i]) for i in along])
         return views
@@ -147,12 +149,6 @@ def planes_of(places: Array) -> list[tuple[int, int]]:
         return [(0, 1)]
     x, y, _ = np.ptp(places, axis=0)
     return [(0, 1), (0, 2) if x >= y else (1, 2)]
-
-
-def mark_ends(axes: Axes, path: Array) -> None:
-    """Mark the start and the end of a planned path (T+1, 2 or 3)."""
-    axes.plot(*path[:1].T, "o", color=PLAN, markersize=6, zorder=3, label="start")
-    axes.plot(*path[-1:].T, "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
 
 
 def bounds(places: Array, world: World, margin: float | Array = 0.0) -> tuple[Array, Array]:
@@ -173,10 +169,14 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
         return
     # Contours of the planner's own distance, for any obstacles. Grid lines through obstacles keep the corners of walls
     # sharp, and those that are smaller than a cell.
-    x, y = (
-        np.unique(np.append(np.linspace(low[i], high[i], CELLS), [_across(obstacle, i) for obstacle in flat.obstacles]))
-        for i in (0, 1)
-    )
+    grid = []
+    for axis in (0, 1):
+        lines = [np.linspace(low[axis], high[axis], CELLS)]
+        for obstacle in flat.obstacles:
+            half = np.abs(obstacle.rotation[axis]) @ np.nan_to_num(_half_sizes(obstacle), posinf=0.0)
+            lines.append(obstacle.position[axis] + half * RINGS)
+        grid.append(np.unique(np.concatenate(lines)))
+    x, y = grid
     distance = distances.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
     levels = [-np.inf, 0, radius] if radius > 0 else [-np.inf, 0]
     axes.contourf(x, y, distance, levels=levels, colors=[SOLID, MARGIN][: len(levels) - 1])
@@ -184,12 +184,6 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
     axes.fill([], [], facecolor=SOLID, edgecolor=EDGE, label="obstacle")  # for the legend
     if radius > 0:
         axes.fill([], [], facecolor=MARGIN, label=NEAR)
-
-
-def _across(obstacle: Obstacle, axis: int) -> Array:
-    """Grid lines through an obstacle along an axis."""
-    half = np.abs(obstacle.rotation[axis]) @ np.nan_to_num(_half_sizes(obstacle), posinf=0.0)
-    return obstacle.position[axis] + half * RINGS
 
 
 def _half_sizes(obstacle: Obstacle) -> Array:

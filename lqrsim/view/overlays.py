@@ -142,13 +142,11 @@ def common_scale(recordings: Iterable[RecordedTrial]) -> Scale:
     """The scale for all of these runs, at all times."""
     largest = [(recorded.error.max(), np.linalg.norm(recorded.force, axis=1).max()) for recorded in recordings]
     error, force = (float(most) for most in np.max(largest, axis=0))
-    return Scale(_round_up(max(error, 0.01)), force)
-
-
-def _round_up(value: float) -> float:
-    """Round up to one of 1, 1.5, 2, 3, 5, 7, 10, 15, ..."""
-    power = 10.0 ** np.floor(np.log10(value) + 1e-9)
-    return float(power * next(step for step in (1, 1.5, 2, 3, 5, 7, 10) if step * power >= value * (1 - 1e-9)))
+    error = max(error, 0.01)
+    power = 10.0 ** np.floor(np.log10(error) + 1e-9)
+    # Rounded up to one of 1, 1.5, 2, 3, 5, 7, 10, 15, ...
+    steps = (step for step in (1, 1.5, 2, 3, 5, 7, 10) if step * power >= error * (1 - 1e-9))
+    return Scale(float(power * next(steps)), force)
 
 
 def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:

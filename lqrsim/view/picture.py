@@ -86,7 +86,9 @@ class SceneRenderer:
         self.window.make_current()
         for (box, view), faded in zip(self.views, self.faded, strict=True):
             view.place(scene, data, time)
-            self._move_headlight()
+            for light in scene.lights[: scene.nlight]:  # a headlight moves with the camera
+                if light.headlight:
+                    light.pos, light.dir = scene.camera[0].pos, scene.camera[0].forward
             faded += np.clip(self._occluders() - faded, -fade, fade)
             with self._fade(faded, of_model):
                 for arrow in self.overlays.drawables:
@@ -101,12 +103,6 @@ class SceneRenderer:
         whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
         mujoco.mjr_readPixels(self.pixels, None, whole, self.context)
         return self.pixels[::-1]
-
-    def _move_headlight(self) -> None:
-        """Move the headlight to the camera."""
-        for light in self.scene.lights[: self.scene.nlight]:
-            if light.headlight:
-                light.pos, light.dir = self.scene.camera[0].pos, self.scene.camera[0].forward
 
     def _occluders(self) -> npt.NDArray[np.bool_]:
         """Flags (ngeom,) of the geoms between the camera and the robot's centre or outline."""
@@ -250,7 +246,10 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
         parts: list[RunPart] = []
         panes: list[Pane] = []
         for recorded, drawn, box, caption, (run, row) in zip(recordings, overlays, boxes, captions, shown, strict=True):
-            _set_quality(recorded, options.settings)
+            quality, settings = recorded.model.vis.quality, options.settings
+            quality.shadowsize, quality.offsamples = settings.shadows, settings.samples
+            # Lines are boxes under a distant sun, for which one quadrilateral per side suffices; the default is 16.
+            quality.numquads = 1
             areas = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
             named = zip((camera, *insets), areas, strict=True)
             views = [(area, camera_view(name, recorded, area.aspect, beside=recordings)) for name, area in named]
@@ -363,13 +362,6 @@ def _one_each(field: str, values: Any, of: Sequence[object]) -> list[Any]:
     if len(values) != len(of):
         raise InputError(f"{field}: got {len(values)}, want one for each of {len(of)} runs")
     return list(values)
-
-
-def _set_quality(recorded: RecordedTrial, settings: QualitySettings) -> None:
-    quality = recorded.model.vis.quality
-    quality.shadowsize, quality.offsamples = settings.shadows, settings.samples
-    # Lines are boxes under a distant sun, for which one quadrilateral per side suffices; MuJoCo's default is 16.
-    quality.numquads = 1
 
 
 def _draw_edge(image: Pixels, box: Box) -> None:

@@ -67,7 +67,9 @@ class RecordedTrial:
         self.times, self.states = rollout.times[alive], rollout.states[trial, alive]
         self.measured = rollout.measured[trial, alive]
         self.error, self.clearance = rollout.tracking_error[trial, alive], rollout.clearance[trial, alive]
-        self.force = _recent_mean(rollout.forces[trial], rollout.plan.dt)
+        window = max(round(FORCE_WINDOW / rollout.plan.dt), 1)
+        total = np.cumsum(np.vstack([np.zeros((window, 3)), np.nan_to_num(rollout.forces[trial])]), axis=0)
+        self.force = (total[window:] - total[:-window]) / window  # means until the end of each period
         self.end = float(rollout.times[-1])
         self.planar = rollout.state_coordinates.from_above
         self.robot = robot_body(self.model, rollout.body)
@@ -145,13 +147,6 @@ class RecordedTrial:
 def interpolated(points: Array, times: Array, at: Array | float) -> Array:
     """Points (..., c) between rows of a table (k, c), which belong to increasing times (k,)."""
     return np.stack([np.interp(at, times, column) for column in points.T], axis=-1)
-
-
-def _recent_mean(forces: Array, dt: float) -> Array:
-    """Mean forces (T, 3) over FORCE_WINDOW before the end of each period."""
-    window = max(round(FORCE_WINDOW / dt), 1)
-    total = np.cumsum(np.vstack([np.zeros((window, 3)), np.nan_to_num(forces)]), axis=0)
-    return (total[window:] - total[:-window]) / window
 
 
 @checked
