@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from paper import settling
-from paper.common import as_in_the_paper, figure, numbers, picture
+from paper.common import as_in_the_paper, bootstrap, figure, numbers, picture
 from paper.convergence_figures import ABOVE, EVERY, LINES, draw_ellipsoids, draw_iterations, draw_order
 from paper.convergence_runs import (
     FINISHED,
@@ -35,7 +35,6 @@ from paper.rates import CLOSE, FEWEST, ROUNDING, Rate, rate
 from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
 
 import lqrsim as ls
-from lqrsim.stress.statistics import bootstrap
 
 CONSTANT, SECOND = (0.8, 1.3), 1.5  # orders that count as a constant factor; as second order, from there on
 FEW = 0.05  # share of queries that does not count

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
-from paper.common import figure, numbers, picture
+from paper.common import draw_in_space, figure, numbers, picture
 from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
 
 import lqrsim as ls
@@ -134,7 +134,7 @@ def draw_paths(
             if len(place) == 3:
                 axes = drawn.add_subplot(grid[number], projection="3d")
                 assert isinstance(axes, Axes3D)
-                figure_parts.draw_in_space(axes, scenario.scene.world, low, high)
+                draw_in_space(axes, scenario.scene.world, low, high)
                 axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))
             else:
                 axes = drawn.add_subplot(grid[number])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
-from paper.common import as_in_the_paper, figure, numbers, picture, render_still
+from paper.common import as_in_the_paper, draw_in_space, figure, numbers, picture, render_still
 from runner import FolderSettings, Result, Statement, between, interval, opening, run, table
 from scipy.spatial.transform import Rotation
 
@@ -82,7 +82,7 @@ def draw(config: Config, result: Result, scenario: ls.Scenario, solution: ls.Sol
         space = drawn.add_axes((0.0, 0.07, 0.38, 0.93), projection="3d")
         assert isinstance(space, Axes3D)
         low, high = figure_parts.bounds(plan.states[:, :3], world)
-        figure_parts.draw_in_space(space, world, low, high)
+        draw_in_space(space, world, low, high)
         space.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))  # those of the corners would touch
         space.plot(*plan.states[:, :3].T, color=PLAN)
         for step in range(0, plan.steps + 1, round(EVERY / plan.dt)):

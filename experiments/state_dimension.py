@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator, StrMethodFormatter
-from paper.common import as_in_the_paper, figure, numbers, picture
+from paper.common import as_in_the_paper, bootstrap, figure, numbers, picture
 from runner import FolderSettings, Result, Statement, between, interval, opening, run, table
 from solver_benchmark.common import median, take_turns
 from solver_benchmark.scaling import chain_of_masses
@@ -25,7 +25,6 @@ from solver_benchmark.scaling import chain_of_masses
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.costs import CostSum, terms_of
-from lqrsim.stress.statistics import bootstrap
 from lqrsim.view.style import LIMIT, PLAN, RUNS, plain_decades
 
 ROBOTS = ("drive", "quadrotor")

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from paper.common import as_in_the_paper, figure, fixed, picture
+from paper.common import as_in_the_paper, bootstrap, figure, fixed, picture
 from paper.contestants import draw_excess, draw_means
 from peers import Answer
 from peers.common import line
@@ -27,7 +27,6 @@ from solver_benchmark.common import take_turns
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.stress.statistics import bootstrap
 
 PAPER, FROM_LINE = "smoothing, hover", "smoothing, line"
 SEARCH, SEARCH_COST, ILQR = "smoothing, search", "smoothing, search (1e-4)", "iLQR, hover"

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from paper.common import as_in_the_paper, figure, fixed, numbers, picture
+from paper.common import as_in_the_paper, bootstrap, figure, fixed, numbers, picture
 from runner import FolderSettings, Result, Statement, between, interval, opening, run, table
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.stress.statistics import bootstrap
 from lqrsim.view.style import LIMIT, RUNS, plain_decades
 
 SOFT, FIXED, ILQR = "smoothing, soft start", "smoothing, fixed start", "iLQR, fixed start"

@@ -219,11 +219,6 @@ WRONG = [None, "x", 3, -1, 1.5, np.nan, [], {}, {"a": 1}, ["a"], [[1], [2, 3]], 
         (statistics.paired_difference, {"only_first": 1, "only_second": 2, "trials": 5, "confidence": 0.9}),
         (statistics.mean, {"sample": [1.0, 2.0], "confidence": 0.9}),
         (statistics.holm, {"p_values": [0.1, 0.2]}),
-        (
-            lambda statistic, sample, **options: statistics.bootstrap(statistic, sample, sample, **options),
-            {"statistic": lambda a, b, axis: a.mean(axis) - b.mean(axis), "sample": [1.0, 2.0], "confidence": 0.9,
-             "resamples": 20, "seed": 3},
-        ),
     ],
 )  # fmt: skip
 def test_arguments_of_the_wrong_kind_raise_no_other_exception(function: Any, arguments: dict[str, Any]) -> None:

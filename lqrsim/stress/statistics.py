@@ -1,13 +1,13 @@
-"""Statistics of trials: exact intervals of rates, paired comparisons, bootstrap intervals, mostly by SciPy."""
+"""Statistics of trials: exact intervals of rates, and paired comparisons, mostly by SciPy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Bounds, Chance, Count, Index, Seed, Want, checked
+from lqrsim.annotations import Chance, Count, Index, checked
 from lqrsim.errors import Array, InputError, check_array, excerpt
 
 CONFIDENCE = 0.95
@@ -163,47 +163,6 @@ def holm(p_values: npt.ArrayLike) -> Array:
     adjusted = np.empty(len(values))
     adjusted[order] = raised
     return adjusted
-
-
-@checked
-def bootstrap(
-    statistic: Annotated[Callable[..., Array | float], Want("a function of the samples and axis")],
-    *samples: npt.ArrayLike,
-    confidence: Chance = CONFIDENCE,
-    resamples: Annotated[int, Bounds(at_least=1, at_most=1_000_000)] = 10_000,
-    seed: Seed = 0,
-) -> Estimate:
-    """A statistic of paired samples, (K,) each, with its percentile bootstrap interval.
-
-    Args:
-      statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example `lambda a, b, axis:
-        a.mean(axis) / b.mean(axis)`.
-      samples: numbers (K,); row i of each belongs to the same trial.
-      resamples: number of bootstrap samples.
-    """
-    from scipy import stats
-
-    arrays = [check_array("samples", sample, (None,)) for sample in samples]
-    if not arrays or any(len(array) != len(arrays[0]) for array in arrays) or len(arrays[0]) < 2:
-        raise InputError(f"samples: got lengths {[len(array) for array in arrays]}, want one length of at least 2")
-    try:
-        value = float(statistic(*arrays, axis=0))
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"statistic: got {excerpt(statistic)}, want a function of the samples and axis ({error})"
-        ) from None
-    interval = stats.bootstrap(
-        arrays,
-        statistic,
-        paired=True,
-        vectorized=True,
-        n_resamples=resamples,
-        batch=max(1, min(1000, 10_000_000 // len(arrays[0]))),  # bounds the memory
-        confidence_level=confidence,
-        method="percentile",  # BCa is undefined for medians of counts, which we have
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return Estimate(value, float(interval.low), float(interval.high), confidence)
 
 
 def rounded(number: float) -> str:

@@ -11,7 +11,6 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.patches import Circle
-from mpl_toolkits.mplot3d import Axes3D
 from scipy.spatial import ConvexHull
 
 from lqrsim.codegen import distances
@@ -209,20 +208,6 @@ def _begin_view(axes: Axes, low: Array, high: Array, names: str) -> None:
         for name, by in zip(names, (1 / stretch, stretch), strict=True)
     ]
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect=stretch, xlabel=said[0], ylabel=said[1])
-
-
-def draw_in_space(axes: Axes3D, world: World, low: Array, high: Array) -> None:
-    """Draw translucent surfaces of obstacles between two corners (3,)."""
-    for obstacle in world.obstacles:
-        if obstacle.kind != "plane":  # planes are the sides of the box
-            x, y, z = surface(obstacle, low, high)
-            axes.plot_surface(x, y, z, color=SOLID, alpha=0.10, linewidth=0, rstride=1, cstride=1, shade=True)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.zaxis.set_rotate_label(False)  # otherwise it would be upside down
-    axes.set_zlabel("z (m)", rotation=90)
-    axes.set_box_aspect(tuple(high - low), zoom=1.0)  # pyright: ignore[reportArgumentType] a float, as its documentation says
-    axes.view_init(elev=27, azim=-110)
 
 
 def draw_projected(axes: Axes, world: World, low: Array, high: Array, across: int, up: int) -> None:
