@@ -8,11 +8,10 @@ from typing import Annotated, Any, Union
 
 from tyro.conf import subcommand
 
-from lqrsim.commands.bridging import Bridge
 from lqrsim.commands.creating import Export, New
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Harden, Rare
-from lqrsim.commands.solving import List, Simulate, Solve
+from lqrsim.commands.solving import Bridge, List, Simulate, Solve
 from lqrsim.commands.stressing import Compare, Replay, Report, Stress
 from lqrsim.commands.viewing import Render, Verify, View
 

@@ -1,15 +1,16 @@
 """Commands that run the demo and the paper's experiments, and that manage the cache."""
 
 import itertools
+import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 import lqrsim as ls
-from lqrsim.commands import console
+from lqrsim.commands import as_json, console
 from lqrsim.commands.options import Json
 
 
@@ -36,9 +37,90 @@ class Demo:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.commands.demo import demo
+        from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
+        from lqrsim.simulation.uncertainty_of import tube_under
 
-        return demo(self.robots, out=self.out, seed=self.seed, video=self.video, quick=self.quick)
+        console.check_output("--out", self.out)
+        scenarios = {reference: resolve(reference) for reference in self.robots}
+        video = self.video and self._can_render()
+        rows, failures, misses = [TABLE], list[str](), list[str]()
+        results = list[as_json.Object]()
+        for reference, scenario in scenarios.items():
+            folder = self.out / folder_name(scenario)
+            console.say(f"\n== {reference}: {scenario.summary}")
+            solution = replace(console.solve(scenario), scenario=from_anywhere(reference))
+            console.wrote(ls.save(solution, folder / "solution.npz"))
+            tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
+            if remark:
+                console.say(remark)
+            world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)
+            if solution.cost_to_go is not None:
+                path = folder / "policy.png"
+                console.wrote(ls.view.plot_policy(solution, path, world=world, radius=radius, tube=tube))
+            if not solution.success:
+                failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
+            runs = dict[str, ls.Rollout]()
+            for name, disturbances in {"undisturbed": (), "disturbed": scenario.disturbances}.items():
+                options = {"disturbances": disturbances, "seed": self.seed, **scenario.near_enough()}
+                with console.progress("simulating", "step") as progress:
+                    rollout = ls.simulate(scenario.plant(), solution, progress=progress, **options)
+                console.say(rollout.summary())
+                runs[name] = tube.added_to(rollout) if tube is not None and name == "disturbed" else rollout
+                console.wrote(ls.save(runs[name], folder / f"{name}.npz"))
+                rows.append(_row(reference, name, solution, rollout))
+            undisturbed = runs["undisturbed"]
+            worst, unit = float(undisturbed.tracking_error.max()), undisturbed.tracking_unit
+            if not worst <= scenario.tracking_bound:  # also true for the NaN of a diverged run
+                bound = f"want <= {scenario.tracking_bound:g} {unit}"
+                failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
+            console.wrote(ls.view.plot_run(solution, runs, folder / "figure.png", world=world))
+            misses += [f"{reference}: {line}" for line in undisturbed.target.of_plan(undisturbed.goal_radius)[1:]]
+            if video:
+                self._render(runs["disturbed"], folder / "video.mp4")
+            if console.wants_result():
+                shown = {name: as_json.of_rollout(run, scenario.problem) for name, run in runs.items()}
+                results.append({"solution": as_json.of_solution(solution), "runs": shown})
+        console.say("\n" + "\n".join(rows))
+        for line in [*misses, *(f"FAILED {failure}" for failure in failures)]:
+            console.say(line)
+        console.result(scenarios=results, misses=misses, failures=failures)
+        return 1 if failures else 0
+
+    @staticmethod
+    def _can_render() -> bool:
+        from lqrsim.view import gl
+
+        try:
+            gl.bind()
+        except ls.InputError as error:
+            console.say(f"No videos, everything else works: {error}")
+            return False
+        return True
+
+    def _render(self, rollout: "ls.Rollout", path: Path) -> None:
+        """Render a video with the calibrated panes that show the robot's position."""
+        from lqrsim.view import cameras
+
+        quality, fps = ("draft", 5) if self.quick else ("standard", 30)
+        with console.progress("rendering", "frame") as progress:
+            options = {"insets": cameras.measuring(rollout.plane), "quality": quality, "fps": fps}
+            console.wrote(ls.render(rollout, path, progress=progress, **options))
+
+
+TABLE = (
+    f"{'scenario':<20} {'run':<12} {'iterations':>10} {'cost':>10} {'gap':>9} {'clearance m':>12}"
+    f" {'rms m':>9} {'max m':>9} {'final m':>9} {'goal m':>9} {'outcome':>9}"
+)
+
+
+def _row(reference: str, run: str, solution: "ls.Solution", rollout: "ls.Rollout") -> str:
+    error = rollout.tracking_error[0, rollout.counts[0]]
+    final, away = (math.nan, math.nan) if not rollout.counts[0, -1] else (error[-1], rollout.goal_distance[0])
+    return (
+        f"{reference:<20} {run:<12} {len(solution.iterations):>10} {solution.cost:>10.4f} {solution.gap:>9.1e}"
+        f" {rollout.least_clearance()[0]:>12.3f} {math.sqrt((error**2).mean()):>9.2e} {error.max():>9.2e} {final:>9.2e}"
+        f" {away if rollout.target.unit == 'm' else math.nan:>9.2e} {rollout.outcome[0]:>9}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

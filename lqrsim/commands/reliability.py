@@ -160,7 +160,7 @@ class Harden(FailureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("stress/recheck.py", "certify", repetitions="INT", seed="INT")
+@options_of("stress/failure_search.py", "certify", repetitions="INT", seed="INT")
 class Certify:
     """Check a certificate by measuring it again.
 

@@ -71,10 +71,11 @@ def of_table(
       head: whether the first row names the columns; otherwise the first column names the rows.
     """
     lines = "".join(f"<div>{escape(remark)}</div>" for remark in remarks)
-    table = "".join(
-        "<tr>" + "".join(_cell(text, named=(i if head else j) == 0) for j, text in enumerate(row)) + "</tr>"
-        for i, row in enumerate(rows)
-    )
+    table = ""
+    for i, row in enumerate(rows):
+        tags = ["td" if (i if head else j) else "th" for j in range(len(row))]
+        cells = (f'<{tag} style="text-align:left">{escape(text)}</{tag}>' for tag, text in zip(tags, row, strict=True))
+        table += f"<tr>{''.join(cells)}</tr>"
     beside = "display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start"
     return (
         f'<div class="lqrsim"><div><strong>{escape(heading)}</strong></div>{lines}'
@@ -102,11 +103,6 @@ def _drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
             line = np.stack([times, scaled[:, i]], axis=1)
             lines.append((line, COLOURS[i % len(COLOURS)], f"{label}, {name}", dashed))
     return _svg(lines, f"{', '.join(space.labels)} over time, each to its own scale", equal=False)
-
-
-def _cell(text: str, *, named: bool) -> str:
-    tag = "th" if named else "td"
-    return f'<{tag} style="text-align:left">{escape(text)}</{tag}>'
 
 
 def _range(values: Array) -> tuple[Array, Array]:

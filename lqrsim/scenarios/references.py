@@ -53,7 +53,12 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
             raise InputError(f"scenario: got a file that needs your code in {target!r}, which runs only with {option}")
         make = _own_function(target)
     else:
-        make = _registered_function(target)
+        from lqrsim import scenarios
+
+        try:
+            make = getattr(scenarios, check_name("scenario", target, scenarios.names()))
+        except InputError as error:
+            raise InputError(f"{error}; or the path of an .xml or .urdf file, or FILE.py:FUNCTION") from None
     scenario = make(**_keywords(target, make, settings))
     if not isinstance(scenario, Scenario):
         raise InputError(f"scenario: got a {type(scenario).__name__} from {target}, want a lqrsim Scenario")
@@ -112,15 +117,6 @@ def _parts(reference: str) -> tuple[str, list[str]]:
     """The target and its settings. A comma inside a value, as in `goal=(1, 2)`, does not separate settings."""
     target, *settings = re.split(r",(?=\s*\w+=)", reference)
     return target, settings
-
-
-def _registered_function(name: str) -> Callable[..., object]:
-    from lqrsim import scenarios
-
-    try:
-        return getattr(scenarios, check_name("scenario", name, scenarios.names()))
-    except InputError as error:
-        raise InputError(f"{error}; or the path of an .xml or .urdf file, or FILE.py:FUNCTION") from None
 
 
 def _own_function(target: str) -> Callable[..., object]:

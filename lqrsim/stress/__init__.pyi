@@ -1,7 +1,9 @@
 from .campaign import run_campaign as run_campaign
 from .comparison import compare as compare
 from .design_point import smallest_failure as smallest_failure
+from .failure_search import FailureCertificate as FailureCertificate
 from .failure_search import ReliabilityProblem as ReliabilityProblem
+from .failure_search import certify as certify
 from .funnels import FunnelCheck as FunnelCheck
 from .funnels import check_funnel as check_funnel
 from .hardening import harden as harden
@@ -9,8 +11,6 @@ from .multilevel_splitting import NoFailure as NoFailure
 from .multilevel_splitting import failure_probability as failure_probability
 from .outcome_table import Outcomes as Outcomes
 from .outcome_table import outcomes as outcomes
-from .recheck import FailureCertificate as FailureCertificate
-from .recheck import certify as certify
 from .results import Results as Results
 from .results import replay as replay
 from .safest import ComparedPlan as ComparedPlan

@@ -16,7 +16,6 @@ from lqrsim.annotations import SHARE, Bounds, Count, OneOf, checked
 from lqrsim.errors import Array, InputError, check_name, excerpt
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.statistics import (
-    CONFIDENCE,
     Estimate,
     compare,
     holm,
@@ -67,14 +66,13 @@ class Success:
 
 
 @checked
-def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -> Success:
+def success(cell: Cell, outcomes: Outcomes) -> Success:
     """The success rate of a cell with its intervals. Raises InputError if there are no trials."""
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
-    exact = rate(reached, trials, confidence=confidence)
-    band = rate(reached, trials, confidence=confidence, method="wilson")
+    exact, band = rate(reached, trials), rate(reached, trials, method="wilson")
     same = alike(cell, outcomes)
     if same:
-        exact = band = Estimate(exact.value, exact.value, exact.value, confidence)
+        exact = band = Estimate(exact.value, exact.value, exact.value)
     return Success(cell, reached, trials, exact, band, same)
 
 
@@ -94,12 +92,12 @@ def alike(cell: Cell, outcomes: Outcomes) -> bool:
     return same and len(set(outcomes.outcome.tolist())) == 1
 
 
-def degradation(table: Table, policy: str, sweep: str, *, confidence: float = CONFIDENCE) -> list[Success]:
+def degradation(table: Table, policy: str, sweep: str) -> list[Success]:
     """Success rates of a policy by increasing strength. Raises InputError if the table has no such policy or sweep."""
     check_name("policy", policy, dict.fromkeys(cell.policy for cell in _checked_table(table)))
     check_name("sweep", sweep, dict.fromkeys(cell.sweep for cell in table))
     cells = [cell for cell in table if (cell.policy, cell.sweep) == (policy, sweep)]
-    return [success(cell, table[cell], confidence=confidence) for cell in sorted(cells, key=lambda cell: cell.strength)]
+    return [success(cell, table[cell]) for cell in sorted(cells, key=lambda cell: cell.strength)]
 
 
 @dataclass(frozen=True)
@@ -119,13 +117,11 @@ class BreakingPoint:
 
 
 @checked
-def breaks(
-    table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95, confidence: float = CONFIDENCE
-) -> list[BreakingPoint]:
+def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95) -> list[BreakingPoint]:
     """The breaking point of each policy and sweep, the weakest first."""
     breaking_points = []
     for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table)):
-        points = degradation(table, policy, sweep, confidence=confidence)
+        points = degradation(table, policy, sweep)
         first = next((point for point in points if point.exact.high < below), None)
         strength, exact = (None, None) if first is None else (first.cell.strength, first.exact)
         breaking_points.append(BreakingPoint(policy, sweep, below, strength, exact))

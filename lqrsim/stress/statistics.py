@@ -110,9 +110,7 @@ def paired_difference(
     return Estimate(surplus / trials, low, high, confidence)
 
 
-def independent_difference(
-    first: tuple[int, int], second: tuple[int, int], *, confidence: float = CONFIDENCE
-) -> tuple[Estimate, float]:
+def independent_difference(first: tuple[int, int], second: tuple[int, int]) -> tuple[Estimate, float]:
     """The difference of two success rates, of trials that have nothing in common, and Fisher's exact test of it.
 
     The interval is Newcombe's hybrid score (Statistics in Medicine 17, 1998, method 10): how far the rates can be off
@@ -126,12 +124,12 @@ def independent_difference(
     """
     from scipy import stats
 
-    one, other = (rate(*counts, confidence=confidence, method="wilson") for counts in (first, second))
+    one, other = (rate(*counts, method="wilson") for counts in (first, second))
     value = one.value - other.value
     low = value - float(np.hypot(one.value - one.low, other.high - other.value))
     high = value + float(np.hypot(one.high - one.value, other.value - other.low))
     test = stats.fisher_exact([[reached, trials - reached] for reached, trials in (first, second)])
-    return Estimate(value, low, high, confidence), float(test.pvalue)  # pyright: ignore[reportAttributeAccessIssue]
+    return Estimate(value, low, high), float(test.pvalue)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> float:
@@ -142,17 +140,16 @@ def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> f
     return inside
 
 
-@checked
-def mean(sample: npt.ArrayLike, *, confidence: Chance = CONFIDENCE) -> Estimate:
+def mean(sample: npt.ArrayLike) -> Estimate:
     """The mean of a sample (K,) with Student's interval."""
     from scipy import stats
 
     numbers = check_array("sample", sample, (None,))
     if len(numbers) < 2:
         raise InputError(f"sample: got {len(numbers)} numbers, want at least 2")
-    reach = stats.t.ppf(0.5 + confidence / 2, len(numbers) - 1) * numbers.std(ddof=1) / np.sqrt(len(numbers))
+    reach = stats.t.ppf(0.5 + CONFIDENCE / 2, len(numbers) - 1) * numbers.std(ddof=1) / np.sqrt(len(numbers))
     middle = float(numbers.mean())
-    return Estimate(middle, middle - float(reach), middle + float(reach), confidence)
+    return Estimate(middle, middle - float(reach), middle + float(reach))
 
 
 def holm(p_values: npt.ArrayLike) -> Array:

@@ -28,7 +28,9 @@ def bind() -> None:
     choice = os.environ.get("MUJOCO_GL", "").strip().lower()
     if choice in ("0", "disable", "disabled", "false", "off"):
         raise InputError(f"MUJOCO_GL: got {choice!r}, which turns rendering off, want it unset")
-    backend = choice or _installed()
+    # The first that is installed. PyOpenGL's EGL also needs an OpenGL library.
+    egl = find_library("EGL") and (find_library("OpenGL") or find_library("GL"))
+    backend = choice or ("egl" if egl else "osmesa" if find_library("OSMesa") else "")
     if not backend:
         raise InputError(f"OpenGL: got neither EGL nor OSMesa, want one of them: {INSTALL}")
     # PyOpenGL and drivers raise exceptions of any kind, AttributeError and TypeError included.
@@ -50,10 +52,3 @@ def available() -> bool:
     except InputError:
         return False
     return True
-
-
-def _installed() -> str:
-    """The first backend that is installed, or an empty string. PyOpenGL's EGL also needs an OpenGL library."""
-    if find_library("EGL") and (find_library("OpenGL") or find_library("GL")):
-        return "egl"
-    return "osmesa" if find_library("OSMesa") else ""

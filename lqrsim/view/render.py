@@ -172,7 +172,10 @@ def render(
         funnel=funnel, quality=quality, size=size, speed=speed,
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
-        count = _frame_count(drawn.end, speed, rate)
+        count = int(drawn.end / speed * rate + 1e-9) + 1
+        if count > MOST_FRAMES:
+            frames = f"{count} frames, want at most {MOST_FRAMES}"
+            raise InputError(f"speed, fps: got {speed:g} and {float(rate):g}, which are {frames}")
         if animated:
             samples = [drawn.draw(time) for time in np.linspace(0, drawn.end, min(PALETTE_SAMPLES, count))]
             writer = gif(unfinished, rate, samples)
@@ -232,14 +235,6 @@ def render_still(
             earlier = np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
         Image.fromarray(drawn.draw(time, earlier=earlier)).save(unfinished)
     return PictureFile(path)
-
-
-def _frame_count(end: float, speed: float, rate: Fraction) -> int:
-    count = int(end / speed * rate + 1e-9) + 1
-    if count > MOST_FRAMES:
-        frames = f"{count} frames, want at most {MOST_FRAMES}"
-        raise InputError(f"speed, fps: got {speed:g} and {float(rate):g}, which are {frames}")
-    return count
 
 
 def _checked_path(path: str | os.PathLike[str], *suffixes: str) -> Path:
