@@ -122,10 +122,9 @@ def test_results_show_a_row_for_each_cell(tmp_path: Path) -> None:
         shown, ends = dict(zip(head, row, strict=True)), results.outcomes(cell)
         assert (shown["sweep"], float(shown["strength"]), shown["policy"]) == (cell.sweep, cell.strength, cell.policy)
         assert shown["trials"] == "4"
-        assert float(shown["reached (%)"]) == pytest.approx(100 * np.mean(ends.outcome == "reached"), abs=0.05)
+        assert float(shown["success"]) == pytest.approx(np.mean(ends.outcome == "reached"), abs=5e-4)
         low, high = binomtest(int(np.sum(ends.outcome == "reached")), 4).proportion_ci(0.95)
-        wanted = f"{100 * low:.1f} to {100 * high:.1f}" if cell.strength else "deterministic: 1 run"
-        assert shown["95 % interval"] == wanted
+        assert (shown["low"], shown["high"]) == ((f"{low:.3f}", f"{high:.3f}") if cell.strength else ("", ""))
         assert int(shown["collided"]) == np.sum(ends.outcome == "collided")
     next((tmp_path / "there" / "shards").iterdir()).unlink()
     unfinished = parsed(ls.stress.Results(tmp_path / "there")._repr_html_())

@@ -94,11 +94,11 @@ def of_campaign(results: "ls.stress.Results") -> Object:
     from lqrsim.results.goal import OUTCOMES
 
     cells = []
-    for cell, ends, found in results.cell_successes():
+    for cell, ends, success in results.cell_successes():
         row = {**_fields(cell, "policy sweep strength"), "trials": ends.total()}
-        if found is not None:
+        if success is not None:
             outcomes = {name: ends[name] for name in OUTCOMES}
-            row |= {"outcomes": outcomes, "reached": found.exact, "deterministic": found.alike}
+            row |= {"outcomes": outcomes, "reached": success.exact, "deterministic": success.alike}
         cells.append(row)
     return {
         **_fields(results, "folder complete"),

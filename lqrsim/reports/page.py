@@ -100,18 +100,16 @@ def _over_strength(curves: Mapping[str, object], path: str | os.PathLike[str], l
         figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * -(-len(curves) // 4)))
 
 
+Trials = list[analysis.Trial]
 LARGEST = 1_500_000  # bytes, largest video
 SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
 FPS = 15
 
 
-def videos_of_worst(results: Results, table: analysis.Table, count: int, folder: Path) -> Iterator[Any]:
+def videos_of_worst(results: Results, worst: Sequence[Trials], count: int, folder: Path) -> Iterator[Any]:
     """A remark on all videos, and then each video."""
-    worst = [
-        next((trial for trial in worst_trials(table, group) if trial.outcome != "error"), None)
-        for group in policies_and_sweeps(table)
-    ]
-    chosen, problem = [trial for trial in worst if trial is not None][:count], ""
+    first = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
+    chosen, problem = [trial for trial in first if trial is not None][:count], ""
     if not chosen:
         yield "No videos were requested." if count == 0 else "There is no trial to render."
         return
@@ -186,14 +184,15 @@ def report(
     parts = 2 + videos
     tell = progress or (lambda done, total: None)
     tell(0, parts)
-    page = _text_and_tables(results, table, scenario)
+    worst = worst_trials(table)
+    page = _text_and_tables(results, table, worst, scenario)
     tell(1, parts)
     with tempfile.TemporaryDirectory() as folder:
         page["sweeps"] = [
             _sweep(name, table, scenario, results.campaign, Path(folder)) for name in results.campaign.sweeps
         ]
         tell(2, parts)
-        rendered = videos_of_worst(results, table, videos, Path(folder))
+        rendered = videos_of_worst(results, worst, videos, Path(folder))
         page["videos_note"] = next(rendered)
         page["videos"] = []
         for number, video in enumerate(rendered):
@@ -207,11 +206,13 @@ def report(
     return path
 
 
-def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, Any]:
+def _text_and_tables(
+    results: Results, table: analysis.Table, worst: Sequence[Trials], scenario: Scenario
+) -> dict[str, Any]:
     """The whole page except pictures."""
-    campaign, manifest = results.campaign, results.manifest
-    whole = {cell: one for cell, one in table.items() if len(one) == campaign.trials}
-    erred = sum(int((one.outcome == "error").sum()) for one in table.values())
+    campaign, unit = results.campaign, tracking_unit(scenario.problem.dynamics.state_coordinates)
+    whole = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
+    erred = sum(int((outcomes.outcome == "error").sum()) for outcomes in table.values())
     done, all_trials = sum(map(len, table.values())), len(results.cells) * campaign.trials
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
@@ -227,25 +228,16 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
             "To resume or repair the campaign": results.command,
             "This page": results.command_of("report"),
         },
-        "asked": json.dumps(manifest["campaign"], indent=2, ensure_ascii=False),
+        "asked": json.dumps(results.manifest["campaign"], indent=2, ensure_ascii=False),
         "breaks": breaks_table(table),
-        "breaks_note": f"The lowest tested strength at which the 95 % interval of the success rate is entirely"
-        f" below {100 * BROKEN_BELOW:g} %, in ascending order.",
-        "success_note": f"A trial succeeds if it ends within {radius:g} {target.unit} of the {target.name}, without a"
-        " collision until then. Tables have exact (Clopper-Pearson) intervals of 95 %, the bands of the curves are"
-        " Wilson's. If nothing is random all trials are the same run, and there is no interval.",
-        "compared": comparison_tables(whole, tracking_unit(scenario.problem.dynamics.state_coordinates)),
-        "compared_note": "Trials of the same number have the same random numbers for all policies. Policies differ in"
-        " the trials in which only one of them succeeded: p is from McNemar's exact test, corrected for the number of"
-        " comparisons on this page (Holm). Differences are first minus second, with 95 % intervals: Tango's score"
-        " interval for success, Student's for the rms of trials in which both succeeded. If nothing is random there is"
-        " nothing to compare.",
+        "broken_below": f"{100 * BROKEN_BELOW:g} %",
+        "reach": f"{radius:g} {target.unit} of the {target.name}",
+        "compared": comparison_tables(whole, unit),
         "modes": failure_table(table),
         "measures": measure_tables(table, scenario),
-        "measures_note": "Median, and 5 to 95 % quantiles in parentheses, until a trial collides or diverges. Final"
-        " error, distance from the goal and cost are those of trials that ran to the end.",
-        "worst": worst_table(table, tracking_unit(scenario.problem.dynamics.state_coordinates)),
-        "worst_note": f"Of each policy and sweep the {WORST_EACH} worst. {analysis.RANKING}",
+        "worst": worst_table(worst, unit),
+        "worst_each": WORST_EACH,
+        "ranking": analysis.RANKING,
     }
 
 
@@ -376,29 +368,20 @@ def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
 
 def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
     """Pairs of policies on the same trials, a table for each pair and sweep; `unit` is the unit of tracking errors."""
-    found = analysis.comparisons(table)
     factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     head = (
         "strength", "only the first", "only the second", "p", "difference in success (%)", "both reached",
         f"difference in rms ({unit})",
     )  # fmt: skip
-    groups = dict.fromkeys((one.first.sweep, one.first.policy, one.second.policy) for one in found)
-    return [
-        PageTable(
-            f"{sweep}: {first} against {second}",
-            head,
-            [
-                [
-                    f"{one.first.strength:g}", str(one.only_first), str(one.only_second),
-                    f"{one.adjusted:.2g}", _percent(one.success, unit=""), str(one.both),
-                    "" if one.rms is None else _between(one.rms.value, one.rms.low, one.rms.high, factor),
-                ]
-                for one in found
-                if (one.first.sweep, one.first.policy, one.second.policy) == (sweep, first, second)
-            ],
-        )
-        for sweep, first, second in groups
-    ]  # fmt: skip
+    tables = dict[str, list[list[str]]]()
+    for pair in analysis.comparisons(table):
+        caption = f"{pair.first.sweep}: {pair.first.policy} against {pair.second.policy}"
+        tables.setdefault(caption, []).append([
+            f"{pair.first.strength:g}", str(pair.only_first), str(pair.only_second),
+            f"{pair.adjusted:.2g}", _percent(pair.success, unit=""), str(pair.both),
+            "" if pair.rms is None else _between(pair.rms.value, pair.rms.low, pair.rms.high, factor),
+        ])  # fmt: skip
+    return [PageTable(caption, head, rows) for caption, rows in tables.items()]
 
 
 def _between(value: float, low: float, high: float, scale: float = 1.0) -> str:
@@ -438,39 +421,35 @@ def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]
     units |= dict.fromkeys(("worst", "rms", "final"), tracking_unit(space))
     units["goal"] = Target(space, scenario.problem.weighed_goal, np.zeros((1, len(space)))).unit
     head = ["policy", "strength", *(f"{name} ({unit})" if unit else name for name, unit in units.items())]
-    tables = []
-    for sweep in dict.fromkeys(cell.sweep for cell in table):
-        rows = []
-        for cell, outcomes in table.items():
-            if cell.sweep == sweep:
-                quantiles = [analysis.quantiles(outcomes, name) for name in units]
-                values = [_between(middle, low, high) for low, middle, high in quantiles]
-                rows.append([cell.policy, f"{cell.strength:g}", *values])
-        tables.append(PageTable(sweep, head, rows))
-    return tables
+    tables = dict[str, list[list[str]]]()
+    for cell, outcomes in table.items():
+        quantiles = [analysis.quantiles(outcomes, name) for name in units]
+        values = [_between(middle, low, high) for low, middle, high in quantiles]
+        tables.setdefault(cell.sweep, []).append([cell.policy, f"{cell.strength:g}", *values])
+    return [PageTable(sweep, head, rows) for sweep, rows in tables.items()]
 
 
-def policies_and_sweeps(table: analysis.Table) -> list[tuple[str, str]]:
-    """Policies and sweeps by breaking strength, alternating between policies."""
-    order = [(one.policy, one.sweep) for one in analysis.breaks(table, below=BROKEN_BELOW)]
+def worst_trials(table: analysis.Table) -> list[Trials]:
+    """The worst trials of each policy and sweep, by breaking strength, alternating between policies."""
+    order = [(point.policy, point.sweep) for point in analysis.breaks(table, below=BROKEN_BELOW)]
     turns = zip_longest(*([group for group in order if group[0] == policy] for policy in policies(table)))
-    return [group for turn in turns for group in turn if group is not None]
+    return [
+        analysis.worst({cell: table[cell] for cell in table if (cell.policy, cell.sweep) == group}, WORST_EACH)
+        for turn in turns
+        for group in turn
+        if group is not None
+    ]
 
 
-def worst_trials(table: analysis.Table, group: tuple[str, str]) -> list[analysis.Trial]:
-    """The worst trials of a policy and a sweep, the worst first."""
-    return analysis.worst({cell: one for cell, one in table.items() if (cell.policy, cell.sweep) == group}, WORST_EACH)
-
-
-def worst_table(table: analysis.Table, unit: str) -> PageTable:
+def worst_table(worst: Sequence[Trials], unit: str) -> PageTable:
     """The worst trials of each policy and sweep; `unit` is the unit of tracking errors."""
     rows = [
         [
-            *_cell_names(one.cell), str(one.trial), one.outcome, one.obstacle, f"{one.ended:.2f}",
-            f"{one.clearance:.3f}", f"{one.worst:.3f}",
+            *_cell_names(trial.cell), str(trial.trial), trial.outcome, trial.obstacle, f"{trial.ended:.2f}",
+            f"{trial.clearance:.3f}", f"{trial.worst:.3f}",
         ]
-        for group in policies_and_sweeps(table)
-        for one in worst_trials(table, group)
+        for trials in worst
+        for trial in trials
     ]  # fmt: skip
     head = (
         "policy", "sweep", "strength", "trial", "outcome", "collided with", "ended (s)", "least clearance (m)",

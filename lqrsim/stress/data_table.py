@@ -1,4 +1,4 @@
-"""Tables for papers: columns of names and numbers, written as CSV, LaTeX and Markdown."""
+"""Tables for papers and notebooks: columns of names and numbers, written as CSV, LaTeX, Markdown and HTML."""
 
 import csv
 import io
@@ -23,6 +23,7 @@ from lqrsim.errors import (
     excerpt,
     keep,
 )
+from lqrsim.results import notebook
 from lqrsim.results.archive import replacing
 
 Entry = str | int | float | None
@@ -108,6 +109,10 @@ class DataTable:
         return _lines(head, *rest, *(line for note in self.notes for line in ("", _markdown_text(note))))
 
     __str__ = markdown
+
+    def _repr_html_(self) -> str:
+        heading, *remarks = self.notes or ("",)
+        return notebook.of_table(heading, remarks, list(self._rows(str, str)))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the table in the format that the name ends with, .csv, .tex or .md; returns its path."""

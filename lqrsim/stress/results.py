@@ -12,7 +12,7 @@ import numpy as np
 
 from lqrsim.annotations import LINE, Count, Index, Want, checked
 from lqrsim.errors import InputError, check_name, check_path, excerpt
-from lqrsim.results import notebook, save_load
+from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
@@ -20,7 +20,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
-from lqrsim.stress.analysis import Success, success
+from lqrsim.stress import analysis
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, digest_of_solution, read, read_manifest
 from lqrsim.stress.data_table import DataTable, fraction_format
 from lqrsim.stress.outcome_table import Outcomes
@@ -106,11 +106,11 @@ class Results:
             counts.update(table["outcome"].tolist())
         return counts
 
-    def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], Success | None]]:
+    def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], analysis.Success | None]]:
         """Each cell with its outcomes so far and its success rate, None if no trial has been run."""
         for cell in self.cells:
             ends = self.tally(cell, partial=True)
-            yield cell, ends, success(cell, self.outcomes(cell, partial=True)) if ends else None
+            yield cell, ends, analysis.success(cell, self.outcomes(cell, partial=True)) if ends else None
 
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
@@ -120,17 +120,17 @@ class Results:
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
         head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
         lines = [head + "".join(f" {name:>9}" for name in others)]
-        for cell, ends, found in self.cell_successes():
-            if found is None:
+        for cell, ends, success in self.cell_successes():
+            if success is None:
                 continue
-            sure, among = found.exact, f"{found.reached}/{found.trials}"
-            share = f"{100 * sure.value:5.1f} [{100 * sure.low:5.1f}, {100 * sure.high:5.1f}]"
-            share = f"{among:>13} {'deterministic: 1 run' if found.alike else share}"
+            exact, reached = success.exact, f"{success.reached}/{success.trials}"
+            share = f"{100 * exact.value:5.1f} [{100 * exact.low:5.1f}, {100 * exact.high:5.1f}]"
+            share = f"{reached:>13} {'deterministic: 1 run' if success.alike else share}"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
-        said = [*self.manifest["remarks"], *self._designs(), *self.plans(), *self.came_to_nothing(), *self.hints()]
-        return "\n".join([*lines, *said])
+        lines += [*self.manifest["remarks"], *self._designs(), *self.plans(), *self.came_to_nothing(), *self.hints()]
+        return "\n".join(lines)
 
     def rates(self) -> DataTable:
         """The success rate of each cell so far as a table: for CSV, LaTeX or Markdown.
@@ -141,11 +141,11 @@ class Results:
         """
         head = ("sweep", "strength", "policy", "trials", *OUTCOMES, "success", "low", "high")
         rows: list[tuple[Any, ...]] = []
-        for cell, ends, found in self.cell_successes():
+        for cell, ends, success in self.cell_successes():
             rate = (None, None, None)
-            if found is not None:
-                interval = (None, None) if found.alike else (found.exact.low, found.exact.high)
-                rate = (found.exact.value, *interval)
+            if success is not None:
+                interval = (None, None) if success.alike else (success.exact.low, success.exact.high)
+                rate = (success.exact.value, *interval)
             counts = (ends.total(), *(ends[name] for name in OUTCOMES))
             rows.append((cell.sweep, cell.strength, cell.policy, *counts, *rate))
         campaign = self.manifest["campaign"]
@@ -153,46 +153,29 @@ class Results:
             f"{campaign['scenario']}, seed {campaign['seed']}; success: the fraction of trials that reached the goal",
             f"low, high: exact (Clopper-Pearson) interval of {100 * CONFIDENCE:g} %; none if all trials are one run",
             *self._designs(),
-            *self._unfinished(),
         ]
+        if missing := sum(count for _, _, count in self.missing):
+            notes.append(f"not finished: {missing} of {campaign['trials'] * len(self.cells)} trials are missing")
         formats: dict[str, str] = dict.fromkeys(("success", "low", "high"), fraction_format(campaign["trials"]))
         return DataTable(dict(zip(head, zip(*rows, strict=True), strict=True)), formats, notes)
 
-    def _unfinished(self) -> list[str]:
-        """A line that says how many trials are missing, if any."""
-        missing = sum(count for _, _, count in self.missing)
-        of = self.manifest["campaign"]["trials"] * len(self.cells)
-        return [f"not finished: {missing} of {of} trials are missing"] if missing else []
-
     def _repr_html_(self) -> str:
-        others = [name for name in OUTCOMES if name != "reached"]
-        rows = [("sweep", "strength", "policy", "trials", "reached (%)", f"{100 * CONFIDENCE:g} % interval", *others)]
-        for cell, ends, found in self.cell_successes():
-            share, interval = "-", "-"
-            if found is not None:
-                sure = found.exact
-                share, interval = f"{100 * sure.value:.1f}", f"{100 * sure.low:.1f} to {100 * sure.high:.1f}"
-                interval = "deterministic: 1 run" if found.alike else interval
-            counts = [str(ends[name]) for name in others]
-            rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(ends.total()), share, interval, *counts))
-        campaign = self.manifest["campaign"]
-        notes = [*self._designs(), *self._unfinished()]
-        return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", notes, rows)
+        return self.rates()._repr_html_()
 
     def designs(self) -> dict[str, str]:
         """For which disturbances each policy was designed that is designed for any, by policy."""
-        stated, found = self.manifest["campaign"]["design_disturbances"], dict[str, str]()
-        told = f"the preset {DEFAULT_DESIGN}"
+        stated, designs = self.manifest["campaign"]["design_disturbances"], dict[str, str]()
+        what = f"the preset {DEFAULT_DESIGN}"
         if stated is not None:  # as it is written in Python
-            settings = (", ".join(f"{name}={value}" for name, value in one["settings"].items()) for one in stated)
-            told = ", ".join(f"{one['kind']}({text})" for one, text in zip(stated, settings, strict=True))
+            settings = (", ".join(f"{name}={value}" for name, value in item["settings"].items()) for item in stated)
+            what = ", ".join(f"{item['kind']}({text})" for item, text in zip(stated, settings, strict=True))
         for policy in self.manifest["policies"]:
             kind = POLICY_KINDS[policy]
             if kind.designed:
-                found[policy] = f"designed for {told}, whatever the disturbances of a cell"
+                designs[policy] = f"designed for {what}, whatever the disturbances of a cell"
             elif kind.per_cell:
-                found[policy] = "designed anew for the disturbances of each cell, at their strength"
-        return found
+                designs[policy] = "designed anew for the disturbances of each cell, at their strength"
+        return designs
 
     def _designs(self) -> list[str]:
         return [f"{policy}: {text}" for policy, text in self.designs().items()]
@@ -212,11 +195,12 @@ class Results:
         Trials that ended with an error do not count.
         """
         reached: dict[str, int] = {}
-        for cell, ends, found in self.cell_successes():
-            if found is not None and cell.strength > 0 and ends["error"] < ends.total():
+        for cell in self.cells:
+            ends = self.tally(cell, partial=True)
+            if cell.strength > 0 and ends["error"] < ends.total():
                 reached[cell.sweep] = reached.get(cell.sweep, 0) + ends["reached"]
         sweeps = self.manifest["campaign"]["sweeps"]
-        kinds = {name: [f"{name}:{one['kind']}" for one in sweeps[name]] for name in reached if name in PRESETS}
+        kinds = {name: [f"{name}:{item['kind']}" for item in sweeps[name]] for name in reached if name in PRESETS}
         return [
             f"{name}: no trial reached the goal; each kind of disturbance alone: --sweep {' '.join(kinds[name])}"
             for name in kinds
