@@ -37,7 +37,6 @@ from lqrsim.results.solution_parts import Certificate
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | FailureCertificate
 _Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, FailureCertificate)
-_Record = TypeVar("_Record")
 
 # The name in the file, and the version.
 FORMATS: dict[type, tuple[str, int]] = {
@@ -90,9 +89,9 @@ def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
     name, version = FORMATS[kind]
     arrays: Arrays = {}
     try:
-        tree = parse(canonical(_tree(result, "", arrays)))
+        tree = parse(canonical(tree_of(result, "", arrays)))
         _check_arrays(kind, {name: Header(array.dtype.str, array.shape) for name, array in arrays.items()})
-        _record(kind, tree, "", dict(arrays))
+        record_from(kind, tree, "", dict(arrays))
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
         raise InputError(f"result: got a {name}, {reason}, want an unchanged result of lqrsim") from None
@@ -127,7 +126,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         _check_arrays(kind, archive.headers)
         outside = ("format", "version", "sha256")
         arrays, tree = archive.arrays(), {name: one for name, one in archive.meta.items() if name not in outside}
-        record = _record(kind, tree, "", arrays)
+        record = record_from(kind, tree, "", arrays)
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want it mentioned there")
         if (version := archive.meta["version"]) != (own := VERSIONS[found][_has_turns(record)]):
@@ -143,18 +142,8 @@ def _has_turns(value: Any) -> bool:
     return any(map(_has_turns, inside)) if is_dataclass(value) or isinstance(value, tuple) else False
 
 
-def tree_of(record: Any) -> dict[str, Any]:
-    """A record without arrays as JSON has it, for `record_from`."""
-    return _tree(record, "", {})
-
-
-def record_from(kind: type[_Record], tree: Any, path: str) -> _Record:
-    """The record of `tree_of`. Raises InputError for anything else; messages call it `path`."""
-    return _record(kind, tree, path, {})
-
-
-def _tree(value: Any, path: str, arrays: Arrays) -> Any:
-    """The JSON tree of a value. Its arrays are put into `arrays`, by the paths of their fields."""
+def tree_of(value: Any, path: str, arrays: Arrays) -> Any:
+    """The JSON tree of a value, for `record_from`. Its arrays are put into `arrays`, by the paths of their fields."""
     if is_dataclass(value):
         tree = {}
         for name in declarations(type(value)):
@@ -162,10 +151,10 @@ def _tree(value: Any, path: str, arrays: Arrays) -> Any:
             if isinstance(inner, np.ndarray):
                 arrays[field] = np.ascontiguousarray(inner)
             else:
-                tree[name] = _tree(inner, field, arrays)
+                tree[name] = tree_of(inner, field, arrays)
         return tree
     if isinstance(value, tuple):
-        return [_tree(one, _join(path, i), arrays) for i, one in enumerate(value)]
+        return [tree_of(one, _join(path, i), arrays) for i, one in enumerate(value)]
     return dict(value) if isinstance(value, Mapping) else value
 
 
@@ -194,7 +183,7 @@ def _declared_at(kind: type, path: str) -> Declared | None:
     return found
 
 
-def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
+def record_from(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
     """Build a record of this kind from a file, taking its arrays out of `arrays`. Raises InputError if it cannot."""
     if not isinstance(tree, dict):
         raise InputError(f"{path}: got {excerpt(tree)}, want an object")
@@ -226,7 +215,7 @@ def _value(said: Declared, tree: Any, path: str, arrays: Arrays) -> Any:
     if len(said.kinds) > 1:  # records that are told apart by their arrays
         kind = next((one for one in said.kinds if _join(path, next(iter(declarations(one)))) in arrays), kind)
     if is_dataclass(kind):
-        return _record(kind, tree, path, arrays)
+        return record_from(kind, tree, path, arrays)
     if get_origin(kind) is tuple:
         if not isinstance(tree, list):
             raise InputError(f"{path}: got {excerpt(tree)}, want a list")

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from scipy.special import ndtr
 
 from lqrsim.annotations import Bounds, Count, Seed, TextProgress, checked
 from lqrsim.errors import Array, InputError, check_array, check_memory
 from lqrsim.process import keeping
 from lqrsim.results.rollout import Rollout
 from lqrsim.stress.multilevel_splitting import CountedScore, Rounds, Score, failure_probability
-from lqrsim.stress.trial_score import normal_tail
 
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
 DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than MOVED
@@ -102,7 +102,7 @@ def smallest_failure(
         distance = history[-1]
         return DesignPoint(
             numbers=best, distance=distance, score=float(counted(best[None])[0]),
-            first_order_probability=normal_tail(distance), history=np.array(history),
+            first_order_probability=float(ndtr(-distance)), history=np.array(history),
             simulations=counted.evaluations, remaining=remaining, converged=converged,
         )  # fmt: skip
 

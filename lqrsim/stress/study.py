@@ -303,20 +303,17 @@ def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, 
         if not dataclasses.is_dataclass(disturbance):
             raise InputError(f"{type(disturbance).__name__}: got a class that is no dataclass, want a dataclass")
         names = [field.name for field in dataclasses.fields(disturbance) if field.init]
-        settings = {name: _as_json(getattr(disturbance, name)) for name in names}
+        settings = {name: getattr(disturbance, name) for name in names}
         items.append({"kind": type(disturbance).__qualname__, "settings": settings})
-    return items
+    return json.loads(json.dumps(items, default=_plain))
 
 
-def _as_json(value: Any) -> Any:
-    if isinstance(value, tuple | list):
-        return [_as_json(one) for one in value]
+def _plain(value: Any) -> Any:
+    """A value of a disturbance that JSON has no form for."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(name): _as_json(one) for name, one in value.items()}
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
+        return dict(value)
     raise InputError(f"sweeps: got {excerpt(value)} in a disturbance, want numbers, strings, and lists of them")
 
 

@@ -247,8 +247,3 @@ class TrialScore:
             threads=self.threads,
             generators=cast(Callable[[int, int], np.random.Generator], generators),
         )
-
-
-def normal_tail(distance: float) -> float:
-    """The probability that a standard normal number is larger."""
-    return float(ndtr(-distance))

@@ -66,7 +66,7 @@ class VideoMetadata:
 
     def as_json(self) -> str:
         """The metadata as JSON, for `from_json`."""
-        return json.dumps({"format": FORMAT, "version": VERSION, **tree_of(self), "rate": str(self.rate)})
+        return json.dumps({"format": FORMAT, "version": VERSION, **tree_of(self, "", {}), "rate": str(self.rate)})
 
     @classmethod
     def from_json(cls, text: str) -> "VideoMetadata":
@@ -85,7 +85,7 @@ class VideoMetadata:
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
             raise InputError(f"video metadata: got {excerpt(text)}, which is damaged ({error})") from None
         tree = {name: part for name, part in parts.items() if name not in ("format", "version")}
-        return record_from(cls, tree | {"rate": rate}, "metadata")
+        return record_from(cls, tree | {"rate": rate}, "metadata", {})
 
     def times(self) -> np.ndarray:
         """Times of the frames in seconds after the start of a run, (frames,)."""
