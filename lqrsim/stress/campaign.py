@@ -259,11 +259,11 @@ def _digest_of_runs(scenario: Scenario) -> str:
     )
     names = robot.name, robot.body, robot.joints, robot.actuators, robot.wheels, dynamics.fixed
     numbers = robot.drag, robot.radius, plant.timestep, robot.activations, scene.geoms, dynamics.parameters
-    told: tuple[Any, ...] = (names, numbers, scenario.near_enough(), without_addresses(str(scenario.simulator)))
-    told += (scenario.sensors,) * bool(scenario.sensors)  # folders from before there were sensors stay valid
+    stated: tuple[Any, ...] = (names, numbers, scenario.near_enough(), without_addresses(str(scenario.simulator)))
+    stated += (scenario.sensors,) * bool(scenario.sensors)  # folders from before there were sensors stay valid
     rules = states.rules, controls.rules
     arrays = (np.asarray(one, dtype=np.float64) for one in (*maps[0], *maps[1], *balls))
-    return sha256(scene.xml, repr(told), *rules, *(part for array in arrays for part in (f"{array.shape}", array)))
+    return sha256(scene.xml, repr(stated), *rules, *(part for array in arrays for part in (f"{array.shape}", array)))
 
 
 def _code(campaign: Campaign) -> dict[str, str | None]:

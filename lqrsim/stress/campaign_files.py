@@ -229,10 +229,10 @@ def _check(manifest: dict[str, Any]) -> None:
         raise InputError("digest: got a hash that does not fit the campaign, want an unchanged file")
 
 
-def _check_names(field: str, found: Mapping[str, Any], names: Sequence[str]) -> None:
+def _check_names(field: str, part: Mapping[str, Any], names: Sequence[str]) -> None:
     """Raise InputError unless an object of JSON has exactly these fields."""
-    if wrong := sorted(found.keys() ^ set(names)):
-        got = f"{'' if wrong[0] in found else 'none of '}{excerpt(wrong[0])}"
+    if wrong := sorted(part.keys() ^ set(names)):
+        got = f"{'' if wrong[0] in part else 'none of '}{excerpt(wrong[0])}"
         raise InputError(f"{field}: got {got}, want exactly {', '.join(names)}")
 
 

@@ -79,9 +79,10 @@ def compare(
         {pair[side]: results.outcomes(pair[side]).first(counts[side]) for pair in pairs}
         for side, results in enumerate((one, other))
     )
-    found = compared(pairs, firsts, seconds, paired=paired)
+    comparisons = compared(pairs, firsts, seconds, paired=paired)
     method = f"difference: first minus second; low, high: {100 * CONFIDENCE:g} % by {_METHOD[paired]}, adjusted (Holm)"
-    return _table(found, [*_notes(one, other, chosen), method], paired=paired, fractions=fraction_format(max(counts)))
+    notes, fractions = [*_notes(one, other, chosen), method], fraction_format(max(counts))
+    return _table(comparisons, notes, paired=paired, fractions=fractions)
 
 
 def _notes(first: Results, second: Results, policies: Sequence[str]) -> list[str]:
@@ -94,29 +95,22 @@ def _notes(first: Results, second: Results, policies: Sequence[str]) -> list[str
     return [printable(note) for note in [*notes, *([f"they differ in {', '.join(differ)}"] if differ else [])]]
 
 
-def _table(found: Sequence[Comparison], notes: Sequence[str], *, paired: bool, fractions: str) -> DataTable:
+def _table(pairs: Sequence[Comparison], notes: Sequence[str], *, paired: bool, fractions: str) -> DataTable:
     """The table of `compare`, with the format of its fractions."""
-    trials: dict[str, list[Entry]] = {
-        f"{side} trials": [one.rates[i].trials for one in found] for i, side in enumerate(("first", "second"))
-    }
-    apart: dict[str, list[Entry]] = {}
-    if paired:
-        trials = {"trials": trials["first trials"]}
-        apart = {"only first": [one.only_first for one in found], "only second": [one.only_second for one in found]}
-    tested = [not np.isnan(one.p_value) for one in found]
-    policies = (dict.fromkeys((one.first.policy, one.second.policy)) for one in found)
-    columns: dict[str, Sequence[Entry]] = {
-        "sweep": [one.first.sweep for one in found],
-        "strength": [one.first.strength for one in found],
-        "policy": [" against ".join(each) for each in policies],
-        **trials,
-        "first success": [one.rates[0].exact.value for one in found],
-        "second success": [one.rates[1].exact.value for one in found],
-        **apart,
-        "difference": [one.success.value for one in found],
-        "low": [one.success.low if sure else None for one, sure in zip(found, tested, strict=True)],
-        "high": [one.success.high if sure else None for one, sure in zip(found, tested, strict=True)],
-        "p": [one.adjusted if sure else None for one, sure in zip(found, tested, strict=True)],
-    }
+    rows = list[dict[str, Entry]]()
+    for pair in pairs:
+        first, second = pair.rates
+        tested = not np.isnan(pair.p_value)
+        trials: dict[str, Entry] = {"first trials": first.trials, "second trials": second.trials}
+        apart: dict[str, Entry] = {}
+        if paired:
+            trials, apart = {"trials": first.trials}, {"only first": pair.only_first, "only second": pair.only_second}
+        rows.append({
+            "sweep": pair.first.sweep, "strength": pair.first.strength,
+            "policy": " against ".join(dict.fromkeys((pair.first.policy, pair.second.policy))), **trials,
+            "first success": first.exact.value, "second success": second.exact.value, **apart,
+            "difference": pair.success.value, "low": pair.success.low if tested else None,
+            "high": pair.success.high if tested else None, "p": pair.adjusted if tested else None,
+        })  # fmt: skip
     formats = dict.fromkeys(("first success", "second success", "difference", "low", "high"), fractions)
-    return DataTable(columns, formats | {"p": ".2g"}, notes)
+    return DataTable({name: [row[name] for row in rows] for name in rows[0]}, formats | {"p": ".2g"}, notes)

@@ -104,24 +104,24 @@ def funnel(
         disturbances=runner.described, versions=versions(), rate=rate, confidence=confidence, seed=seed,
         options={"failures": failures, "largest": largest},
     )  # fmt: skip
-    found: list[FoundLevel] = []
+    levels: list[FoundLevel] = []
 
     def so_far() -> Funnel:
-        left = FoundLevel(0.0, 0, 0, "stopped before this knot was done", 0.0, 0)
-        levels = [*found, *[left] * (len(starts) - len(found))]
+        missing = FoundLevel(0.0, 0, 0, "stopped before this knot was done", 0.0, 0)
+        every = [*levels, *[missing] * (len(starts) - len(levels))]
         return replace(
             blank,
-            levels=np.array([each.level for each in levels]),
-            trials=np.array([each.trials for each in levels]),
-            successes=np.array([each.successes for each in levels]),
-            reasons=tuple(each.reason for each in levels),
-            simulated=sum(each.simulated for each in levels),
+            levels=np.array([each.level for each in every]),
+            trials=np.array([each.trials for each in every]),
+            successes=np.array([each.successes for each in every]),
+            reasons=tuple(each.reason for each in every),
+            simulated=sum(each.simulated for each in every),
         )
 
-    with keeping(lambda _: so_far() if found else None):
+    with keeping(lambda _: so_far() if levels else None):
         run = 0
         for done, knot in enumerate(starts):
-            last = f", level {found[-1].level:.3g} at the one before" if found else ""
+            last = f", level {levels[-1].level:.3g} at the one before" if levels else ""
             guess = _reach(plant, space.position, chosen, shapes[knot])
             end = min(_half_turn(solution, chosen, shapes[knot]), guess * FAR if largest is None else largest)
 
@@ -134,8 +134,8 @@ def funnel(
                 points = points_of(numbers, seed, len(chosen))
                 return runner.reached(blank.states_at(knot, points, level), knot, seed, numbers)
 
-            found.append(find_level(runs, test, guess=guess, largest=end, rate=rate))
-        tell(len(starts), len(starts), f"level {found[-1].level:.3g} at knot {starts[-1]}; {run:,} trials")
+            levels.append(find_level(runs, test, guess=guess, largest=end, rate=rate))
+        tell(len(starts), len(starts), f"level {levels[-1].level:.3g} at knot {starts[-1]}; {run:,} trials")
     return so_far()
 
 

@@ -113,16 +113,16 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
         else:
             reason = "too many trials fail at all levels that were tried, down to the smallest"
         return FoundLevel(0.0, 0, 0, reason, 0.0, pilot.simulated)
-    found, stopped, simulated = (0.0, 0, 0), "", pilot.simulated
+    passed, stopped, simulated = (0.0, 0, 0), "", pilot.simulated
     for level in dict.fromkeys(min(share * aimed, largest) for share in SHARES):
         failed, done = fresh(runs, level, test)
         simulated += done
         if failed > test.failures:
             stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}; {test.failures} of {test.trials} may"
             break
-        found = level, test.trials, test.trials - failed
-    reason = stopped if found[0] == 0 else f"levels beyond {largest:.4g} were not tried" if found[0] == largest else ""
-    return FoundLevel(*found, reason, aimed, simulated)
+        passed = level, test.trials, test.trials - failed
+    beyond = f"levels beyond {largest:.4g} were not tried" if passed[0] == largest else ""
+    return FoundLevel(*passed, beyond if passed[0] else stopped, aimed, simulated)
 
 
 def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:

@@ -245,14 +245,14 @@ def _pilot_run(
         # Later vectors are copies, a few of which may always tie.
         tie = not levels and np.sum(scores == level) > 1 and above.sum() < enough
         if tie or not above.any():
-            found = [(vectors[above], scores[above])]
-            while sum(len(some) for _, some in found) < enough and drawn < MOST_BATCHES:
+            kept = [(vectors[above], scores[above])]
+            while sum(len(some) for _, some in kept) < enough and drawn < MOST_BATCHES:
                 if on_level is not None:
                     on_level(level)
                 vectors, scores = another_batch(vectors, scores)
                 above, drawn = scores > level, drawn + 1
-                found.append((vectors[above], scores[above]))
-            vectors, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
+                kept.append((vectors[above], scores[above]))
+            vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
         if not len(scores):
             tied = drawn * particles
             raise NoFailure(

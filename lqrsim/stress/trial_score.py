@@ -214,8 +214,8 @@ class TrialScore:
     def _score(self, rollout: Rollout) -> Array:
         """The scores of a rollout. Raises InputError unless they are one number per trial."""
         # Only lqrsim's own scores leave knots out.
-        found = self.failure(rollout, first=self.first) if self.first else self.failure(rollout)  # pyright: ignore[reportCallIssue]
-        scores = shaped("failure: returned", found, (rollout.trials,))
+        options = {"first": self.first} if self.first else {}
+        scores = shaped("failure: returned", self.failure(rollout, **options), (rollout.trials,))
         if np.isnan(scores).any():
             raise InputError(f"failure: returned {excerpt(scores.tolist())}, want numbers: positive is failure")
         return scores
