@@ -148,9 +148,9 @@ def level_test(
 
     The states are of `space`, and the knots of a plan with this number of steps.
     """
-    if knots is None:
-        knots = np.linspace(0, steps, min(KNOTS, steps) + 1)[:-1].astype(int).tolist()
-    chosen, names = sorted(set(knots)), space.names if states is None else tuple(states)
+    even = np.linspace(0, steps, min(KNOTS, steps) + 1)[:-1].astype(int)
+    chosen = sorted({*even.tolist()} if knots is None else {*knots})
+    names = space.names if states is None else tuple(states)
     if not chosen or chosen[0] < 0 or chosen[-1] >= steps:
         raise InputError(f"knots: got {excerpt(knots)}, want some of 0 to {steps - 1}, before the plan's end")
     for name in names:
