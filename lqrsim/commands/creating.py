@@ -104,7 +104,6 @@ class Export:
     json: Json = False
 
     def run(self) -> int:
-
         if (self.c is None) == (self.minari is None):
             raise ls.InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
         unused, target = (OF_C, "--c") if self.c is None else (OF_MINARI, "--minari")
@@ -117,7 +116,6 @@ class Export:
         return 0
 
     def _to_c(self, folder: Path) -> None:
-
         console.check_output("--c", folder)
         policy: Any = ls.load(self.source)  # `export_c` refuses anything that cannot be exported
         found = ls.export_c(
@@ -129,7 +127,6 @@ class Export:
         console.result(sha256=found.sha256, table_bytes=found.table_bytes, rounding=found.rounding)
 
     def _to_minari(self, name: str) -> None:
-
         try:
             from lqrsim.gym import make_env, write_minari
         except ImportError as error:

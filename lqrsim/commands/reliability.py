@@ -84,7 +84,6 @@ class Rare(FailureOptions):
         return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
 
     def _write(self, found: "RareFailures", folder: Path) -> int:
-
         console.say(found.summary())
         failures = len(found.splitting.failures)
         others = min(failures, self.shown) - 1
@@ -113,7 +112,6 @@ class Break(FailureOptions):
         return problem.smallest_failure(**stated(self, problem.smallest_failure, **callbacks))
 
     def _write(self, found: "SmallestFailure", folder: Path) -> int:
-
         console.say(found.summary())
         console.say(found.save(folder).summary())
         _wrote(folder, "break.json", ("rollout.npz", "break.json"))
@@ -145,11 +143,9 @@ class Harden(FailureOptions):
     SEARCH = "hardening", "repetition"
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
-
         return ls.stress.harden(problem, **stated(self, ls.stress.harden, **callbacks))
 
     def _write(self, found: "HardenedPlan", folder: Path) -> int:
-
         console.say(found.verdict())
         shown, files = found.save(folder, shown=self.shown), ["solution.npz", "harden.json"]
         if shown is not None:
@@ -178,7 +174,6 @@ class Certify:
     json: Json = False
 
     def run(self) -> int:
-
         certificate = ls.load(self.file, ls.stress.FailureCertificate)
         console.say(certificate.summary())
         try:
@@ -198,7 +193,6 @@ class Certify:
 
 
 def _say_none(none: Exception) -> int:
-
     console.say(f"no failure was found ({none})")
     console.result(found=None, reason=str(none))
     return 1
@@ -206,7 +200,6 @@ def _say_none(none: Exception) -> int:
 
 def _wrote(folder: Path, result: str, files: Sequence[str]) -> None:
     """Say which files were written. The result for `--json` is the content of one of them."""
-
     for name in files:
         console.wrote(folder / name)
     console.result(**json.loads((folder / result).read_text(encoding="utf-8")))

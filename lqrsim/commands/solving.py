@@ -237,7 +237,6 @@ class Simulate:
         return 0
 
     def _single_disturbances(self) -> "list[ls.disturbances.Disturbance]":
-
         disturbances: list[ls.disturbances.Disturbance] = []
         if self.control_noise:
             disturbances.append(ls.disturbances.ControlNoise(self.control_noise))

@@ -99,7 +99,6 @@ class Render:
 
     def _check_options(self, out: Path) -> None:
         """Raise InputError for another kind of file, or for options that do not belong to its kind."""
-
         kind = out.suffix.lower()
         if kind in (".mp4", ".gif") and (self.time is not None or self.every is not None):
             raise ls.InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
