@@ -101,7 +101,7 @@ ALLOWED = {
     "tyro": ("cli", "commands"),
     "pyarrow": ("stress",),
     "distributed": ("stress",),
-    "jinja2": ("reports",),
+    "jinja2": ("reports", "commands.reproduce"),
     "tqdm": ("commands",),
     "gymnasium": ("gym",),
     "minari": ("gym",),

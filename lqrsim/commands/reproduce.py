@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jinja2
+
 from lqrsim.commands import console
 from lqrsim.errors import InputError, check_name
 from lqrsim.machine import description
@@ -146,44 +148,26 @@ def _end(running: subprocess.Popen[str]) -> None:
 def results_page(saved: Mapping[str, Any]) -> str:
     """All results in Markdown: verdicts on the paper's statements, the runs, and the report of each script."""
     results: dict[str, ScriptResult] = saved["results"]
-    statements = [statement for one in results.values() for statement in one["statements"]]
+    statements = [statement for result in results.values() for statement in result["statements"]]
     versions = next(iter(results.values()))["result"]["versions"]
-    rows = [
-        f"| {one['paper']} ({one['where']}) | {one['test']} | {one['ours']} | {VERDICTS[one['holds']]} |"
-        for one in statements
-    ]
-    size = "a quick run, on a small part of the problems" if saved["quick"] else "a full run"
-    command = "lqrsim reproduce --quick" if saved["quick"] else "lqrsim reproduce"
-    parts = [
-        "# The paper's results, reproduced",
-        f"Written by `{command}`, {size}. Each section is one script of `experiments/`, which also runs by itself; its"
-        " help says how it measures. [results.json](results.json) has the numbers unrounded.",
-        "The paper: J. van den Berg, *Iterated LQR Smoothing for Locally-Optimal Feedback Control of Systems with"
-        " Non-Linear Dynamics and Non-Quadratic Cost*, American Control Conference, 2014.",
-        f"Computed with {', '.join(f'{name} {version}' for name, version in versions.items())} on {saved['machine']}.",
-        "Intervals in brackets are of 95 %: exact for shares, by bootstrap over queries or rounds otherwise. Times are"
-        " on one thread. In the paper's problems obstacles are a cost, which nothing forbids to pay: a plan that has"
-        " converged may collide. Presets and strengths are those of"
-        " [Stress testing](stress_testing.md#presets).",
-    ]
-    if statements:
-        head = "| the paper says | counts as holding | what came out | verdict |"
-        parts += [
-            "## Which of the paper's statements hold",
-            f"{_count(statements)} A statement can have several tests; what counts as holding"
-            " is this project's choice.",
-            "\n".join([head, "| --- " * 4 + "|", *rows]),
-        ]
-    for name, one in results.items():
-        options = "" if not saved["quick"] else " --quick"
+    sections = list[dict[str, str]]()
+    for name, result in results.items():
+        run = [f"{result['seconds']} s"]
         # With --keep, a result may be of another version or machine than the page's first lines say.
-        other = [
-            f"{what} {version}" for what, version in one["result"]["versions"].items() if versions.get(what) != version
-        ]
-        where = [] if one.get("machine", saved["machine"]) == saved["machine"] else [f"on {one['machine']}"]
-        said = ", ".join([f"{one['seconds']} s", *(["with " + " and ".join(other)] if other else []), *where])
-        parts += [one["report"], f"`python experiments/{name}.py{options}`, {said}."]
-    return "\n\n".join(parts) + "\n"
+        used = result["result"]["versions"].items()
+        if other := [f"{what} {version}" for what, version in used if versions.get(what) != version]:
+            run.append(f"with {' and '.join(other)}")
+        if (machine := result.get("machine", saved["machine"])) != saved["machine"]:
+            run.append(f"on {machine}")
+        sections.append({"name": name, "report": result["report"], "run": ", ".join(run)})
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True)  # Markdown, not HTML
+    template = environment.from_string(Path(__file__).with_name("results.md.j2").read_text(encoding="utf-8"))
+    return template.render(
+        size="a quick run, on a small part of the problems" if saved["quick"] else "a full run",
+        options=" --quick" if saved["quick"] else "", machine=saved["machine"], sections=sections,
+        versions=", ".join(f"{name} {version}" for name, version in versions.items()), statements=statements,
+        count=_count(statements), verdicts=VERDICTS,
+    )  # fmt: skip
 
 
 def _count(statements: Sequence[Mapping[str, Any]]) -> str:
