@@ -1,5 +1,6 @@
 # What `lqrsim` offers, and where it is: read by type checkers, and by lazy_loader when a name is first used.
 
+from . import belief as belief
 from . import disturbances as disturbances
 from . import lq as lq
 from . import robots as robots

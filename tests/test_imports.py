@@ -35,7 +35,7 @@ FLOORS = (
     ("reports",),
     ("commands",),
     ("cli",),
-    ("disturbances", "lq", "types"),
+    ("belief", "disturbances", "lq", "types"),
 )
 
 # Within a room, the same: what is not named here may import whatever is, and its own kind.
@@ -74,7 +74,7 @@ FLOORS_WITHIN = {
             "state_bounds",
         ),
         ("problem",),
-        ("last_command",),
+        ("belief", "last_command"),
     ),
     "solvers": (
         ("budget", "compiled", "initial_guess"),

@@ -47,6 +47,8 @@ class Operations:
         """The name of an expression, after a step for each operation in it; a condition is no step."""
         import sympy
 
+        if isinstance(expression, int):  # an empty sum
+            return sympy.Integer(expression)
         if expression in self._names:
             return self._names[expression]
         if not expression.args:
@@ -154,6 +156,13 @@ def weighted_hessian(
     """
     operations = Operations()
     results = operations.of(formulas)
+    return hessian_of(operations, results, weights, variables, most=most)
+
+
+def hessian_of(
+    operations: Operations, results: Sequence[Any], weights: Sequence[Any], variables: Sequence[Any], *, most: int
+) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
+    """The same for formulas that are operations already, given their names; steps are added to the operations."""
     order = {symbol: i for i, symbol in enumerate(variables)}
     forward = []
     for symbol, operation in operations.steps:
@@ -170,3 +179,29 @@ def weighted_hessian(
     pairs = itertools.combinations_with_replacement(enumerate(variables), 2)
     curves = {(i, j): total.second(a, b) for (i, a), (j, b) in pairs}
     return operations.steps, {pair: curve for pair, curve in curves.items() if curve != 0}
+
+
+def jacobian_of(operations: Operations, results: Sequence[Any], variables: Sequence[Any]) -> dict[tuple[int, int], Any]:
+    """The first derivatives of formulas that are operations, by one sweep forward; steps are added to the operations.
+
+    Returns:
+      (row, variable) -> the name of the derivative, where it is not always zero.
+    """
+    import sympy
+
+    slopes: dict[Any, dict[int, Any]] = {symbol: {j: sympy.Integer(1)} for j, symbol in enumerate(variables)}
+    for symbol, operation in list(operations.steps):
+        terms: dict[int, list[Any]] = defaultdict(list)
+        for a in sorted(operation.free_symbols & slopes.keys(), key=str):
+            slope = operations.name(without_kinks(operation.diff(a)))
+            for j, inner in slopes[a].items():
+                terms[j].append(slope * inner)
+        found = {j: operations.name(sympy.Add(*parts)) for j, parts in terms.items()}
+        if found:
+            slopes[symbol] = {j: slope for j, slope in found.items() if slope != 0}
+    return {
+        (i, j): slope * result.diff(symbol)
+        for i, result in enumerate(results)
+        for symbol in result.free_symbols & slopes.keys()  # at most one, perhaps negative
+        for j, slope in slopes[symbol].items()
+    }

@@ -105,7 +105,7 @@ def _writers() -> str:
     files = [package / "codegen" / f"{name}.py" for name in ("edge_pushing", "symbolic")]
     files += [
         package / "problem" / f"{name}.py"
-        for name in ("dynamics", "costs", "constraints", "collision_spheres", "noise")
+        for name in ("belief", "dynamics", "costs", "constraints", "collision_spheres", "noise")
     ]
     return "".join(file.read_text(encoding="utf-8") for file in files)
 

@@ -1,0 +1,478 @@
+"""Belief-space planning: what the robot knows of its state, as the state of dynamics.
+
+A belief is the mean m (n,) of the robot's state and the lower triangular root L of its covariance, L L'. It moves by an
+extended Kalman filter under maximum-likelihood readings (van den Berg, Patil and Alterovitz, 2012): the mean by the
+robot's dynamics F, the covariance by
+
+    L- = chol(A L L' A' + M M'),    A = dF/dm    and for each reading    L+ = L C,    C C' = I - v v' / s,
+
+where v = L' h, s = r^2 + v'v, h is the gradient of the reading at F and r its standard deviation there. C has a closed
+form without subtractions or inverses. Readings move the mean by v / sqrt(s) times L and a standard normal number, which
+is the noise of the belief. Everything is formulas, with exact first and second derivatives.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.annotations import Bounds, Positive, checked
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.edge_pushing import Operations, hessian_of, jacobian_of
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.sources import text_source
+from lqrsim.codegen.user_functions import check_signature, level_of, name_of, rows_of
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_name
+from lqrsim.problem.dynamics import MOST_STEPS, Dynamics
+from lqrsim.problem.formulas import SymbolicConstraint
+from lqrsim.problem.noise import Noise
+
+
+class NoisySensors:
+    """Sensors whose noise depends on the state, as formulas: light, distances to beacons, a field of view.
+
+        def beacon(x, u, p):  # the distance to a beacon, measured the better the nearer it is
+            distance = sqrt((x.x - p.x) ** 2 + (x.y - p.y) ** 2 + p.height**2)
+            return [(distance, p.noise * distance)]
+
+    Args:
+      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns for each reading a pair: what is read in
+        this state, and the standard deviation of its noise, which must be positive. Noises are independent. u are the
+        controls of the period before.
+      parameters: name -> value, as in `Dynamics`.
+    """
+
+    @checked
+    def __init__(
+        self, function: Callable[[Any, Any, Any], Any], *, parameters: Mapping[str, float] | None = None
+    ) -> None:
+        if level_of(function, None) == "compiled":
+            raise InputError(f"NoisySensors: got the numba function {name_of(function)}, want one of SymPy symbols")
+        check_signature(function, ("x", "u", "p"))
+        self.function, self.parameters = function, symbolic.check_parameters(parameters)
+
+
+class _Step(NamedTuple):
+    """A step of a belief in operations: their names.
+
+    Attributes:
+      after: mean and root, (N,). columns: of the noise of the mean, (Y, n). readings, deviations: (Y,) at the predicted
+        mean, or at the belief itself.
+    """
+
+    operations: Operations
+    x: list[Any]
+    u: list[Any]
+    after: list[Any]
+    columns: list[list[Any]]
+
+
+class Belief(Dynamics):
+    """The dynamics of a belief: a map of the mean and of the root of the covariance, for `Problem(dynamics=...)`.
+
+    The states are those of the robot, which are now means, followed by the root's lower triangle, row by row:
+    `root_x_x`, `root_y_x`, `root_y_y`, .... Row i has the unit of state i. A variance is the sum of the squares of its
+    row, so a `QuadraticCost` with the same weight on a state and on its row is the expectation of that cost of the
+    robot's state; see `uncertainty`. Obstacles and limits act on the mean; see `chance_constraint`.
+
+    Args:
+      dynamics: the robot's, stated as a formula: a rate or a map.
+      dt: control period in s.
+      noise: noise on the robot's state in each period, a formula or a matrix.
+      sensors: what is read at the end of each period.
+    """
+
+    @checked
+    def __init__(self, dynamics: Dynamics, *, dt: Positive, noise: Noise, sensors: NoisySensors) -> None:
+        check_kind("Belief: noise", noise, Noise, "a Noise")
+        check_kind("Belief: sensors", sensors, NoisySensors, "NoisySensors(...)")
+        for what, level in (("dynamics", dynamics.level), ("noise", noise.level)):
+            if level != "symbolic" or dynamics.by_mujoco:
+                raise InputError(f"Belief: {what}: got a function of arrays, want a formula")
+        dynamics.check_period(dt)
+        noise.bind(dynamics)  # raises an exception if it does not fit
+        self.robot, self.process, self.sensors = dynamics, noise, sensors
+        space, controls = dynamics.state_coordinates, dynamics.control_coordinates
+        names, units = space.names, space.units
+        pairs = [(i, j) for i in range(len(names)) for j in range(i + 1)]
+        super().__init__(
+            _key(dynamics, dt, noise, sensors),
+            states=dict(zip(names, units, strict=True)) | {f"root_{names[i]}_{names[j]}": units[i] for i, j in pairs},
+            controls=dict(zip(controls.names, controls.units, strict=True)),
+            parameters=_together(dynamics.parameters, noise.parameters, sensors.parameters),
+            disturbances=dynamics.constants,
+            position=[names[i] for i in space.position],
+            plane=space.plane if len(space.position) == 2 else "",
+            offset=space.offset,
+            angles=[names[i] for i in space.angles],
+            rotation_vectors=[names[i : i + 3] for i in space.rotation_vectors],
+            control_limits=(controls.low, controls.high),
+            period=dt,
+        )
+
+    @property
+    def size(self) -> int:
+        """n, the number of the robot's states."""
+        return len(self.robot.state_coordinates)
+
+    def state(self, mean: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
+        """The belief (N,) with this mean and covariance.
+
+        Args:
+          mean: (n,).
+          covariance: (n, n), positive definite; or (n,) standard deviations.
+        """
+        n = self.size
+        given = np.asarray(covariance, dtype=np.float64)
+        full = np.diag(check_array("covariance", given, (n,)) ** 2) if given.ndim == 1 else given
+        try:
+            root = np.linalg.cholesky(check_array("covariance", full, (n, n)))
+        except np.linalg.LinAlgError:
+            raise InputError("covariance: got one that is not positive definite, want every deviation > 0") from None
+        return np.concatenate([check_array("mean", mean, (n,)), root[np.tril_indices(n)]])
+
+    def covariance(self, states: npt.ArrayLike) -> Array:
+        """The covariances (..., n, n) of beliefs (..., N).
+
+        Args:
+          states: (..., N).
+        """
+        given, n = np.asarray(states, dtype=np.float64), self.size
+        root = np.zeros((*given.shape[:-1], n, n))
+        root[..., *np.tril_indices(n)] = given[..., n:]
+        return root @ root.swapaxes(-1, -2)
+
+    def uncertainty(self, weights: Mapping[str, float]) -> dict[str, float]:
+        """Weights of a `QuadraticCost` that is half the weighted sum of the variances of some states.
+
+        Args:
+          weights: name of a state of the robot -> weight of its variance.
+        """
+        names = self.robot.state_coordinates.names
+        for name in weights:
+            check_name("weights", name, names)
+        return {
+            f"root_{name}_{names[j]}": weight
+            for name, weight in weights.items()
+            for j in range(names.index(name) + 1)
+        }  # fmt: skip
+
+    @property
+    def innovations(self) -> Noise:
+        """The noise of the belief, for `Problem(noise=...)`: by how much readings will move the mean."""
+        return _Innovations(self)
+
+    def chance_constraint(
+        self,
+        function: Callable[[Any, Any, Any], Any],
+        *,
+        chance: float,
+        parameters: Mapping[str, float] | None = None,
+        name: str | None = None,
+    ) -> SymbolicConstraint:
+        """The constraint that `function(x, u, p) >= 0` in the robot's state, but for a chance at each step.
+
+        The function is linearised about the mean, so that it is normally distributed: it must be larger than the
+        standard deviation along its gradient times a quantile.
+
+        Args:
+          function: as in `SymbolicConstraint`, with x the robot's state. Each of its entries has the chance.
+          chance: largest chance that an entry is negative, below a half.
+          parameters: name -> value, as in `SymbolicConstraint`.
+          name: as in `SymbolicConstraint`.
+        """
+        n, names = self.size, tuple(self.robot.state_coordinates.names)
+        quantile = -NormalDist().inv_cdf(Bounds(above=0.0, below=0.5).check("chance", chance))
+
+        @functools.wraps(function)
+        def margin(x: Any, u: Any, p: Any) -> list[Any]:
+            from sympy import sqrt, sympify
+
+            returned = function(symbolic.Vector(x[:n], names), u, p)
+            root, margins = _lower(x[n:], n), []
+            for entry in returned if isinstance(returned, list | tuple) else [returned]:
+                slopes = [sympify(entry).diff(state) for state in x[:n]]
+                spread = sum(sum(slopes[i] * root[i][j] for i in range(j, n)) ** 2 for j in range(n))
+                margins.append(entry - p.deviations * sqrt(spread))
+            return margins
+
+        return SymbolicConstraint(margin, parameters={**(parameters or {}), "deviations": quantile}, name=name)
+
+    def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
+        """The beliefs (K, N) of the extended Kalman filter one period later.
+
+        Args:
+          states: (K, N). controls: (K, m), held over the period. readings: (K, Y), taken at its end.
+        """
+        return self._each("corrected", states, controls, readings, len(self.state_coordinates))
+
+    def read(self, states: Array, controls: Array) -> tuple[Array, Array]:
+        """The exact readings (K, Y) in states of the robot, and the standard deviations of their noise.
+
+        Args:
+          states: (K, n), of the robot. controls: (K, m).
+        """
+        found = self._each("sense", states, controls, np.zeros((len(states), 0)), 2 * self.readings)
+        return found[:, ::2], found[:, 1::2]
+
+    @functools.cached_property
+    def readings(self) -> int:
+        """Y, the number of readings."""
+        return int(self._made["readings"])
+
+    def _each(self, name: str, states: Array, controls: Array, readings: Array, size: int) -> Array:
+        out, numbers = np.empty((len(states), size)), self._numbers()
+        for one in zip(states, controls, readings, out, strict=True):  # a trial has the same bits in any batch
+            self._filter[name](*one[:2], numbers, *one[2:])
+        return out
+
+    @functools.cached_property
+    def _filter(self) -> dict[str, Any]:
+        source = text_source(self._made["filter"], f"filter of {self.name}")
+        return plain_functions(source, {"N": len(self.state_coordinates)}, ("corrected", "sense"))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in super().__getstate__().items() if name != "_filter"}
+
+    @functools.cached_property
+    def _made(self) -> dict[str, Any]:
+        details = ("filter", self.state_coordinates.names, tuple(self.parameters), *self.constants.items())
+        return symbolic.kept(self.f, details, self._trace_filter, filter=str, readings=int)
+
+    def _trace(self) -> str:
+        made = self._step()
+        n, of = len(made.x), f"{self.name}(x, u, p)"
+        values = {f"out[{i}]": entry for i, entry in enumerate(made.after)}
+        value = _written("rate", "x, u, p, out", values, made, of)
+        slopes = {
+            (f"fx[{i}, {j}]" if j < n else f"fu[{i}, {j - n}]"): slope
+            for (i, j), slope in jacobian_of(made.operations, made.after, [*made.x, *made.u]).items()
+        }
+        return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values | slopes, made, of)}"
+
+    def _trace_curvature(self) -> dict[str, Any]:
+        import sympy
+
+        made = self._step()
+        weights = [sympy.Symbol(f"w{i}", real=True) for i in range(len(made.x))]
+        found = hessian_of(made.operations, made.after, weights, [*made.x, *made.u], most=MOST_STEPS)
+        if found is None:
+            return {"source": "", "support": []}
+        support = sorted({i for pair in found[1] for i in pair})
+        place = {i: k for k, i in enumerate(support)}
+        values = {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in found[1].items()}
+        of = f"{self.name}(x, u, p)"
+        return {"source": _written("rate_curvature", "x, u, p, w, curve", values, made, of), "support": support}
+
+    def _trace_filter(self) -> dict[str, Any]:
+        made, of = self._step(read=True), f"{self.name}(x, u, p)"
+        values = {f"out[{i}]": entry for i, entry in enumerate(made.after)}
+        pairs, x, _ = self._sensing()
+        sense = {f"out[{i}]": entry for i, entry in enumerate(pairs)}
+        parts = [
+            _written("corrected", "x, u, p, w, out", values, made, of),
+            symbolic.write_function("sense", "x, u, p, out", "p", sense, of=of),
+        ]
+        return {"filter": "\n\n".join(parts), "readings": len(pairs) // 2}
+
+    def _sensing(self) -> tuple[list[Any], list[Any], list[Any]]:
+        """The formulas of readings and their deviations, in turn, of the robot's state."""
+        function = self.sensors.function
+
+        @functools.wraps(function)
+        def listed(x: Any, u: Any, p: Any) -> list[Any]:
+            returned, wanted = function(x, u, p), "pairs of a reading and the standard deviation of its noise"
+            count = len(returned) if isinstance(returned, list | tuple) else -1
+            pairs = rows_of(returned, count, wanted)
+            if not pairs or any(len(pair) != 2 for pair in pairs):
+                raise InputError(f"got {returned}, want {wanted}, at least one")
+            return [entry for pair in pairs for entry in pair]
+
+        return self._formulas(listed)
+
+    def _formulas(self, function: Callable[..., Any]) -> tuple[list[Any], list[Any], list[Any]]:
+        """The formulas of a function of the robot's state and control, and their symbols."""
+        names = self.robot.state_coordinates.names, self.control_coordinates.names
+        return symbolic.trace(function, *names, list(self.parameters), constants=self.constants)
+
+    def _step(self, *, read: bool = False) -> _Step:
+        """A step, in operations; with `read`, of a filter whose readings are the symbols w."""
+        import sympy
+
+        n, operations = self.size, Operations()
+        name = operations.name
+        x = [sympy.Symbol(f"x{i}", real=True) for i in range(len(self.state_coordinates))]
+        rates, means, u = self._formulas(self.robot.f)
+        process = self.process
+        if process.matrix is None:
+            entries, _, _ = self._formulas(lambda x, u, p: sum(process._rows(process.function(x, u, p), n), []))
+        else:
+            entries = [sympy.Float(one) if one else sympy.Integer(0) for one in process.matrix.ravel().tolist()]
+        strength = sympy.Float(process.strength) if process.strength != 1 else sympy.Integer(1)
+        shaken = [[name(strength * one) for one in entries[i * process.size :][: process.size]] for i in range(n)]
+        mean, slopes = _moved(operations, rates, means, n, self.robot, float(self.period or 0))
+        root = _lower(x[n:], n)
+        turned = [[name(sum(slopes[i][k] * root[k][j] for k in range(j, n))) for j in range(n)] for i in range(n)]
+        root = _cholesky(operations, [a + b for a, b in zip(turned, shaken, strict=True)], n)
+        pairs, _, _ = self._sensing()
+        at = dict(zip(means, mean, strict=True))
+        columns, now = [], mean
+        for row, (reading, deviation) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
+            slope = [name(sympy.sympify(reading.diff(state)).xreplace(at)) for state in means]
+            variance = name(deviation.xreplace(at) ** 2)
+            seen = [name(sum(slope[i] * root[i][j] for i in range(j, n))) for j in range(n)]
+            sums = [variance]  # of the squares from the last to each
+            for one in reversed(seen):
+                sums.insert(0, name(sums[0] + one**2))
+            column = [name(sum(root[i][j] * seen[j] for j in range(i + 1))) for i in range(n)]
+            columns.append([name(one / sympy.sqrt(sums[0])) for one in column])
+            if read:
+                off = sum((s * (a - b) for s, a, b in zip(slope, now, mean, strict=True)), name(reading.xreplace(at)))
+                share = name((sympy.Symbol(f"w{row}", real=True) - off) / sums[0])
+                now = [name(a + one * share) for a, one in zip(now, column, strict=True)]
+            root = _informed(operations, root, seen, sums)
+        return _Step(operations, x, u, [*now, *(one for row in root for one in row)], columns)
+
+
+class _Innovations(Noise):
+    """How readings move the mean of a belief: a column for each reading."""
+
+    def __init__(self, belief: Belief) -> None:
+        super().__init__(belief.f, size=belief.readings, parameters=belief.parameters)
+        self._belief = belief
+
+    def _trace(self, states: Any, controls: Any) -> dict[str, Any]:
+        import sympy
+
+        made, belief = self._belief._step(), self._belief
+        strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)
+        rows = list(range(belief.size))
+        name = made.operations.name
+        flat = [name(strength * one) for column in made.columns for one in column]
+        slopes = jacobian_of(made.operations, flat, [*made.x, *made.u])
+        active = sorted({j for _, j in slopes})
+        values = {f"out[{i}, {k}]": flat[k * len(rows) + i] for i in rows for k in range(self.size)}
+        changes = {
+            f"slopes[{at // len(rows)}, {at % len(rows)}, {active.index(j)}]": slope
+            for (at, j), slope in slopes.items()
+        }  # fmt: skip
+        of = f"innovations of {belief.name}"
+        source = [
+            _written("noise_values", "x, u, data, out", values, made, of, data="data"),
+            _written("noise_slopes", "x, u, data, out, slopes", values | changes, made, of, data="data"),
+        ]
+        return {"source": "\n\n".join(source), "rows": rows, "active": active}
+
+
+def _key(dynamics: Dynamics, dt: float, noise: Noise, sensors: NoisySensors) -> Callable[[Any, Any, Any], Any]:
+    """A function that refers to all that a belief is made of, by which its formulas are kept; nothing calls it."""
+    parts = (
+        dynamics.f, dynamics.discrete, dynamics.substeps, float(dt), noise.strength,
+        noise.function if noise.matrix is None else noise.matrix, sensors.function,
+    )  # fmt: skip
+
+    def belief(x: Any, u: Any, p: Any) -> Any:
+        return parts
+
+    belief.__name__ = belief.__qualname__ = f"belief of {name_of(dynamics.f)}"
+    return belief
+
+
+def _together(*given: Mapping[str, float]) -> dict[str, float]:
+    """The parameters of all. Raises InputError if two have one name and not one value."""
+    found: dict[str, float] = {}
+    for one in given:
+        for name, value in one.items():
+            if found.setdefault(name, value) != value:
+                raise InputError(f"Belief: parameters: got {name!r} twice, {found[name]:g} and {value:g}, want one")
+    return found
+
+
+def _written(name: str, arguments: str, values: dict[str, Any], made: _Step, of: str, data: str = "p") -> str:
+    """Source of a function of the operations that these values need."""
+    needed, steps = {symbol for one in values.values() for symbol in one.free_symbols}, []
+    for symbol, operation in reversed(made.operations.steps):
+        if symbol in needed:
+            needed |= operation.free_symbols
+            steps.append((symbol, operation))
+    return symbolic.write_function(name, arguments, data, values, of=of, steps=steps[::-1])
+
+
+def _lower(entries: Any, n: int) -> list[list[Any]]:
+    """The rows of a lower triangle."""
+    return [list(entries[i * (i + 1) // 2 :][: i + 1]) for i in range(n)]
+
+
+def _moved(
+    operations: Operations, rates: list[Any], x: list[Any], n: int, robot: Dynamics, dt: float
+) -> tuple[list[Any], list[list[Any]]]:
+    """The robot's state after a period and its Jacobian by the state, (n, n): those of `Dynamics.step`."""
+    import sympy
+
+    name, identity = operations.name, [[sympy.Integer(int(i == j)) for j in range(n)] for i in range(n)]
+    jacobian = [[rate.diff(one) for one in x] for rate in rates]
+
+    def at(state: list[Any], slopes: list[list[Any]]) -> tuple[list[Any], list[list[Any]]]:
+        place = dict(zip(x, state, strict=True))
+        value = [name(rate.xreplace(place)) for rate in rates]
+        own = [[name(sympy.sympify(one).xreplace(place)) for one in row] for row in jacobian]
+        return value, [[name(sum(own[i][k] * slopes[k][j] for k in range(n))) for j in range(n)] for i in range(n)]
+
+    if robot.discrete:
+        return at(x, identity)
+    state, slopes, h = x, identity, sympy.Float(dt / robot.substeps)
+    for _ in range(robot.substeps):
+        stages: list[tuple[list[Any], list[list[Any]]]] = []
+        for share in (0, h / 2, h / 2, h):
+            k, K = stages[-1] if stages else (state, slopes)
+            stages.append(
+                at(
+                    [name(a + share * b) if share else a for a, b in zip(state, k, strict=True)],
+                    [[name(a + share * b) if share else a for a, b in zip(*rows, strict=True)]
+                     for rows in zip(slopes, K, strict=True)],
+                )
+            )  # fmt: skip
+        weights = (h / 6, h / 3, h / 3, h / 6)
+        after = [name(state[i] + sum(w * k[i] for w, (k, _) in zip(weights, stages, strict=True))) for i in range(n)]
+        slopes = [
+            [name(slopes[i][j] + sum(w * K[i][j] for w, (_, K) in zip(weights, stages, strict=True))) for j in range(n)]
+            for i in range(n)
+        ]
+        state = after
+    return state, slopes
+
+
+def _cholesky(operations: Operations, B: list[list[Any]], n: int) -> list[list[Any]]:
+    """The lower triangular root of B B'."""
+    import sympy
+
+    name, L = operations.name, list[list[Any]]()
+    for i in range(n):
+        row: list[Any] = []
+        for j in range(i + 1):
+            product = sum(a * b for a, b in zip(B[i], B[j], strict=True))
+            rest = name(product - sum(row[k] * (L[j][k] if j < i else row[k]) for k in range(j)))
+            row.append(name(rest / L[j][j]) if j < i else name(sympy.sqrt(rest)))
+        L.append(row)
+    return L
+
+
+def _informed(operations: Operations, L: list[list[Any]], v: list[Any], sums: list[Any]) -> list[list[Any]]:
+    """L C, with the lower triangular C of C C' = I - v v' / sums[0], for the sums of r^2 and v_j^2 from each j on.
+
+    C_jj = sqrt(sums_j+1 / sums_j), and below it C_ij = -v_i v_j / sqrt(sums_j sums_j+1).
+    """
+    import sympy
+
+    name, n = operations.name, len(v)
+    after = [list[Any](row) for row in L]
+    for j in range(n):
+        diagonal = name(sympy.sqrt(name(sums[j + 1] / sums[j])))
+        share = name(v[j] / name(sums[j] * diagonal))
+        for i in range(j, n):
+            below = name(sum(L[i][k] * v[k] for k in range(j + 1, i + 1)))
+            after[i][j] = name(L[i][j] * diagonal - share * below)
+    return after

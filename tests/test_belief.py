@@ -1,0 +1,152 @@
+"""Beliefs: against LQG in closed form, an extended Kalman filter of matrices, differences, and drawn runs."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+from sympy import cos, sin, sqrt
+
+import lqrsim as ls
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.errors import Array
+from lqrsim.results.solution_parts import Status
+
+DT = 0.1
+A, B = np.array([[1.0, DT], [-0.3, 0.9]]), np.array([[0.0, 0.1], [DT, 0.3]])
+H, R = np.array([[1.0, 0.2], [-0.3, 1.0]]), np.array([0.3, 0.5])
+M = np.array([[0.1, 0.02], [0.0, 0.2]])
+
+
+def linear(x: Any, u: Any, p: Any) -> list[Any]:
+    return [sum(A[i, j] * x[j] + B[i, j] * u[j] for j in range(2)) for i in range(2)]
+
+
+def linear_readings(x: Any, u: Any, p: Any) -> list[Any]:
+    return [(sum(H[i, j] * x[j] for j in range(2)), float(R[i])) for i in range(2)]
+
+
+def linear_belief() -> ls.belief.Belief:
+    dynamics = ls.Dynamics(linear, states={"x": "m", "v": "m/s"}, controls={"a": "N", "b": "N"}, period=DT)
+    return ls.belief.Belief(dynamics, dt=DT, noise=ls.Noise(M), sensors=ls.belief.NoisySensors(linear_readings))
+
+
+def unicycle(x: Any, u: Any, p: Any) -> list[Any]:
+    return [u.speed * cos(x.heading), u.speed * sin(x.heading), u.turn]
+
+
+def skids(x: Any, u: Any, p: Any) -> list[Any]:
+    return [[p.skid * cos(x.heading), 0, 0.01], [p.skid * sin(x.heading), 0.01, 0], [0, p.skid + 0.1 * u.turn, 0]]
+
+
+def beacons(x: Any, u: Any, p: Any) -> list[Any]:
+    distances = [sqrt((x.x - place) ** 2 + x.y**2 + 0.01) for place in (p.left, 2.0)]
+    return [*((one, p.noise * (0.1 + one)) for one in distances), (sin(x.heading) + 0.1 * u.speed, 0.2)]
+
+
+def robot() -> ls.Dynamics:
+    states, controls = {"x": "m", "y": "m", "heading": "rad"}, {"speed": "m/s", "turn": "rad/s"}
+    return ls.Dynamics(unicycle, states=states, controls=controls, position=("x", "y"), angles=("heading",))
+
+
+def belief() -> ls.belief.Belief:
+    noise = ls.Noise(skids, size=3, parameters={"skid": 0.05})
+    sensors = ls.belief.NoisySensors(beacons, parameters={"left": -2.0, "noise": 0.1})
+    return ls.belief.Belief(robot(), dt=DT, noise=noise, sensors=sensors)
+
+
+START = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.05]])
+
+
+def test_linear_gaussian_is_lqg() -> None:
+    """Cost and gains of separation: Riccati's equations for the law and for the filter. To 1e-8, as of the solver."""
+    of, steps, start = linear_belief(), 60, np.array([1.0, -0.5])
+    q, r = np.array([2.0, 1.0]), np.array([0.5, 0.3])
+    p = solve_discrete_are(A, B, np.diag(q), np.diag(r))
+    weights = of.uncertainty({"x": q[0], "v": q[1]})
+    final = np.zeros((5, 5))
+    final[:2, :2] = p
+    rows, columns = np.tril_indices(2)  # of tr(p L L'): entries of one column of L are weighed together
+    final[2:, 2:] = p[np.ix_(rows, rows)] * (columns[:, None] == columns)
+    problem = ls.Problem(
+        dynamics=of, dt=DT, steps=steps, initial=ls.FixedState(of.state(start, START[:2, :2])),
+        stage_cost=ls.QuadraticCost({"x": q[0], "v": q[1]} | weights, about=[0] * 5) + ls.ControlCost(r),
+        final_cost=ls.QuadraticCost(final, about=[0] * 5), noise=of.innovations,
+    )  # fmt: skip
+    cost, covariance = 0.5 * start @ p @ start, START[:2, :2]
+    for _ in range(steps):
+        cost += 0.5 * np.trace(np.diag(q) @ covariance)
+        predicted = A @ covariance @ A.T + M @ M.T
+        gain = predicted @ H.T @ np.linalg.inv(H @ predicted @ H.T + np.diag(R**2))
+        covariance = predicted - gain @ H @ predicted
+        cost += 0.5 * np.trace(p @ (predicted - covariance))
+    cost += 0.5 * np.trace(p @ covariance)
+    law = -np.linalg.solve(np.diag(r) + B.T @ p @ B, B.T @ p @ A)
+    for solve in (ls.smooth, ls.ilqr):
+        solution = solve(problem)
+        assert solution.status is Status.CONVERGED
+        assert solution.cost == pytest.approx(cost, rel=1e-8)
+        np.testing.assert_allclose(solution.policy.gain[..., :2], np.tile(law, (steps, 1, 1)), atol=1e-8)
+        np.testing.assert_allclose(solution.policy.gain[..., 2:], 0, atol=1e-8)
+        np.testing.assert_allclose(of.covariance(solution.trajectory.states[-1]), covariance, atol=1e-12)
+
+
+def filtered(mean: Array, covariance: Array, u: Array, readings: Array | None) -> tuple[Array, Array]:
+    """The extended Kalman filter of `belief()`, by matrices; without readings, of the most likely ones."""
+    p = SimpleNamespace(left=-2.0, noise=0.1, skid=0.05)
+    after = robot().step(mean, u, DT)
+    a = robot().linearize(mean, u, DT)[0]
+    m = np.array(
+        [[p.skid * np.cos(mean[2]), 0, 0.01], [p.skid * np.sin(mean[2]), 0.01, 0], [0, p.skid + 0.1 * u[1], 0]]
+    )
+    predicted = a @ covariance @ a.T + m @ m.T
+    h, expected, std = np.zeros((3, 3)), np.zeros(3), np.array([0.0, 0.0, 0.2])
+    for i, place in enumerate((p.left, 2.0)):
+        expected[i] = np.sqrt((after[0] - place) ** 2 + after[1] ** 2 + 0.01)
+        h[i, :2] = (after[0] - place) / expected[i], after[1] / expected[i]
+        std[i] = p.noise * (0.1 + expected[i])
+    expected[2], h[2, 2] = np.sin(after[2]) + 0.1 * u[0], np.cos(after[2])
+    gain = predicted @ h.T @ np.linalg.inv(h @ predicted @ h.T + np.diag(std**2))
+    moved = 0.0 if readings is None else gain @ (readings - expected)
+    return after + moved, predicted - gain @ h @ predicted
+
+
+def test_a_step_is_that_of_an_extended_kalman_filter() -> None:
+    """To rounding: its mean and covariance, the spread of its mean by readings, and its corrections by given ones."""
+    of, rng = belief(), np.random.default_rng(0)
+    for _ in range(5):
+        mean, u, readings = rng.normal(size=3), rng.normal(size=2), rng.normal(size=3) + 2
+        state = of.state(mean, START)
+        after = of.step(state, u, DT)
+        expected = filtered(mean, START, u, None)
+        np.testing.assert_allclose(after[:3], expected[0], atol=1e-14)
+        np.testing.assert_allclose(of.covariance(after), expected[1], atol=1e-14)
+        given = of.corrected(state[None], u[None], readings[None])[0]
+        np.testing.assert_allclose(given[:3], filtered(mean, START, u, readings)[0], atol=1e-13)
+        np.testing.assert_allclose(given[3:], after[3:], atol=1e-14)
+        columns = of.innovations.matrices(of, state[None], u[None])[0, :3]
+        a, shaken = robot().linearize(mean, u, DT)[0], of.process.matrices(robot(), mean[None], u[None])[0]
+        predicted = a @ START @ a.T + shaken @ shaken.T
+        np.testing.assert_allclose(columns @ columns.T, predicted - expected[1], atol=1e-14)
+
+
+def test_derivatives_of_a_step_are_those_of_differences() -> None:
+    """First and second ones; differences of Jacobians in steps of 1e-6 are good to some 1e-8."""
+    of, rng = belief(), np.random.default_rng(1)
+    assert all(check.good for check in ls.check_derivatives(of))
+    source, numbers = of.curvature_source, of._numbers()
+    assert source is not None
+    n, w = 9, 11
+    second = plain_functions(source, {"N": n, "M": 2}, ["step_curvature"])["step_curvature"]
+    z = np.concatenate([of.state(rng.normal(size=3), START), rng.normal(size=2)])
+    weights, hessian = rng.normal(size=n), np.zeros((w, w))
+    second(z[:n], z[n:], numbers, DT, weights, np.zeros(n), np.zeros((n, w)), hessian)
+
+    def gradient(z: Array) -> Array:
+        a, b, _ = of.linearize(z[:n], z[n:], DT)
+        return weights @ np.hstack([a, b])
+
+    steps = 1e-6 * np.eye(w)
+    expected = np.array([(gradient(z + step) - gradient(z - step)) / 2e-6 for step in steps])
+    np.testing.assert_allclose(hessian, expected, atol=1e-7)
