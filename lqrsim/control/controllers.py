@@ -18,6 +18,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.kernels import policy_evaluation
 from lqrsim.kernels.records import AngularStates, Limits, Policy
+from lqrsim.problem.belief import Belief
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
@@ -119,8 +120,8 @@ class Controller(abc.ABC):
         return None
 
     @property
-    def sensors(self) -> RobotSensors | None:
-        """The sensors of the MJCF that the controller reads in place of the measured states; None by default."""
+    def sensors(self) -> RobotSensors | Belief | None:
+        """What the controller reads in place of the measured states: sensors of the MJCF, or those of a belief."""
         return None
 
 

@@ -13,22 +13,35 @@ is the noise of the belief. Everything is formulas, with exact first and second 
 
 import functools
 from collections.abc import Callable, Mapping
+from itertools import chain
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Bounds, Positive, checked
 from lqrsim.codegen import symbolic
+from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.edge_pushing import Operations, hessian_of, jacobian_of
-from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import text_source
 from lqrsim.codegen.user_functions import check_signature, level_of, name_of, rows_of
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_name
 from lqrsim.problem.dynamics import MOST_STEPS, Dynamics
 from lqrsim.problem.formulas import SymbolicConstraint
 from lqrsim.problem.noise import Noise
+
+# Of the compiled filter, over trials. What they call is outlined: a trial gets the same bits in any batch.
+_LOOPS = """
+def corrected(count, p, states, controls, readings, out):
+    for k in range(count):
+        correct(states[k], controls[k], p, readings[k], out[k])
+
+
+def read(count, p, states, out):
+    for k in range(count):
+        sense(states[k], p, out[k])
+"""
 
 
 class NoisySensors:
@@ -39,9 +52,9 @@ class NoisySensors:
             return [(distance, p.noise * distance)]
 
     Args:
-      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns for each reading a pair: what is read in
-        this state, and the standard deviation of its noise, which must be positive. Noises are independent. u are the
-        controls of the period before.
+      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`, that does not depend on u; returns for each
+        reading a pair: what is read in this state, and the standard deviation of its noise, which must be positive.
+        Noises are independent. Read an angle by its sine and cosine, which do not count turns.
       parameters: name -> value, as in `Dynamics`.
     """
 
@@ -59,8 +72,7 @@ class _Step(NamedTuple):
     """A step of a belief in operations: their names.
 
     Attributes:
-      after: mean and root, (N,). columns: of the noise of the mean, (Y, n). readings, deviations: (Y,) at the predicted
-        mean, or at the belief itself.
+      after: mean and root, (N,). columns: of the noise of the mean, (Y, n).
     """
 
     operations: Operations
@@ -165,11 +177,12 @@ class Belief(Dynamics):
         """The noise of the belief, for `Problem(noise=...)`: by how much readings will move the mean."""
         return _Innovations(self)
 
+    @checked
     def chance_constraint(
         self,
         function: Callable[[Any, Any, Any], Any],
         *,
-        chance: float,
+        chance: Annotated[float, Bounds(above=0.0, below=0.5)],
         parameters: Mapping[str, float] | None = None,
         name: str | None = None,
     ) -> SymbolicConstraint:
@@ -185,7 +198,7 @@ class Belief(Dynamics):
           name: as in `SymbolicConstraint`.
         """
         n, names = self.size, tuple(self.robot.state_coordinates.names)
-        quantile = -NormalDist().inv_cdf(Bounds(above=0.0, below=0.5).check("chance", chance))
+        quantile = -NormalDist().inv_cdf(chance)
 
         @functools.wraps(function)
         def margin(x: Any, u: Any, p: Any) -> list[Any]:
@@ -205,17 +218,19 @@ class Belief(Dynamics):
         """The beliefs (K, N) of the extended Kalman filter one period later.
 
         Args:
-          states: (K, N). controls: (K, m), held over the period. readings: (K, Y), taken at its end.
+          states: (K, N).
+          controls: (K, m), held over the period.
+          readings: (K, Y), taken at its end.
         """
-        return self._each("corrected", states, controls, readings, len(self.state_coordinates))
+        return self._each("corrected", len(self.state_coordinates), states, controls, readings)
 
-    def read(self, states: Array, controls: Array) -> tuple[Array, Array]:
+    def read(self, states: Array) -> tuple[Array, Array]:
         """The exact readings (K, Y) in states of the robot, and the standard deviations of their noise.
 
         Args:
-          states: (K, n), of the robot. controls: (K, m).
+          states: (K, n), of the robot.
         """
-        found = self._each("sense", states, controls, np.zeros((len(states), 0)), 2 * self.readings)
+        found = self._each("read", 2 * self.readings, states)
         return found[:, ::2], found[:, 1::2]
 
     @functools.cached_property
@@ -223,19 +238,11 @@ class Belief(Dynamics):
         """Y, the number of readings."""
         return int(self._made["readings"])
 
-    def _each(self, name: str, states: Array, controls: Array, readings: Array, size: int) -> Array:
-        out, numbers = np.empty((len(states), size)), self._numbers()
-        for one in zip(states, controls, readings, out, strict=True):  # a trial has the same bits in any batch
-            self._filter[name](*one[:2], numbers, *one[2:])
+    def _each(self, name: str, size: int, *given: Array) -> Array:
+        out, n = np.empty((len(given[0]), size)), len(self.state_coordinates)
+        module = module_of(text_source(self._made["filter"], f"filter of {self.name}"), self.name, N=n)
+        getattr(module, name)(len(out), self._numbers(), *map(in_c_order, given), out)
         return out
-
-    @functools.cached_property
-    def _filter(self) -> dict[str, Any]:
-        source = text_source(self._made["filter"], f"filter of {self.name}")
-        return plain_functions(source, {"N": len(self.state_coordinates)}, ("corrected", "sense"))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in super().__getstate__().items() if name != "_filter"}
 
     @functools.cached_property
     def _made(self) -> dict[str, Any]:
@@ -270,13 +277,13 @@ class Belief(Dynamics):
     def _trace_filter(self) -> dict[str, Any]:
         made, of = self._step(read=True), f"{self.name}(x, u, p)"
         values = {f"out[{i}]": entry for i, entry in enumerate(made.after)}
-        pairs, x, _ = self._sensing()
+        pairs, _, _ = self._sensing()
         sense = {f"out[{i}]": entry for i, entry in enumerate(pairs)}
         parts = [
-            _written("corrected", "x, u, p, w, out", values, made, of),
-            symbolic.write_function("sense", "x, u, p, out", "p", sense, of=of),
+            _written("correct", "x, u, p, w, out", values, made, of),
+            symbolic.write_function("sense", "x, p, out", "p", sense, of=of),
         ]
-        return {"filter": "\n\n".join(parts), "readings": len(pairs) // 2}
+        return {"filter": "\n\n".join([*(f"@outline\n{part}" for part in parts), _LOOPS]), "readings": len(pairs) // 2}
 
     def _sensing(self) -> tuple[list[Any], list[Any], list[Any]]:
         """The formulas of readings and their deviations, in turn, of the robot's state."""
@@ -291,7 +298,10 @@ class Belief(Dynamics):
                 raise InputError(f"got {returned}, want {wanted}, at least one")
             return [entry for pair in pairs for entry in pair]
 
-        return self._formulas(listed)
+        found, x, u = self._formulas(listed)
+        if set().union(*(entry.free_symbols for entry in found)) & set(u):
+            raise InputError(f"{name_of(function)}(x, u, p): got a reading that depends on u, want one of the state")
+        return found, x, u
 
     def _formulas(self, function: Callable[..., Any]) -> tuple[list[Any], list[Any], list[Any]]:
         """The formulas of a function of the robot's state and control, and their symbols."""
@@ -308,7 +318,7 @@ class Belief(Dynamics):
         rates, means, u = self._formulas(self.robot.f)
         process = self.process
         if process.matrix is None:
-            entries, _, _ = self._formulas(lambda x, u, p: sum(process._rows(process.function(x, u, p), n), []))
+            entries, _, _ = self._formulas(lambda x, u, p: [*chain(*process._rows(process.function(x, u, p), n))])
         else:
             entries = [sympy.Float(one) if one else sympy.Integer(0) for one in process.matrix.ravel().tolist()]
         strength = sympy.Float(process.strength) if process.strength != 1 else sympy.Integer(1)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
 from lqrsim.control.controllers import ControllerLike, ControllerRun, as_controller
 from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
+from lqrsim.problem.belief import Belief
 from lqrsim.problem.noise import Noise
 from lqrsim.results.goal import Target
 from lqrsim.results.plan import Plan
@@ -25,7 +26,7 @@ from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
-from lqrsim.simulation.effects import Effects, MakeGenerator, Readings, seeded
+from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
 from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.physics import SimulatorPhysics
 from lqrsim.simulation.plant import Plant
@@ -228,7 +229,11 @@ class ClosedLoop:
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
         self.step, self.measured = 0, self.states
         sensors = self.law.sensors
-        self._readings = None if sensors is None else Readings(sensors, self.effects, self.physics, dt)
+        self._readings: Readings | BeliefReadings | None = None
+        if isinstance(sensors, Belief):
+            self._readings = BeliefReadings(sensors, self.effects)
+        elif sensors is not None:
+            self._readings = Readings(sensors, self.effects, self.physics, dt)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -283,7 +288,7 @@ class ClosedLoop:
         shape = self.trials, len(self._names)
         shown, knot = measured, self.knot + step
         if self._readings is not None:
-            shown = self._readings.arriving(knot, None if step else self._held(knot))
+            shown = self._readings.arriving(knot, self.states, None if step else self._held(knot))
         try:
             commands = _checked_commands(self.controller_run.control(knot, shown), shape)
             failed = _not_finite(commands)

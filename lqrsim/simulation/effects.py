@@ -7,10 +7,12 @@ import numpy as np
 
 from lqrsim.annotations import Want
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
+from lqrsim.problem.belief import Belief
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import RobotSensors
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.disturbances.base import Hook
+from lqrsim.simulation.disturbances.sensors import DEVIATIONS, READINGS
 from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.plant import Plant
 
@@ -168,7 +170,7 @@ class Readings:
         taken = self._sensors.reader()(states[:1], controls[:1], np.zeros((1, 6)))
         return self._arriving(step, np.repeat(taken, len(states), axis=0))
 
-    def arriving(self, step: int, held: Array | None = None) -> Array:
+    def arriving(self, step: int, states: Array, held: Array | None) -> Array:
         """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
         exact = self._sensors.readings(self._physics.sense(held))
         named = {one.name: exact[:, at] for one, at in self._columns()}
@@ -186,6 +188,25 @@ class Readings:
             if step - late in self._taken and self._sensors.due(step - late, self._dt)[i]:
                 out[:, at] = self._taken[step - late][:, at]
         return out
+
+
+class BeliefReadings:
+    """The readings of K trials by the formulas of a belief, in the true states, at each knot.
+
+    `ReadingErrors` adds their noise.
+    """
+
+    def __init__(self, belief: Belief, effects: Effects) -> None:
+        self._belief, self._effects = belief, effects
+
+    def follow(self, step: int, states: Array, controls: Array) -> Array:
+        """The exact readings (K, Y) at a knot of the plan, before the run begins."""
+        return self._belief.read(states)[0]
+
+    def arriving(self, step: int, states: Array, held: Array | None) -> Array:
+        """The readings (K, Y) in the true states (K, n)."""
+        exact, deviations = self._belief.read(states)
+        return self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS]
 
 
 class _Streams(Sequence[np.random.Generator]):

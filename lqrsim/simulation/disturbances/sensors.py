@@ -1,4 +1,4 @@
-"""The errors of the sensors of an MJCF."""
+"""The errors of the sensors of an MJCF, and of those of a belief."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -10,11 +10,13 @@ import numpy as np
 from lqrsim.annotations import NonNegative, checked
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_items, check_kind, check_name, keep
+from lqrsim.problem.belief import Belief
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import Sensor
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, left_out, normal, uniform
 from lqrsim.simulation.plant import Plant
 
+READINGS, DEVIATIONS = "readings", "standard deviations"  # of a belief, by which `read` has them
 SETTINGS = tuple(one.name for one in fields(Sensor)[1:])  # all but the name
 
 
@@ -85,3 +87,36 @@ class SensorErrors(Disturbance):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return left_out(self, plant, "OffsetFree has them by its own sensors=", acts=self.strength > 0)
+
+
+@checked
+@dataclass(frozen=True)
+class ReadingErrors(Disturbance):
+    """Noise of the sensors of a belief, as strong as these are in the true state. Without it, readings are exact.
+
+    Args:
+      belief: the belief.
+      strength: factor of the standard deviations.
+    """
+
+    belief: Belief
+    strength: NonNegative = 1.0
+
+    _scales = "strength"
+
+    def describe(self, plant: Plant) -> str:
+        return f"errors of {self.belief.readings} readings, times {self.strength:g}"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        errors = self.strength * normal(generators, plan.steps + 1, self.belief.readings)
+
+        def read(step: int, readings: Mapping[str, Array]) -> dict[str, Array]:
+            found = dict(readings)
+            if READINGS in found:
+                found[READINGS] = found[READINGS] + errors[:, step] * found[DEVIATIONS]
+            return found
+
+        return Effect(read=read)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return left_out(self, plant, "a BeliefFeedback has them by its belief", acts=self.strength > 0)

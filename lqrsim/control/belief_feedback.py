@@ -1,0 +1,97 @@
+"""The policy of a belief, on an extended Kalman filter that runs with it."""
+
+import numpy as np
+
+from lqrsim.annotations import checked
+from lqrsim.control.controllers import Controller, ControllerRun, evaluator
+from lqrsim.control.tracking_laws import check_plan
+from lqrsim.errors import Array, InputError
+from lqrsim.problem.belief import Belief
+from lqrsim.problem.problem import Problem
+from lqrsim.results.archive import sha256
+from lqrsim.results.coordinates import Spaces
+from lqrsim.results.plan import Plan
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
+
+
+class BeliefFeedback(Controller):
+    """The policy of a plan in belief space: controls affine in the mean and the root of the covariance.
+
+    It reads the belief's sensors in place of measured states, from the end of the first period on, and begins with the
+    plan's first belief. `ReadingErrors` are their errors in a run, and the belief's `process` is the noise that the
+    filter assumes. A rollout's `controller_run` has `beliefs`, (T, K, N) at the knots at which there is a control.
+
+    Args:
+      problem: a problem whose dynamics are a `Belief`.
+      solution: its solution.
+    """
+
+    @checked
+    def __init__(self, problem: Problem, solution: Solution) -> None:
+        if not isinstance(problem.dynamics, Belief):
+            raise InputError("BeliefFeedback: problem: got one of other dynamics, want a problem of a Belief")
+        check_plan("BeliefFeedback", problem, solution)
+        self.belief, self.solution = problem.dynamics, solution
+
+    def __repr__(self) -> str:
+        return f"BeliefFeedback({self.belief.name}, {self.solution.trajectory.steps} steps)"
+
+    def start(self, trials: int) -> "BeliefRun":
+        return BeliefRun(self, trials)
+
+    @property
+    def sensors(self) -> Belief:
+        return self.belief
+
+    @property
+    def plan(self) -> Plan:
+        """The plan of the mean; its policy has the gains on the mean, and the covariance of the plan."""
+        n, own, policy = self.belief.size, self.solution, self.solution.policy
+        known = np.vecdot(policy.gain[:, :, n:], policy.nominal[:, None, n:])
+        law = AffinePolicy(
+            gain=policy.gain[:, :, :n], offset=policy.offset + known, nominal=policy.nominal[:, :n], dt=policy.dt,
+            state_coordinates=self.belief.robot.state_coordinates, control_coordinates=policy.control_coordinates,
+        )  # fmt: skip
+        trajectory = Trajectory(own.trajectory.states[:, :n], own.trajectory.controls, own.trajectory.dt)
+        return Plan(
+            status=own.status, detail=own.detail, policy=law, trajectory=trajectory, cost_to_go=None,
+            goal=None if own.goal is None else own.goal[:n], goal_radius=own.goal_radius,
+        )  # fmt: skip
+
+    @property
+    def digest(self) -> str:
+        data, first = self.belief.data, self.solution.trajectory.states[0]
+        return sha256(self.solution.policy.digest, self.belief.step_source.digest, data, first)[:16]
+
+    @property
+    def coordinates(self) -> Spaces:
+        return self.belief.robot.state_coordinates, self.solution.policy.control_coordinates
+
+
+class BeliefRun(ControllerRun):
+    """K trials of a run.
+
+    Attributes:
+      beliefs: at each knot so far, with its readings, (t, K, N).
+    """
+
+    def __init__(self, law: BeliefFeedback, trials: int) -> None:
+        policy = law.solution.policy
+        self._law, self._evaluate = law, evaluator(policy.state_coordinates, policy.control_coordinates)
+        self._now, self._command = np.tile(law.solution.trajectory.states[0], (trials, 1)), np.empty((0, 0))
+        self._record: list[Array] = []
+
+    @property
+    def beliefs(self) -> Array:
+        return np.array(self._record)
+
+    def control(self, step: int, measured: Array) -> Array:
+        policy = self._law.solution.policy
+        if step:
+            self._now = self._law.belief.corrected(self._now, self._command, measured)
+        self._record.append(self._now)
+        t = min(step, policy.steps - 1)
+        self._command = self._evaluate(self._now, policy.gain[t], policy.offset[t], policy.nominal[t])
+        return self._command
