@@ -1473,7 +1473,7 @@ class TestPlanMethods:
         bent = convex.copy()
         bent[2, 3:, 3:] -= 1e4 * np.eye(2)
         assert direction(bent) == 2  # the controls of that step have no least
-        given = 0, stages.about, plan, gaps, 0.0, 1.0, curves, forces
+        given = stages.about, plan, gaps, 0.0, 1.0, curves, forces
         assert replay(kernel, SIZES, "regularised_direction", *given) > 0
         bent = convex.copy()
         bent[0, :3, :3] -= 1e6 * np.eye(3)
