@@ -4,12 +4,12 @@ import copy
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_model import MjcfModel
+from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
 from lqrsim.scenes.mujoco_log import unlogged
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most

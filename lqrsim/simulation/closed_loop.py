@@ -192,7 +192,7 @@ class ClosedLoop:
     @unlogged()
     def __post_init__(self) -> None:
         plant, trials = self.plant, self.trials
-        self.acting = as_disturbances(self.disturbances, "disturbances, such as ControlNoise(0.05)")
+        self.acting = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
         self.state_coordinates, self.control_coordinates = coordinates_of(self.law, plant)

@@ -247,7 +247,7 @@ class _Trials:
     ) -> None:  # fmt: skip
         self.plant, self.solution = plant, solution
         self.law, _ = as_controller(controller, solution, plant.robot.dynamics)
-        self.disturbances = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
+        self.disturbances = as_disturbances(disturbances)
         # The tolerance of a goal without a position is relative to the range of the whole plan, not of its rest.
         self.target = Target(solution.policy.state_coordinates, solution.goal, solution.trajectory.states)
         self.radius = self.target.radius(plant.robot.radius, *near)

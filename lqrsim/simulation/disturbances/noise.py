@@ -235,8 +235,9 @@ class StateNoise(Disturbance):
         return left_out(self, plant, "filters and tubes have no noise that acts on the states directly")
 
 
-def as_disturbances(given: object, wanted: str) -> tuple[Disturbance, ...]:
+def as_disturbances(given: object) -> tuple[Disturbance, ...]:
     """The disturbances, with each `Noise` converted to StateNoise. Raises InputError for anything else."""
+    wanted = "disturbances, such as ControlNoise(0.05)"
     items = check_items("disturbances", given, (Disturbance, Noise), wanted)
     return tuple(StateNoise(one) if isinstance(one, Noise) else one for one in items)
 

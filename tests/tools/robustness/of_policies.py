@@ -27,7 +27,7 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
         "Uncertainty": (fields(uncertainty),),
         "Sensor": (fields(Sensor("create_position", noise=0.1, rate=5.0, delay=0.2)),),
         "Plant.sensors": ({"self": place.plant, "sensors": [Sensor("create_position")]},),
-        "Uncertainty.steady": ({"self": uncertainty, "memory": 5.0, "share": 0.2},),
+        "Uncertainty.steady": ({"self": uncertainty, "memory": 5.0},),
         "track": (common | chosen, 0.5),
         "OffsetFree": (common | chosen | {"sensors": ("x", "y"), "memory": 5.0, "record": False}, 0.5),
         "OffsetFree.loop": ({"self": law, "uncertainty": uncertainty},),
