@@ -439,7 +439,7 @@ class TestDataThatUsersBuild:
         path = tmp_path / "run.png"
         for label in ("x" * 5000, "two\nlines", "", 3):
             call = lambda name=label: lq.view.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
-            assert refusal(call).startswith("rollouts: label: got ")
+            assert refusal(call).startswith("rollouts: a name: got ")
         assert "titles" in refusal(lambda: lq.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
         assert "sweeps: a name" in refusal(lambda: lq.stress.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
         lq.view.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)

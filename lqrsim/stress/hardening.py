@@ -244,10 +244,8 @@ class _Search:
             raise InputError(f"problem: got {problem.scenario}, whose duration is free, want a fixed one")
         self.asked, self.chance, self.options = problem, chance, options
         self.scenario, self.stated, design = scenario, scenario.problem, problem.design_disturbances
-        if design is None:
-            self.uncertainty = uncertainty_of(scenario.plant(), problem.disturbances)
-        else:
-            self.uncertainty = design_uncertainty(scenario, design)
+        met = uncertainty_of(scenario.plant(), problem.disturbances)  # also refuses sets that there are not
+        self.uncertainty = met if design is None else design_uncertainty(scenario, design)
         self.surroundings = Surroundings.of(self.stated, self.uncertainty.obstacles)
         self.names = [one.name for shape in self.surroundings.shapes for one in shape.world.obstacles]
         self.rounds: list[HardeningRound] = []

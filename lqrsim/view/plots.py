@@ -4,6 +4,7 @@ import os
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -13,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.ticker import MaxNLocator
 
-from lqrsim.annotations import Index, NonNegative, checked
+from lqrsim.annotations import Index, NonNegative, Want, checked
 from lqrsim.control.tubes import Tube
-from lqrsim.errors import Array, InputError, check_kind, check_text
+from lqrsim.errors import Array, InputError, check_text
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
@@ -37,13 +38,14 @@ ROUNDING = 1e-6  # of the largest error: smaller ones of an undisturbed run are 
 LEAST_ERROR = 1e-3  # mm, or of the plan's range; an axis of smaller errors would show rounding errors
 
 
+@checked
 def plot_run(
     solution: Solution,
-    rollouts: Mapping[str, Rollout],
+    rollouts: Annotated[Mapping[str, Rollout], Want("a dictionary of label: Rollout")],
     path: str | os.PathLike[str],
     *,
     world: World,
-    trial: int = 0,
+    trial: Index = 0,
     style: Style = "screen",
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
@@ -60,7 +62,16 @@ def plot_run(
       world: the obstacles, such as `scene.world`.
       style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
     """
-    _check(solution, rollouts, trial, world)
+    if not 1 <= len(rollouts) <= len(RUNS):
+        raise InputError(f"rollouts: got {len(rollouts)}, want 1 to {len(RUNS)}")
+    for name, run in rollouts.items():
+        check_text("rollouts: a name", name, "a label", at_most=100)
+        check_same_system(f"rollouts[{name!r}]", "a run", spaces_of(run), spaces_of(solution.policy), "the solution")
+        if trial >= run.trials:
+            raise InputError(f"trial: got {trial}, want one of 0 to {run.trials - 1} of rollouts[{name!r}]")
+        if not run.plane:
+            wanted = "the 2 or 3 states that are the position, or runs of a robot with balls that have frames"
+            raise InputError(f"state_coordinates.position: got none, want {wanted}")
     with styles.figure(path, style=style) as figure:
         first = next(iter(rollouts.values()))
         views = (_of_positions if first.state_coordinates.position else _of_balls)(solution, rollouts, world, trial)
@@ -108,22 +119,6 @@ def _grid(figure: Figure, place: SubplotSpec, count: int, across: int) -> list[A
 def _entries(*drawn: Axes) -> dict[str, Artist]:
     """What is drawn in these axes, by label."""
     return {label: artist for axes in drawn for artist, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-
-
-@checked
-def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: Index, world: World) -> None:
-    check_kind("rollouts", rollouts, Mapping, "a dictionary of label: Rollout")
-    if not 1 <= len(rollouts) <= len(RUNS):
-        raise InputError(f"rollouts: got {len(rollouts)}, want 1 to {len(RUNS)}")
-    for name, run in rollouts.items():
-        check_text("rollouts: label", name, "a label", at_most=100)
-        check_kind(f"rollouts[{name!r}]", run, Rollout, "a Rollout, such as simulate(...) returns")
-        check_same_system(f"rollouts[{name!r}]", "a run", spaces_of(run), spaces_of(solution.policy), "the solution")
-        if not 0 <= trial < run.trials:
-            raise InputError(f"trial: got {trial}, want one of 0 to {run.trials - 1} of rollouts[{name!r}]")
-        if not run.plane:
-            wanted = "the 2 or 3 states that are the position, or runs of a robot with balls that have frames"
-            raise InputError(f"state_coordinates.position: got none, want {wanted}")
 
 
 def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> Views:
@@ -290,7 +285,6 @@ def plot_policy(
       InputError: the solution has no policy, or the tube is of another plan or has no position.
     """
     world = World() if world is None else world
-    check_kind("world", world, World, "a World, such as scene.world")
     if solution.cost_to_go is None:
         raise InputError(f"solution: got no cost-to-go ({solution.status.name}), want a solution of a completed solve")
     if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
