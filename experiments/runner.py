@@ -18,6 +18,7 @@ from peers.common import Unavailable
 from tqdm import tqdm
 
 import lqrsim as ls
+from lqrsim.commands.as_json import text_of
 from lqrsim.machine import description
 from lqrsim.results.archive import replacing
 from lqrsim.stress.statistics import Estimate
@@ -96,7 +97,7 @@ def run(
     verdicts, failed = statements(result), list(failures(result))
     if config.json:
         printed = {"result": result, "report": report(result), "statements": [asdict(verdict) for verdict in verdicts]}
-        print(json.dumps(printed, allow_nan=False))
+        print(text_of(printed))
     else:
         print(report(result))
         for verdict in verdicts:
@@ -164,7 +165,7 @@ def measure(config: Any, sections: Sections, result: Result, *, keep_as: str | N
         if keep_as and not config.quick:
             config.out.mkdir(parents=True, exist_ok=True)
             with replacing(config.out / f"{keep_as}_{name}.json") as unfinished:
-                unfinished.write_text(json.dumps(result[name], allow_nan=False) + "\n", encoding="utf-8")
+                unfinished.write_text(text_of(result[name]) + "\n", encoding="utf-8")
     return result
 
 

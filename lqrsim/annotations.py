@@ -44,6 +44,7 @@ from lqrsim.errors import (
     check_text,
     excerpt,
     numbers_of,
+    owned,
     real,
 )
 
@@ -157,11 +158,12 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
             who = getattr(kind, "_prefix", f"{kind.__name__}: ")
         placed, (places, sized) = list(given), wanted()
         sizes = Sizes() if sized else None
+        take = _owned if makes else _checked
         for name, place, said in places:
             if name in named:
-                named[name] = _checked(who + name, named[name], said, sizes)
+                named[name] = take(who + name, named[name], said, sizes)
             elif place < len(placed):
-                placed[place] = _checked(who + name, placed[place], said, sizes)
+                placed[place] = take(who + name, placed[place], said, sizes)
         return function(*placed, **named)
 
     return call
@@ -294,6 +296,12 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any
         elif is_dataclass(value):
             _share_sizes(field, value, sizes)
     return value
+
+
+def _owned(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any:
+    """As `_checked`, with an array of one's own."""
+    found = _checked(field, value, said, sizes)
+    return owned(found) if isinstance(found, np.ndarray) else found
 
 
 def _names(said: Declared) -> str:

@@ -5,11 +5,15 @@ import contextlib
 import io
 import itertools
 import logging
+import os
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from lqrsim import process
+
+NARROWEST = 20  # columns of a terminal for which help and errors are laid out
 
 DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under
 disturbances and shown on video.
@@ -52,7 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         process.flush()
         return code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        for note in getattr(stop, "__notes__", ()):
+            process.print_error(f"lqrsim: {note}")
         if own:
             process.end_stopped()
         process.print_error("lqrsim: stopped")
@@ -82,7 +88,7 @@ def _run(arguments: list[str]) -> int:
         with process.printing():
             print(f"usage: lqrsim COMMAND ...\n\n{DESCRIPTION.format(commands=lines)}")
         raise SystemExit(0)
-    with process.printing():
+    with process.printing(), _wide_enough():
         command = _parse(arguments)
 
     from lqrsim.versions import outdated
@@ -101,8 +107,14 @@ def _run(arguments: list[str]) -> int:
     try:
         if isinstance(command, str):
             raise InputError(command)
+        if not _has_folder():
+            raise InputError("working folder: got one that was removed, want one that exists: change to another")
         with process.interruptible():
-            return console.run(command, NAMES[type(command)])
+            try:
+                return console.run(command, NAMES[type(command)])
+            except MemoryError as error:
+                why = f" ({' '.join(str(error).split())[:200]})" if str(error) else ""
+                raise InputError(f"memory: got too little for this{why}, want more, or a smaller task") from None
     except InputError as error:
         if "--json" in arguments:
             name = f"lqrsim {arguments[0]}" if arguments[0] in COMMANDS else "lqrsim"
@@ -111,6 +123,25 @@ def _run(arguments: list[str]) -> int:
         return 2
     finally:
         logger.removeHandler(notices)
+
+
+def _has_folder() -> bool:
+    """Whether the working folder exists, to which relative paths refer."""
+    try:
+        os.getcwd()
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _wide_enough() -> Iterator[None]:
+    """A block in which a terminal has NARROWEST columns at least: with a few, help would never be completed."""
+    if shutil.get_terminal_size().columns >= NARROWEST:
+        yield
+        return
+    with process.environment(COLUMNS=str(NARROWEST)):
+        yield
 
 
 def _parse(arguments: list[str]) -> Any:

@@ -50,6 +50,17 @@ def keep(record: object, **values: object) -> None:
         object.__setattr__(record, name, value)
 
 
+def owned(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The array if nobody can change it, also through one that it is a view of; else a read-only copy."""
+    base: object = array
+    while isinstance(base, np.ndarray) and not base.flags.writeable:
+        base = base.base
+    if base is not None:
+        array = array.copy()
+        array.setflags(write=False)
+    return array
+
+
 def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...], *, infinite: bool = False) -> Array:
     """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
 
@@ -246,17 +257,18 @@ def check_text(field: str, value: object, want: str = "text", *, at_most: int = 
 
 
 def check_path(field: str, value: object, want: str = "the path of a file") -> Path:
-    """`value` as a valid path of a file, with names of at most 255 bytes. Raises InputError otherwise."""
+    """`value` as a valid path of a file, with names in UTF-8 of at most 255 bytes. Raises InputError otherwise."""
+    name: object = value
     try:
         if not isinstance(value, (str, os.PathLike)):
             raise TypeError
         name = os.fspath(value)
         good = isinstance(name, str) and name and "\0" not in name
         good = good and all(len(part.encode()) <= 255 for part in Path(name).parts) and len(name.encode()) < 4096
-    except Exception:  # not a path, or not encodable
-        good, name = False, value
+    except Exception:  # not a path, or not UTF-8, in which files and JSON hold names
+        good = False
     if not good:
-        raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names of at most 255 bytes")
+        raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names in UTF-8 of at most 255 bytes")
     return Path(name)  # pyright: ignore[reportArgumentType]
 
 

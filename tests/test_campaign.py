@@ -1,6 +1,7 @@
 """Campaigns: the same bits whatever happens on the way, and one line for what cannot be."""
 
 import errno
+import io
 import multiprocessing
 import os
 import random
@@ -14,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from sampling import rarely
@@ -412,6 +414,78 @@ def test_no_flipped_bit_is_missed(reference: Results) -> None:
         except Damaged:
             continue
         assert all(table[name].tobytes() == whole[name].tobytes() for name in whole)  # in what nothing depends on
+
+
+ROWS = 4
+LONG = pa.DictionaryArray.from_arrays(pa.array(np.zeros(ROWS, np.int32)), pa.array(["x" * 30_000_000]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "says"),
+    [
+        ({"reason": LONG}, {"compression": "zstd"}, "another compression"),
+        ({"reason": LONG}, {"compression": "brotli"}, "another compression"),
+        ({}, {"compression": {"cost": "gzip", "reason": "snappy"}}, "another compression"),
+        ({"reason": LONG}, {}, "other columns"),
+        ({"reason": pa.array(["x" * 2_000_000] * ROWS)}, {}, "a text of 2000000 characters"),
+        ({"reason": pa.array(["x" * 2_000_000] * ROWS)}, {"use_dictionary": False}, "a text of 2000000 characters"),
+        ({"cost": pa.array([[1.0] * 100] * ROWS)}, {}, "other columns"),
+        ({"cost": pa.array(range(ROWS))}, {}, "other columns"),
+        ({"more": pa.array(range(ROWS))}, {}, "other columns"),
+        ({"trial": None}, {}, "other columns"),
+        ({"reason": pa.array([None] * ROWS, pa.string())}, {}, "TypeError"),
+    ],
+)
+def test_what_is_in_a_shard_is_bounded_before_it_is_unpacked(
+    reference: Results, changes: dict[str, pa.Array | None], options: dict[str, object], says: str
+) -> None:
+    """Texts of a file of some kilobytes would take gigabytes."""
+    shard = next(reference.shards())
+    whole = pq.read_table(io.BytesIO(reference.path(shard).read_bytes()))
+    assert len(whole) == ROWS
+    columns = {name: whole[name] for name in whole.column_names} | changes
+    table = pa.table({name: column for name, column in columns.items() if column is not None})
+    file = io.BytesIO()
+    pq.write_table(table.replace_schema_metadata(whole.schema.metadata), file, **options)
+    pool = pa.default_memory_pool()
+    before = pool.bytes_allocated()
+    with pytest.raises(Damaged, match=says):
+        unpack(file.getvalue(), shard, reference.manifest["digest"])
+    assert pool.bytes_allocated() - before < 1 << 20
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no pipes in folders")
+def test_a_pipe_in_place_of_a_shard_is_moved_aside(reference: Results, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(reference.folder, folder)
+    shard = folder / "shards" / "0001-000000012.parquet"
+    shard.unlink()
+    os.mkfifo(shard)
+    with pytest.raises(InputError, match="without trials 12 to"):
+        Results(folder).outcomes(Cell("open_loop", "scenario", 1.0))
+    run_campaign(CAMPAIGN, folder, workers=0)
+    same_bits(folder, reference)
+
+
+def test_a_stopped_campaign_says_how_to_go_on(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """In Python below the traceback, and as a line of the command."""
+
+    def stop(done: int, total: int) -> None:
+        if done:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "folder"
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_campaign(CAMPAIGN, folder, workers=0, progress=stop)
+    (note,) = stopped.value.__notes__
+    command = f"lqrsim stress {CAMPAIGN.scenario} --resume --out {folder}"
+    assert note == f"{folder} has what is done; to go on, call run_campaign again, or run: {command}"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "lqrsim.commands.console.Progress.__call__", lambda self, done, total, found="": stop(done, total)
+        )
+        assert main([*command.split()[1:], "--workers", "0"]) == 130
+    assert capfd.readouterr().err.endswith(f"lqrsim: {note}\nlqrsim: stopped\n")
 
 
 def test_a_shard_of_another_campaign_is_not_taken(reference: Results, tmp_path: Path) -> None:

@@ -441,6 +441,117 @@ def test_an_opengl_that_mujoco_cannot_load_is_one_line(monkeypatch: pytest.Monke
     assert "MUJOCO_GL: got 'nonsense'" in error
 
 
+@pytest.mark.parametrize(
+    ("columns", "command"), [*((20, command) for command in COMMANDS), *((n, "solve") for n in range(1, 20, 4))]
+)
+def test_help_of_a_narrow_terminal_ends(
+    columns: int, command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With 5 columns or less it went on for ever. Less than 20 are taken for 20."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert "usage: lqrsim" in capsys.readouterr().out
+    assert os.environ["COLUMNS"] == str(columns)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder in which a process works")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_working_folder_that_was_removed_is_one_line(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything is done."""
+    words = {
+        "new": ["robot"], "cache": [], "demo": [], "list": [], "reproduce": [], "compare": ["a"],
+        "replay": ["a", "--trial", "0", "--cell", "0"], "bridge": ["a", "--scenario", "quadrotor", "--listen", "udp:1"],
+    }.get(command, ["quadrotor"])  # fmt: skip
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    try:
+        code = main([command, *words])
+    except SystemExit as end:
+        code = end.code
+    error = capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    said = "lqrsim: error: working folder: got one that was removed, want one that exists: change to another\n"
+    assert code == 2
+    assert error == said or "usage" in error.lower() or "required" in error.lower()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
+@pytest.mark.parametrize("command", ["new robot", "solve quadrotor", "rare quadrotor", "harden quadrotor", "demo"])
+def test_a_name_that_is_not_utf_8_is_refused_before_the_work(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lqrsim.commands.console.solve", None)
+    assert main([*command.split(), "--out", os.fsdecode(b"b\xff")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "--out: got 'b\\udcff', want the path of an output, of names in UTF-8 of at most 255 bytes" in error
+
+
+def test_too_little_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lqrsim.commands.solving.List.run", lambda self: len(np.zeros(1 << 58, np.int8)))
+    assert main(["list"]) == 2
+    error = capsys.readouterr().err
+    assert re.fullmatch(r"lqrsim: error: memory: got too little for this \(.*\), want more, or a smaller task\n", error)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
+@pytest.mark.parametrize(
+    ("what", "largest"),
+    [("robot", 0), ("video", 0), ("video", 40_000), ("policy", 0), ("policy", 4096), ("table", 4096)],
+)
+def test_a_full_disk_is_one_line(what: str, largest: int, tmp_path: Path) -> None:
+    """In another process, for a video that could not even be begun ended it by a fault of memory."""
+    lines = {
+        "robot": "main(['new', 'robot']) == 2 or None",
+        "policy": "ls.save(policy, 'a.npz')",
+        "video": "video()",
+        "table": "write(bytes(50_000), Path('a.parquet'))",
+    }
+    program = f"""
+import resource
+from fractions import Fraction
+from pathlib import Path
+import numpy as np
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.results.archive import replacing
+from lqrsim.stress.campaign_files import write
+from lqrsim.view.render import encoder
+
+rng = np.random.default_rng(0)
+arrays = dict(gain=rng.random((9000, 1, 1)), offset=rng.random((9000, 1)), nominal=rng.random((9000, 1)))
+space = ls.types.Coordinates(names=("x",), units=("m",))
+policy = ls.AffinePolicy(**arrays, dt=0.1, state_coordinates=space, control_coordinates=space)
+
+def video():
+    with replacing(Path("a.mp4")) as file, encoder(file, (64, 64), Fraction(30), crf=1, preset="ultrafast") as put:
+        for number in range(60):
+            put(np.random.default_rng(number).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+
+resource.setrlimit(resource.RLIMIT_FSIZE, ({largest}, {largest}))
+try:
+    {lines[what]}
+except ls.InputError as error:
+    print(f"lqrsim: error: {{error}}")
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    said = [line for line in (done.stdout + done.stderr).splitlines() if line.startswith("lqrsim: error")]
+    assert done.returncode == 0, done.stderr
+    assert len(said) == 1
+    assert said[0].endswith("want a file that can be written (File too large)")
+    assert "Traceback" not in done.stderr
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(("a.", ".unfinished"))]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
 def test_ctrl_c_is_one_line_and_leaves_nothing(own: Path, tmp_path: Path) -> None:
     with start("solve", f"{own}:endless", "--out", str(tmp_path / "out")) as process:

@@ -140,6 +140,30 @@ def test_records_of_arrays_equal_themselves_alone() -> None:
     assert not [kind.__name__ for kind in found if kind.__eq__ is not object.__eq__ and not issubclass(kind, values)]
 
 
+def arrays_in(value: Any) -> list[np.ndarray]:
+    """The arrays of a value: itself, or those of a tuple or a list."""
+    found = value if isinstance(value, tuple | list) else [value]
+    return [one for one in found if isinstance(one, np.ndarray)]
+
+
+def test_frozen_records_own_their_arrays(caller: Any) -> None:
+    """What the caller writes into an array later changes no record made from it, nor does a reader of the record."""
+    tried = 0
+    for name, subject in caller.subjects.items():
+        kind = subject.call
+        if not (inspect.isclass(kind) and dataclasses.is_dataclass(kind)):
+            continue
+        copies = {key: value.copy() for key, value in subject.arguments.items() if isinstance(value, np.ndarray)}
+        if not copies or not kind.__dataclass_params__.frozen or kind is ls.disturbances.Effect:
+            continue
+        made = kind(**{**subject.arguments, **copies})
+        mine = [one for field in dataclasses.fields(made) for one in arrays_in(getattr(made, field.name, None))]
+        tried += len(mine)
+        assert not [key for key, copy in copies.items() if any(np.shares_memory(copy, one) for one in mine)], name
+        assert not any(one.flags.writeable for one in arrays_in([getattr(made, key, None) for key in copies])), name
+    assert tried > 50
+
+
 @pytest.mark.parametrize("numbers", [0.1, (0.1, 0.2), np.array([0.1, 0.2])])
 @pytest.mark.parametrize("kind", [lambda it: Uncertainty(measurement=it), ls.disturbances.MeasurementNoise])
 def test_what_is_stated_by_numbers_equals_the_same_numbers(kind: Callable[[Any], Any], numbers: Any) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from lqrsim.errors import InputError
 from lqrsim.robots.mjcf import MjcfRobot
+from lqrsim.scenes.mjcf_model import MOST
 from lqrsim.scenes.mjcf_text import MODELS, names
 from lqrsim.scenes.scene import load_scene, scene_from_xml
 
@@ -371,6 +372,27 @@ def test_names_that_obstacles_without_one_get_are_free(scene_of):
             '<body><flexcomp name="f" type="grid" dim="2" spacing="1 1 1" count="99999 99999 1"/></body>',
             "<flexcomp> of 9,999,800,001 copies",
         ),
+        *[
+            (f'<geom size="1"/></worldbody><{one}/><worldbody>', f"{said} in <{one.split()[0]}>, want .* at most")
+            for one, said in (
+                *((f'size {key}="{most + 1}"', f"{key}='{most + 1}'") for key, most in MOST["size"].items()),
+                *((f'quality {key}="+9e9"', rf"{key}='\+9e9'") for key in MOST["quality"]),
+                *((f'size nuser_{kind}="10001"', f"nuser_{kind}='10001'") for kind in ("body", "geom", "sensor")),
+                ('size memory="5G"', "memory='5G'"),
+                ('size memory="1E"', "memory='1E'"),
+            )
+        ],
+        *[
+            (
+                f'<geom size="1"/></worldbody><asset><texture name="t" {sizes}/></asset><worldbody>',
+                "pixels in <texture>",
+            )
+            for sizes in (
+                'type="2d" builtin="flat" width="30000" height="30000"',
+                'builtin="flat" width="20000" height="20000"',
+                'type="skybox" builtin="gradient" width="10" height="9000000"',
+            )
+        ],
         ('<geom size="1"/></worldbody><compiler boundmass="nan"/><worldbody>', "got NaN for the boundmass of compiler"),
         ('<geom size="1"/></worldbody><option timestep="nan"/><worldbody>', "got the timestep nan, want a finite"),
         ('<geom size="1"/></worldbody><option timestep="0"/><worldbody>', "got the timestep 0, want a finite"),

@@ -73,6 +73,9 @@ def test_holm_s_procedure() -> None:
     np.testing.assert_allclose(holm([0.04, 0.01, 0.03]), [0.06, 0.03, 0.06])
     np.testing.assert_allclose(holm([0.9, 0.8]), 1.0)
     assert len(holm([])) == 0
+    for wrong in ([-1.0, 0.5], [0.5, 1.0 + 1e-9], [2]):
+        with pytest.raises(ls.InputError, match=r"p_values: got .*, want a finite number >= 0 and <= 1"):
+            holm(wrong)
 
 
 def test_paired_test_is_the_sign_test_of_those_that_differ() -> None:

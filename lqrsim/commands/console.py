@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import lqrsim as ls
 from lqrsim import process
 from lqrsim.commands import as_json
+from lqrsim.errors import check_path
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -96,6 +97,7 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
     """Check before the work starts that `folder`, or the file `name` in it, can be written."""
     from lqrsim.results.archive import excerpt_of
 
+    check_path(field, folder / name, "the path of an output")
     existing = folder.absolute()
     while not os.path.exists(existing) and existing != existing.parent:
         existing = existing.parent

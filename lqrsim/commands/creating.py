@@ -38,7 +38,7 @@ class New:
     """Folder in which the robot's folder is made."""
 
     def run(self) -> int:
-        from lqrsim.results.archive import excerpt_of
+        from lqrsim.results.archive import excerpt_of, replacing
 
         check_robot_name(self.name)
         folder = self.out / self.name
@@ -53,7 +53,9 @@ class New:
             ) from None
         for template in sorted(TEMPLATES.glob("*.*")):
             path = folder / _named(template.name, self.name)
-            path.write_text(_named(template.read_text(encoding="utf-8"), self.name), encoding="utf-8", newline="\n")
+            with replacing(path) as unfinished:
+                text = _named(template.read_text(encoding="utf-8"), self.name)
+                unfinished.write_text(text, encoding="utf-8", newline="\n")
             console.wrote(path)
         console.say("\nnext:")
         for command in next_commands(self.name, folder):

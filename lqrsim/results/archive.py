@@ -190,6 +190,7 @@ class Archive:
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=1000)
             if file.read(1):  # reads to the end, where zipfile compares the checksum
                 raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want exactly as many")
+        array.setflags(write=False)  # so that the record that gets it makes no copy
         return array
 
 
@@ -256,8 +257,13 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
       InputError: the folder or the file cannot be written, the disk is full, or `path` is no regular file.
     """
-    # The target of a link is replaced, not the link.
-    target = Path(os.path.realpath(check_path("output", path)))
+    check_path("output", path)
+    try:
+        target = Path(os.path.realpath(path))  # the target of a link is replaced, not the link
+    except OSError as error:  # the working folder was removed
+        raise InputError(
+            f"output: got {excerpt_of(path)}, want a file that can be written ({error.strerror})"
+        ) from None
     looped = target.is_symlink()  # after all links have been followed
     if looped or (target.exists() and not target.is_file()):
         what = "a folder" if target.is_dir() else "a link to itself" if looped else "neither a file nor a folder"

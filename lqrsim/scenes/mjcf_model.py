@@ -1,5 +1,6 @@
 """An MJCF as a record, read and compiled once, that robots, dynamics, plants and pictures share."""
 
+import contextlib
 import itertools
 import math
 import os
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
-from lqrsim.errors import Array, InputError, check_name
+from lqrsim.errors import Array, InputError, check_name, excerpt
 from lqrsim.scenes import mjcf_text
 from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, UNNAMED, mujoco
 from lqrsim.scenes.mujoco_log import unlogged
@@ -32,6 +33,14 @@ FAR_PAST = 0.1  # fraction of a joint's range; springs of limits give way by les
 _SAME = 1e-12  # m, and of quaternions, within which a mocap body is where a keyframe has it
 
 MOST_CELLS = 4096**2  # largest number of cells of a height field; MuJoCo crashes with far more
+# Largest numbers of elements whose attributes are sizes of arrays, or of drawings; with far more, MuJoCo takes minutes
+# and GBs. Those that begin with nuser_ are numbers of each element.
+MOST = {
+    "size": {"nkey": 10_000, "nuserdata": 10**7, "njmax": 10**6, "nconmax": 10**6, "nstack": 10**8, "memory": 2**32},
+    "quality": {"shadowsize": 2**14, "offsamples": 64, "numslices": 1000, "numstacks": 1000, "numquads": 1000},
+}
+MOST_USER = 10_000
+MOST_PIXELS = 8192**2  # of a texture that MuJoCo makes
 MOST_COPIES = 1_000_000  # largest number of elements from <replicate>: they take MuJoCo minutes, and GBs
 _COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of the elements that they make
 _MASSES = frozenset(
@@ -464,7 +473,7 @@ def _check_elements(xml: str, what: str) -> None:
     MuJoCo treats a NaN for the mass or density of a geom as a missing number.
     """
     text = xml.lower()
-    rare = any(word in text for word in (*_COPIERS, "hfield", "nan"))
+    rare = any(word in text for word in (*_COPIERS, "hfield", "nan", "builtin", *(f"<{tag}" for tag in MOST)))
     if not rare and xml.count("</") < DEEPEST and xml.count("<") <= MOST_COPIES:
         return  # files of thousands of geoms are not read again
     reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
@@ -487,6 +496,8 @@ def _check_elements(xml: str, what: str) -> None:
                 if _NAN.search(element.attrib[key].lower()):
                     name = f" {element.attrib['name']!r}" if "name" in element.attrib else ""
                     raise InputError(f"{what}: got NaN for the {key} of {element.tag}{name}, want a number")
+            if event == "start":
+                _check_sizes(element, what)
             if event == "start" and element.tag == "hfield":
                 sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
                 cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
@@ -496,6 +507,30 @@ def _check_elements(xml: str, what: str) -> None:
     except (ElementTree.ParseError, ValueError) as error:
         if isinstance(error, InputError):
             raise  # MuJoCo reports all other errors
+
+
+def _check_sizes(element: ElementTree.Element, what: str) -> None:
+    """Raises InputError for a size beyond MOST, or a texture of more than MOST_PIXELS."""
+    given = element.attrib
+    most = MOST.get(element.tag, {})
+    for key, text in given.items() if most else ():
+        largest = MOST_USER if key.startswith("nuser_") else most.get(key)
+        if largest is not None and _size(text) > largest:
+            got = f"{key}={excerpt(text)} in <{element.tag}>"
+            raise InputError(f"{what}: got {got}, want {largest:,} at most")
+    if element.tag == "texture" and "builtin" in given:
+        width, height = _size(given.get("width", "0")), _size(given.get("height", "0"))
+        if max(width * height, 6 * width**2 if given.get("type", "cube") == "cube" else 0) > MOST_PIXELS:
+            got = f"{excerpt(given.get('width'))} x {excerpt(given.get('height'))} pixels in <texture>"
+            raise InputError(f"{what}: got {got}, want {MOST_PIXELS:,} at most")
+
+
+def _size(text: str) -> float:
+    """A number of an MJCF, which may end in K, M, G, T, P or E, powers of 1024; 0 if MuJoCo itself refuses it."""
+    match = re.fullmatch(r"\s*\+?([\d.]+(?:e\+?\d{1,2})?)([kmgtpe]?)\s*", text.lower())
+    with contextlib.suppress(ValueError):
+        return float(match[1]) * 1024.0 ** ("kmgtpe".find(match[2]) + 1 if match[2] else 0) if match else 0.0
+    return 0.0
 
 
 def _product(text: str) -> int:

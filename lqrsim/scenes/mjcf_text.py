@@ -58,7 +58,8 @@ def read_mjcf(name_or_path: str | os.PathLike[str]) -> tuple[str, str]:
             raise InputError(f"{error}; or the path of an .xml or .urdf file") from None
     elif not os.path.isfile(path):
         packaged = ", ".join(names())
-        near = difflib.get_close_matches(path.name, [one.name for one in path.parent.glob("*.xml")], n=1)
+        there = [one.name for one in path.parent.glob("*.xml") if os.path.isfile(one)]
+        near = difflib.get_close_matches(path.name, there, n=1)
         hint = f" (did you mean {path.with_name(near[0])}?)" if near else ""
         got = os.fspath(name_or_path)
         raise InputError(f"scene: got {got!r}, want a file that exists, or one of: {packaged}{hint}")

@@ -83,6 +83,8 @@ def _parsed(path: Path) -> ElementTree.Element:
     """The root of the file. Raises InputError if it is no URDF, or MuJoCo's reader would crash."""
     if not is_urdf(path):
         raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want the path of a {SUFFIX} file")
+    if not os.path.isfile(path):
+        raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want a file that exists")
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     # Without namespaces, as MuJoCo and ROS: prefixes such as `drake:` are often not declared.
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end

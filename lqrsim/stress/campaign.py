@@ -12,6 +12,7 @@ import itertools
 import logging
 import os
 import sys
+from collections.abc import Iterator
 from copy import copy
 from pathlib import Path
 from typing import Annotated, Any
@@ -102,6 +103,7 @@ def run_campaign(
         _write_or_check_manifest(campaign, folder, deterministic)
         results = Results(folder, scenario=campaign.scenario)
         results.campaign = campaign
+        stack.enter_context(_resumable(results))
         unfinished = _unfinished(results)
         if unfinished:
             if others := changed(results.manifest["versions"]):
@@ -128,6 +130,18 @@ def run_campaign(
             if (counted := results.tally(cell).total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     return results
+
+
+@contextlib.contextmanager
+def _resumable(results: Results) -> Iterator[None]:
+    """A block whose KeyboardInterrupt says how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        stop.add_note(
+            f"{results.folder} has what is done; to go on, call run_campaign again, or run: {results.command}"
+        )
+        raise
 
 
 def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:

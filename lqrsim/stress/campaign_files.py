@@ -27,9 +27,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lqrsim.annotations import Line, checked
-from lqrsim.errors import InputError, excerpt
+from lqrsim.errors import LONGEST, InputError, excerpt
 from lqrsim.results.archive import Other, blamed, canonical, parse, replacing, sha256
 from lqrsim.results.solution import Solution
+from lqrsim.stress.outcome_table import COLUMNS
+from lqrsim.stress.parquet_footer import chunks
 from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Shard
 
 _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
@@ -82,6 +84,10 @@ else:
 
 Table = dict[str, npt.NDArray[np.generic]]
 _KEY = b"lqrsim shard"
+_TEXTS = "outcome", "obstacle", "reason"
+_TYPES = dict.fromkeys((*COLUMNS, "reason"), pa.float64()) | {"trial": pa.int64()} | dict.fromkeys(_TEXTS, pa.string())
+_SNAPPY = 22  # bytes that come of one at most; of other compressions it may be tens of thousands
+_AT_ONCE = 1 << 26  # bytes of text that are unpacked before they are looked at
 
 
 class Damaged(Exception):
@@ -102,16 +108,23 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
     """Decode a table. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
     about = _about(shard, campaign)
     try:
+        groups = chunks(contents)
+        rows = [[chunk.values for chunk in group] for group in groups]
+        if any(chunk.codec not in (0, 1) for group in groups for chunk in group):
+            raise ValueError("another compression than Snappy's")  # a few bytes of it may be gigabytes
         file = pq.ParquetFile(io.BytesIO(contents), page_checksum_verification=True)
-        if file.metadata.num_rows != shard.count:  # checked before memory is allocated for the rows
+        if not file.metadata.num_rows == shard.count == sum(group[0] for group in rows):
             raise ValueError(f"{file.metadata.num_rows} rows")
-        arrow = file.read(use_threads=False)
-        meta = json.loads((arrow.schema.metadata or {})[_KEY])
-        texts = {field.name for field in arrow.schema if pa.types.is_string(field.type)}
-        table: Table = {
-            name: np.array(arrow[name].to_pylist(), dtype=np.str_) if name in texts else arrow[name].to_numpy()
-            for name in arrow.column_names
-        }
+        if file.schema_arrow.names != [*_TYPES] or file.schema_arrow.types != [*_TYPES.values()]:
+            raise ValueError("other columns than those of outcomes")
+        if any(len(group) != len(_TYPES) or len({*group}) > 1 for group in rows):
+            raise ValueError("columns of different lengths")
+        meta = json.loads((file.schema_arrow.metadata or {})[_KEY])
+        numbers = file.read([name for name in _TYPES if name not in _TEXTS], use_threads=False)
+        table: Table = {name: numbers[name].to_numpy() for name in _TYPES if name not in _TEXTS}
+        for name in _TEXTS:
+            table[name] = _texts(file, name, max(group[[*_TYPES].index(name)].size for group in groups))
+        table = {name: table[name] for name in _TYPES}
         good = meta == about | {"sha256": _digest(table, about)}
     except Exception as error:  # a parser may raise anything for damaged bytes
         raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
@@ -130,7 +143,11 @@ def write(contents: bytes, path: Path) -> None:
 
 def read(path: Path, shard: Shard, campaign: str) -> Table:
     """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
+    if not os.path.isfile(path):
+        raise Damaged("it is no regular file")
     try:
+        if (size := path.stat().st_size) > _LARGEST_TABLE:
+            raise Damaged(f"it has {size:,} bytes, want at most {_LARGEST_TABLE:,}")
         contents = path.read_bytes()
     except OSError as error:
         raise Damaged(f"it cannot be read ({error.strerror or error})") from None
@@ -139,6 +156,21 @@ def read(path: Path, shard: Shard, campaign: str) -> Table:
 
 def _about(shard: Shard, campaign: str) -> dict[str, Any]:
     return {"campaign": campaign, "cell": shard.cell, "first": shard.first, "count": shard.count}
+
+
+def _texts(file: pq.ParquetFile, name: str, size: int) -> npt.NDArray[np.str_]:
+    """A column of texts, in parts: a text that rows have in common stands in the file once, and is unpacked for each.
+
+    Args:
+      size: bytes of the column in the file.
+    """
+    found = list[str]()
+    for part in file.iter_batches(max(_AT_ONCE // (_SNAPPY * size + 1), 1), columns=[name], use_threads=False):
+        texts = part.column(0).to_pylist()
+        if (longest := max(map(len, texts), default=0)) > LONGEST:
+            raise ValueError(f"a text of {longest} characters")
+        found += texts
+    return np.array(found, dtype=np.str_)
 
 
 def _digest(table: Table, about: Mapping[str, Any]) -> str:
@@ -153,7 +185,7 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
 
 FORMAT, VERSION, NAME = "lqrsim campaign", 8, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
-_LARGEST = 1 << 26  # bytes, largest manifest
+_LARGEST, _LARGEST_TABLE = 1 << 26, 1 << 29  # bytes, largest manifest and table
 
 
 @checked

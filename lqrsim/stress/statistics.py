@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Chance, Count, Index, checked
-from lqrsim.errors import Array, InputError, check_array, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_number, excerpt
 
 CONFIDENCE = 0.95
 
@@ -153,8 +153,10 @@ def mean(sample: npt.ArrayLike) -> Estimate:
 
 
 def holm(p_values: npt.ArrayLike) -> Array:
-    """Adjust the p-values of several tests for their number (Holm, 1979). Raises InputError unless they are (K,)."""
+    """Adjust the p-values (K,) of several tests for their number (Holm, 1979)."""
     values = check_array("p_values", p_values, (None,))
+    for value in values[(values < 0) | (values > 1)]:
+        check_number("p_values", value, at_least=0.0, at_most=1.0)
     order = np.argsort(values, kind="stable")
     raised = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
     adjusted = np.empty(len(values))

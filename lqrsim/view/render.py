@@ -44,6 +44,7 @@ def encoder(
     Args:
       crf, preset: x264's settings of quality and compression.
     """
+    path.write_bytes(bytes(4096))  # FFmpeg crashes on a disk that is so full that it cannot even write its header
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:
             metadata.embed(container)

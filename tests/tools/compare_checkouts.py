@@ -28,6 +28,7 @@ import numpy as np
 import tyro
 
 import lqrsim as ls
+from lqrsim.commands.as_json import text_of
 from lqrsim.versions import versions
 
 
@@ -243,5 +244,5 @@ def report(result: dict[str, Any]) -> str:
 if __name__ == "__main__":
     config = tyro.cli(Config, description=__doc__)
     result = main(config)
-    print(json.dumps(result) if config.json else report(result))
+    print(text_of(result) if config.json else report(result))
     sys.exit(any(result["different"].values()))
