@@ -22,4 +22,11 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("lqrsim")
-    return _attribute(name)
+    try:
+        return _attribute(name)
+    except Exception as error:
+        from lqrsim.errors import opengl_error
+
+        if (other := opengl_error(error)) is not None:
+            raise other from None
+        raise

@@ -11,6 +11,7 @@ import itertools
 import math
 import os
 import re
+import sys
 import sysconfig
 import types
 from collections.abc import Iterable, Mapping
@@ -42,6 +43,21 @@ class InputError(ValueError):
     def __init__(self, message: str) -> None:
         line = " ".join(message.splitlines())  # the message of a user's function may be pages long
         super().__init__(line if len(line) <= LONGEST else f"{line[:700]} ... {line[-300:]}")
+
+
+def opengl_error(error: BaseException) -> InputError | None:
+    """What to raise instead of an exception with which MuJoCo could not be imported because of MUJOCO_GL; else None.
+
+    MuJoCo chooses its OpenGL while it is imported; if the chosen one is missing, it raises anything. Python then keeps
+    the modules in it that were imported, and not MuJoCo itself.
+    """
+    failed = "mujoco" not in sys.modules and any(name.startswith("mujoco.") for name in sys.modules)
+    if not failed or "MUJOCO_GL" not in os.environ or isinstance(error, InputError):
+        return None
+    return InputError(
+        f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
+        f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
+    )
 
 
 def keep(record: object, **values: object) -> None:

@@ -56,6 +56,12 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "solution.npz"
 
 
+@pytest.fixture(scope="module")
+def rollout_file(solved: Path) -> Path:
+    simulate(solved, solved.parent)
+    return solved.with_name("rollout.npz")
+
+
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
     """A Python file with scenarios that are not lqrsim's."""
@@ -433,12 +439,35 @@ def test_exit_code_and_line_reach_the_shell() -> None:
     assert "Traceback" not in error
 
 
-def test_an_opengl_that_mujoco_cannot_load_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have one OpenGL")
+@pytest.mark.parametrize("command", ["list", "render", "verify"])
+def test_an_opengl_that_mujoco_cannot_load_is_one_line(
+    command: str, monkeypatch: pytest.MonkeyPatch, rollout_file: Path
+) -> None:
+    """Whichever module imports MuJoCo first."""
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    with start("list") as process:
+    with start(command, *([] if command == "list" else [str(rollout_file)])) as process:
         printed, error = process.communicate(timeout=600)
     assert (process.returncode, printed, error.count("\n")) == (2, "", 1)
-    assert "MUJOCO_GL: got 'nonsense'" in error
+    assert error.count("MUJOCO_GL: got 'nonsense', with which MuJoCo cannot be imported here") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux" or "DISPLAY" in os.environ, reason="GLFW works where there is a display")
+def test_an_opengl_that_needs_a_display_is_one_line(monkeypatch: pytest.MonkeyPatch, rollout_file: Path) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with start("render", str(rollout_file), "--out", str(rollout_file.with_suffix(".png"))) as process:
+        _, error = process.communicate(timeout=600)
+    assert process.returncode == 2
+    assert "Traceback" not in error
+    assert "OpenGL: got glfw, which fails" in error.splitlines()[-1]
+
+
+def test_in_python_an_opengl_that_mujoco_cannot_load_is_named() -> None:
+    code = "import lqrsim as ls\ntry:\n    ls.render\nexcept ls.InputError as error:\n    print(error)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "MUJOCO_GL": "nonsense"}, capture_output=True, text=True
+    )
+    assert done.stdout.startswith("MUJOCO_GL: got 'nonsense'"), done.stderr
 
 
 @pytest.mark.parametrize(

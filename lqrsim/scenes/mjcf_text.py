@@ -14,19 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_name, check_number, check_path
+from lqrsim.errors import Array, InputError, check_name, check_number, check_path, opengl_error
 from lqrsim.scenes.world import KINDS, World
 
 try:
     import mujoco
 except Exception as error:
-    # MuJoCo chooses its OpenGL while it is imported; if the chosen one is missing, it can raise anything.
-    if "MUJOCO_GL" not in os.environ:
-        raise
-    raise InputError(
-        f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
-        f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
-    ) from None
+    if (other := opengl_error(error)) is not None:
+        raise other from None
+    raise
 
 # In the wheel, models/ is inside the package; in the repository, next to it.
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]

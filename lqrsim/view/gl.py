@@ -39,10 +39,17 @@ def bind() -> None:
 
         if backend in ("egl", "osmesa"):
             gl_context.GLContext = importlib.import_module(f"mujoco.{backend}").GLContext
-        gl_context.GLContext(16, 16).free()
+        context = gl_context.GLContext(16, 16)
+        if backend not in ("egl", "osmesa"):  # those of windows only complain when something is drawn
+            import mujoco
+
+            context.make_current()
+            mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 100).free()
+        context.free()
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"OpenGL: got {backend}, which fails ({reason}), want a working one: {INSTALL}") from error
+        want = "MUJOCO_GL unset, or a working one" if choice else "a working one"
+        raise InputError(f"OpenGL: got {backend}, which fails ({reason}), want {want}: {INSTALL}") from error
 
 
 def available() -> bool:
