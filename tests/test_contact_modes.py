@@ -215,7 +215,7 @@ def test_smooth_converges_beside_a_jump_and_says_what_is_there(tmp_path: Path) -
     assert loaded.certificate == solution.certificate
 
 
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(seed=st.integers(0, 10_000))
 def test_the_optimality_in_a_mode_bounds_what_the_mode_allows(seed: int) -> None:
     draws = np.random.default_rng(seed)

@@ -106,7 +106,7 @@ def test_a_force_is_a_constraint_if_it_is_linear(
             assert one.slopes @ [1.0, *state, *control] == pytest.approx(force, rel=1e-9, abs=1e-9)
 
 
-@settings(max_examples=examples(4), deadline=None, derandomize=True)
+@settings(max_examples=examples(4))
 @given(
     servo=st.sampled_from([(80.0, "Euler"), (80.0, "RK4"), (900.0, "implicitfast"), (4000.0, "implicitfast")]),
     most=st.floats(8.0, 20.0), other=st.floats(2.5, 6.0), goal=st.tuples(st.floats(-0.8, 0.8), st.floats(-0.8, 0.8)),
@@ -255,7 +255,7 @@ def test_limits_hold_where_a_plan_can_keep_them(
     assert replan.cost == pytest.approx(first_plan.cost, rel=1e-2)
 
 
-@settings(max_examples=examples(12), deadline=None, derandomize=True)
+@settings(max_examples=examples(12))
 @given(push=st.tuples(st.floats(-3, 3), st.floats(-3, 3)), after=st.integers(1, 10))
 def test_after_a_push_they_give_way(
     stated: Armed, first_plan: ls.Solution, solver: ls.types.PreparedSolver,

@@ -44,7 +44,7 @@ def problem(
     )  # fmt: skip
 
 
-@settings(max_examples=examples(15), deadline=None, derandomize=True)
+@settings(max_examples=examples(15))
 @given(st.floats(0.1, 5.0), st.floats(0.3, 3.0), st.integers(5, 20))
 def test_a_cart_pushes_and_brakes_for_half_of_the_way_each(way: float, push: float, half: int) -> None:
     """The least time is 2 sqrt(way / push); an even number of steps can have the switch where it belongs.

@@ -210,7 +210,7 @@ def test_a_funnel_is_not_checked_under_disturbances_that_change_the_start(ice: l
 
 
 @hypothesis.given(st.integers(0, 2**32 - 1), st.booleans())
-@hypothesis.settings(max_examples=examples(40), deadline=None)
+@hypothesis.settings(max_examples=examples(40))
 def test_rotated_covariances_are_symmetric_up_to_rounding(seed: int, at_each_knot: bool) -> None:
     """U diag(w) U' of equal variances has entries beside its diagonal that are rounding alone."""
     rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(4, 4)))
@@ -241,7 +241,7 @@ WHOLE = st.fixed_dictionaries(
 
 
 @hypothesis.given(WHOLE)
-@hypothesis.settings(max_examples=examples(40), deadline=None)
+@hypothesis.settings(max_examples=examples(40))
 def test_whole_inputs(given: dict[str, Any]) -> None:
     """Whatever is asked for, it is refused in one line, or the funnel is whole: what it says of itself holds."""
     here = whole_inputs_plant()

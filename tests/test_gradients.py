@@ -94,7 +94,7 @@ def test_a_linear_quadratic_problem_has_closed_forms() -> None:
 
 
 @settings(
-    max_examples=examples(24), deadline=None, derandomize=True, phases=[Phase.generate],
+    max_examples=examples(24), phases=[Phase.generate],
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )  # fmt: skip
 @given(

@@ -64,7 +64,7 @@ def separated(own: Array, other: Array) -> float:
     return float(np.linalg.norm(ends[:, 0] + share[:, None] * sides, axis=1).min())
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60))
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.booleans())
 def test_distances_are_those_of_the_difference_of_both(seed: int, count: int, backwards: bool) -> None:
     """To rounding, in any order of the corners, for any axis on which a box stands; slopes against differences.

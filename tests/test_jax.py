@@ -61,7 +61,7 @@ def compiled_step(dynamics: ls.Dynamics, x: Array, u: Array, weights: Array) -> 
     return [out, jacobian, hessian]
 
 
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(st.lists(NUMBERS, min_size=8, max_size=8), st.lists(NUMBERS, min_size=5, max_size=5))
 def test_steps_and_their_derivatives_are_those_of_the_formula(coupling: list[float], point: list[float]) -> None:
     """To 1e-12 of the largest entry: sums are rounded in another order."""

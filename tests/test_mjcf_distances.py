@@ -69,7 +69,7 @@ def by_bindings(robot: ls.MjcfRobot, state: Array, displaced: Array | None = Non
 
 @pytest.mark.parametrize("other", OBSTACLES)
 @pytest.mark.parametrize("own", SHAPES)
-@settings(max_examples=examples(3), deadline=None, derandomize=True)
+@settings(max_examples=examples(3))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str, seed: int) -> None:
     robot, rng = arm(own, other, seed), np.random.default_rng(seed)
@@ -94,7 +94,7 @@ def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str
         np.testing.assert_allclose(np.linalg.norm(slope[:, :3], axis=1), 1.0, rtol=0, atol=1e-9)
 
 
-@settings(max_examples=examples(10), deadline=None, derandomize=True)
+@settings(max_examples=examples(10))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_obstacles_that_are_elsewhere(seed: int) -> None:
     robot, rng = arm("mesh", "box", seed), np.random.default_rng(seed)
@@ -114,7 +114,7 @@ def test_obstacles_that_are_elsewhere(seed: int) -> None:
 
 
 @pytest.mark.parametrize("other", ["plane", "sphere", "capsule", "cylinder", "box"])
-@settings(max_examples=examples(2), deadline=None, derandomize=True)
+@settings(max_examples=examples(2))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_obstacles_that_move_and_are_in_no_mjcf(other: str, seed: int) -> None:
     """Copies of the MJCF's own obstacles have the distances of these, displaced by as much as they have moved."""
@@ -265,7 +265,7 @@ def test_an_arm_goes_round_a_post_without_a_ball(tmp_path: Path, kind: str) -> N
 SITES = '<site name="tool" pos="0.25 0.01 0.02" euler="10 20 30"/>'
 
 
-@settings(max_examples=examples(10), deadline=None, derandomize=True)
+@settings(max_examples=examples(10))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -394,7 +394,7 @@ TURNED = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler
   <actuator><motor joint="b" ctrlrange="-9 9"/><motor joint="c" ctrlrange="-9 9"/></actuator></mujoco>"""
 
 
-@settings(max_examples=examples(16), deadline=None, derandomize=True)
+@settings(max_examples=examples(16))
 @given(
     kind=st.sampled_from(sorted(PEDESTALS)), gap=st.floats(-0.02, 9e-4), of_body=st.booleans(),
     turns=st.booleans(),
@@ -526,7 +526,7 @@ def test_what_cannot_be_an_obstacle_is_refused_in_one_line(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("unweighed", ["none", "velocities", "activations", "a position"])
-@settings(max_examples=examples(12), deadline=None, derandomize=True)
+@settings(max_examples=examples(12))
 @given(seed=st.integers(0, 2**32 - 1))
 @example(seed=0)  # inside
 def test_a_goal_inside_an_obstacle_is_found_where_positions_have_weights(seed: int, unweighed: str) -> None:

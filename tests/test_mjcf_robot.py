@@ -57,7 +57,7 @@ def stepped(robot: ls.MjcfRobot, state: Array, control: Array, substeps: int, *,
 
 
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
-@settings(max_examples=examples(15), deadline=None)
+@settings(max_examples=examples(15))
 @given(seed=SEEDS)
 def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> None:
     robot, drawn = robot_of(kind, seed)
@@ -69,7 +69,7 @@ def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> 
 
 
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS)
 def test_its_derivatives_are_those_of_the_steps(kind: str, seed: int) -> None:
     """Against central differences of whole periods: they differ by what one-sided differences of a step may be off.
@@ -93,7 +93,7 @@ def test_its_derivatives_are_those_of_the_steps(kind: str, seed: int) -> None:
     np.testing.assert_allclose(A @ state + B @ control + c, robot.dynamics.step(state, control, dt), atol=1e-9)
 
 
-@settings(max_examples=examples(20), deadline=None)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS)
 def test_derivatives_of_a_linear_file_have_a_closed_form(seed: int) -> None:
     """A mass on a spring and a damper, driven through a lag: as MuJoCo's Euler and implicitfast step, damping implicit.
@@ -245,7 +245,7 @@ def test_threads_do_not_disturb_each_other() -> None:
 
 
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
-@settings(max_examples=examples(20), deadline=None)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS)
 def test_states_and_mujocos_numbers_are_the_same_place(kind: str, seed: int) -> None:
     robot, _ = robot_of(kind, 0)
@@ -309,7 +309,7 @@ def test_states_by_name_and_keyframe() -> None:
 
 
 @pytest.mark.parametrize("kind", ["motor", "position", "general"])
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS)
 def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> None:
     """The acceleration by MuJoCo is zero there; and where a limit is too tight, the joint that is short is told of."""
@@ -351,7 +351,7 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
         '<motor {}/>',
     ],
 )  # fmt: skip
-@settings(max_examples=examples(5), deadline=None)
+@settings(max_examples=examples(5))
 @given(seed=SEEDS)
 def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) -> None:
     """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `settled` return."""
@@ -390,7 +390,7 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
             np.testing.assert_allclose(changed, [*wanted[:5], 0.5], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS)
 def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: int) -> None:
     """A chassis that is welded to a base without mass, with wheels: the position is the base's, and so are pushes."""
@@ -606,7 +606,7 @@ def test_an_arm_that_swings_onto_the_floor_at_first_follows_a_line_of_states(see
     assert not robot.dynamics.touches(solution.trajectory.states)
 
 
-@settings(max_examples=examples(4), deadline=None)
+@settings(max_examples=examples(4))
 @given(seed=SEEDS)
 def test_an_arm_that_is_to_stay_where_it_is_has_nothing_to_do(seed: int) -> None:
     """The least cost is zero; by MuJoCo's rounding, that of the arm's friction included, the plan's is about 1e-20."""
@@ -622,7 +622,7 @@ def test_an_arm_that_is_to_stay_where_it_is_has_nothing_to_do(seed: int) -> None
     assert abs(solution.trajectory.states - state).max() < 1e-6
 
 
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(seed=SEEDS)
 def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
     """A body on two feet over a floor or a table, at any height and heading: plain `mj_step` leaves it where it is."""
@@ -655,7 +655,7 @@ def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
         ls.MjcfRobot(scene).settled(robot.at(z=top + 1))
 
 
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(seed=SEEDS)
 def test_muscles_hold_by_pulling_at_most_as_much_as_they_can(seed: int) -> None:
     """Two of them, one against the other, with or without a range of their own: by `mj_step` the limb stays for 0.2 s.
@@ -706,7 +706,7 @@ def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     np.testing.assert_array_equal(robot.settled(state)[:2], state[:2])  # winches drive it
 
 
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=examples(10))
 @given(seed=SEEDS)
 def test_fingers_that_are_coupled_follow_and_are_held(seed: int) -> None:
     """Two fingers that one motor moves; against gravity and each other's weight, by MuJoCo's own steps."""
@@ -731,7 +731,7 @@ def test_fingers_that_are_coupled_follow_and_are_held(seed: int) -> None:
 INTEGRATING = '<general name="drive" joint="hinge" dyntype="integrator" gainprm="{gain}" biastype="affine"'
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(seed=SEEDS, above=st.booleans())
 def test_an_integrator_whose_control_is_never_zero_rests_at_the_end_of_its_range_or_drifts(
     seed: int, above: bool
@@ -793,7 +793,7 @@ NO_CONTACT = 'contype="0" conaffinity="0"'
 
 
 @pytest.mark.parametrize("tie", ["connect", "sites"])
-@settings(max_examples=1, deadline=None)
+@settings(max_examples=1)
 @given(seed=SEEDS)
 def test_a_closed_loop_closes_is_held_and_is_moved_by_a_plan(seed: int, tie: str) -> None:
     """Tips by MuJoCo's kinematics; torques by virtual work, of differences of the potential energy along the loop."""
@@ -831,7 +831,7 @@ def test_a_closed_loop_closes_is_held_and_is_moved_by_a_plan(seed: int, tie: str
     np.testing.assert_allclose(data.qpos, plan.trajectory.states[-1, :4], rtol=0, atol=1e-4)
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(seed=SEEDS)
 def test_welds_and_tendons_hold_joints_together(seed: int) -> None:
     """Two arms of three links with one hand, by MuJoCo's kinematics; two fingers that a tendon keeps symmetric."""
@@ -915,7 +915,7 @@ def tied(kind: str, rng: np.random.Generator) -> str:
 
 
 @pytest.mark.parametrize("kind", ["connect", "plate", "joint", "linear", "weld", "tendon"])
-@settings(max_examples=2, deadline=None)
+@settings(max_examples=2)
 @given(seed=SEEDS)
 def test_an_error_of_the_start_leaves_loops_closed(kind: str, seed: int) -> None:
     """By MuJoCo's constraints; what is drawn is what the robot without the constraints begins with."""
@@ -976,7 +976,7 @@ def test_joint_limits_are_bounds() -> None:
         _ = robot_of("wheel", 0)[0].joint_limits
 
 
-@settings(max_examples=examples(15), deadline=None)
+@settings(max_examples=examples(15))
 @given(seed=SEEDS)
 def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
     """A table with two bent legs and a load off its middle, by plain `mj_step` for half a second."""
@@ -1037,7 +1037,7 @@ def test_plans_keep_off_joint_limits(gear: float, turn: float) -> None:
     assert solution.cost == pytest.approx(squares / 2, rel=1e-9)
 
 
-@settings(max_examples=examples(20), deadline=None)
+@settings(max_examples=examples(20))
 @given(seed=SEEDS)
 def test_limits_cost_nothing_where_start_and_goal_are(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -1136,7 +1136,7 @@ def test_what_it_cannot_touch_is_no_obstacle() -> None:
 PART = '<geom {name} size="0.1" pos="{number} 2 0"/><body pos="{number} 3 0"><joint/><geom size="0.1"/></body>'
 
 
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=examples(10))
 @given(parts=st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=8))
 def test_what_has_no_name_gets_one_in_all_sections_and_included_files(
     tmp_path_factory: pytest.TempPathFactory, parts: list[tuple[int, bool]]
@@ -1303,7 +1303,7 @@ DRY = """<mujoco model="dry"><option timestep="0.005" integrator="implicitfast"/
   </actuator></mujoco>"""
 
 
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(mass=st.floats(0.3, 3.0), loss=st.floats(0.2, 3.0), push=st.floats(0.5, 1.0), speed=st.floats(0.5, 2.0))
 def test_dry_friction_is_coulombs_while_a_joint_moves(mass: float, loss: float, push: float, speed: float) -> None:
     """A block that slides loses its friction from each push, whatever its speed: steps in closed form."""

@@ -47,7 +47,7 @@ def assert_is_oracles(solution: ls.Solution, numbers: Any, problem: ls.Problem, 
 
 
 @pytest.mark.parametrize(("fixed", "form"), FORMS)
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3))
 def test_a_linear_quadratic_problem_with_multiplicative_noise(fixed, form, seed, strength):
     """The stochastic Riccati recursion to 1e-9: cost-to-go, policy, start, expected cost; in both forms."""
@@ -267,7 +267,7 @@ def test_what_is_refused(make, message):
         make()
 
 
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(power=st.floats(-3, 306), solver=st.sampled_from([ls.smooth, ls.ilqr]))
 def test_noise_without_bounds_is_never_left_out_of_the_cost(power: float, solver: Any) -> None:
     """A linear-quadratic plan costs sum_t tr(S_t+1 M M') / 2 more with constant noise M, however large that is."""
@@ -391,38 +391,35 @@ def test_risk_averse_tracking(share):
         ls.track(dataclasses.replace(problem, noise=None), solution, **asked, risk=1.0)
 
 
-@settings(max_examples=examples(12), deadline=None)
+@settings(max_examples=examples(12))
 @given(st.integers(0, 2**32 - 1))
 def test_the_expected_cost_has_no_penalties(seed: int) -> None:
-    """A double integrator to a goal of some states, in the closed form of its policy's expected cost: to rounding."""
+    """A double integrator and a single one to a goal of some states, in the closed form of the cost: to rounding."""
     rng, dt = np.random.default_rng(seed), 0.1
-    steps, goal = int(rng.integers(5, 30)), rng.normal(size=2)
-    A, B = np.array([[1, dt], [0, 1]]), np.array([dt**2 / 2, dt])
+    steps, goal = int(rng.integers(5, 30)), rng.normal(size=3)
+    A, B = np.eye(3) + dt * np.eye(3, k=1) * [0, 1, 0], np.array([[dt**2 / 2, 0], [dt, 0], [0, dt]])
     M, Q, R, end = (
-        0.1 * rng.normal(size=(2, 2)),
-        rng.uniform(0, 2, size=2),
-        rng.uniform(0.5, 2),
-        rng.uniform(0, 2, size=2),
+        0.1 * rng.normal(size=(3, 3)),
+        *(rng.uniform(low, 2, size=k) for low, k in ((0, 3), (0.5, 2), (0, 3))),
     )
-    kept = {name: goal[i] for i, name in enumerate(("x", "v")) if i == 1 or rng.random() < 0.5}
+    kept = {name: goal[i] for i, name in enumerate("xvy") if i == 1 or rng.random() < 0.5}
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x.v, u.a, u.w], states={"x": "m", "v": "m/s", "y": "m"}, controls={"a": "m/s^2", "w": "m/s"}
+    )
     problem = ls.Problem(
-        dynamics=ls.Dynamics(lambda x, u, p: [x.v, u.a], states={"x": "m", "v": "m/s"}, controls={"a": "m/s2"}),
-        dt=dt, steps=steps, initial=ls.FixedState((0.0, 0.0)),
-        stage_cost=ls.ControlCost((R,)) + ls.QuadraticCost(Q, about=goal), final_cost=ls.QuadraticCost(end, about=goal),
+        dynamics=dynamics, dt=dt, steps=steps, initial=ls.FixedState(np.zeros(3)),
+        stage_cost=ls.ControlCost(R) + ls.QuadraticCost(Q, about=goal), final_cost=ls.QuadraticCost(end, about=goal),
         constraints=[ls.GoalState(kept)], noise=ls.Noise(M),
     )  # fmt: skip
     solution = ls.smooth(problem)
     assert solution.success
-    mean, covariance, cost = np.zeros(2), np.zeros((2, 2)), 0.0
-    for t in range(steps):
-        gain = solution.policy.gain[t]
-        control = gain @ mean + solution.policy.offset[t]
-        cost += (
-            0.5
-            * (R * (control**2 + gain @ covariance @ gain.T) + Q @ ((mean - goal) ** 2 + np.diag(covariance))).item()
-        )
-        closed = A + B[:, None] @ gain
-        mean, covariance = A @ mean + B * control, closed @ covariance @ closed.T + M @ M.T
+    mean, covariance, cost = np.zeros(3), np.zeros((3, 3)), 0.0
+    for gain, offset in zip(solution.policy.gain, solution.policy.offset, strict=True):
+        control = gain @ mean + offset
+        cost += 0.5 * R @ (control**2 + np.diag(gain @ covariance @ gain.T))
+        cost += 0.5 * Q @ ((mean - goal) ** 2 + np.diag(covariance))
+        closed = A + B @ gain
+        mean, covariance = A @ mean + B @ control, closed @ covariance @ closed.T + M @ M.T
     cost += 0.5 * end @ ((mean - goal) ** 2 + np.diag(covariance))
     np.testing.assert_allclose(solution.cost, cost, rtol=1e-8)
 
@@ -455,7 +452,7 @@ def closed_loop_cost(numbers: Any, problem: ls.Problem, policy: ls.AffinePolicy)
     return float(cost + 0.5 * off @ numbers.end_weight @ off + 0.5 * np.trace(numbers.end_weight @ covariance))
 
 
-@settings(max_examples=examples(20), deadline=None, derandomize=True)
+@settings(max_examples=examples(20))
 @given(st.integers(0, 2**32 - 1))
 def test_bounds_under_noise_that_depends_on_the_plan(seed: int) -> None:
     """Against SLSQP: the mean of least cost within the bound, with noise weighed by the stochastic Riccati recursion.
@@ -511,7 +508,7 @@ def test_bounds_under_noise_that_depends_on_the_plan(seed: int) -> None:
 
 
 @pytest.mark.parametrize("multiplicative", [0.0, 0.1])
-@settings(max_examples=examples(12), deadline=None, derandomize=True)
+@settings(max_examples=examples(12))
 @given(st.integers(0, 2**32 - 1))
 def test_bounds_under_noise_with_a_risk(multiplicative: float, seed: int) -> None:
     """A small one: whatever the active set, the iterations end."""

@@ -95,7 +95,7 @@ def swung(**stated: Any) -> ls.Problem:
     })  # fmt: skip
 
 
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(low=st.floats(-1.0, 0.2), high=st.floats(0.4, 1.5), most=st.floats(0.1, 2.0), seed=st.integers(0, 99))
 def test_samples_keep_to_the_bounds_of_a_problem(low: float, high: float, most: float, seed: int) -> None:
     """A stop of the joint, of which the dynamics know nothing, is outside of them; the change shows the controls."""

@@ -65,7 +65,7 @@ def test_digests_are_of_everything_that_differs() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), m=st.integers(1, 4), count=st.integers(0, 4))
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=examples(30))
 def test_the_nominal_control_is_where_all_control_costs_together_are_least(seed: int, m: int, count: int) -> None:
     """By least squares of the roots, to 1e-9: the weights are well conditioned."""
     rng, names = np.random.default_rng(seed), [f"u{i}" for i in range(m)]
@@ -241,7 +241,7 @@ def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
 
 
 @pytest.mark.parametrize("solve", [ls.smooth, ls.ilqr])
-@settings(max_examples=examples(8), deadline=None)
+@settings(max_examples=examples(8))
 @given(x=st.floats(-1.0, 1.0), y=st.floats(-1.0, 1.0), speed=st.floats(-1.0, 1.0), weighed=st.booleans())
 def test_a_goal_inside_an_obstacle_is_said_before_the_solve(
     solve: Callable[..., ls.Solution], x: float, y: float, speed: float, weighed: bool
@@ -316,7 +316,7 @@ def test_bad_parts_get_one_line(make, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(
     st.integers(0, 2**32 - 1), st.integers(2, 6), st.sampled_from([(), (5,), (2, 3)]), st.sampled_from([1e-200, 1, 1e9])
 )
@@ -377,7 +377,7 @@ def in_order(given: dict[str, float]) -> list[float]:
     return [given.get(name, given.get(unit, 0.0)) for name, unit in STATES.items()]
 
 
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(weight=WEIGHTS, about=WEIGHTS, start=WEIGHTS, effort=st.floats(0.1, 10.0), unit=st.booleans(), push=WEIGHTS)
 def test_numbers_by_name_or_unit_are_those_in_order(
     weight: dict, about: dict, start: dict, effort: float, unit: bool, push: dict
@@ -457,7 +457,7 @@ def test_numbers_by_name_are_in_no_order_before_a_problem() -> None:
 SHUFFLED = st.permutations(["count", "index", "names", "v", "x"])  # attributes of tuples are names, too
 
 
-@settings(max_examples=examples(20), deadline=None)
+@settings(max_examples=examples(20))
 @given(states=SHUFFLED, controls=st.permutations(["turn", "push"]), seed=st.integers(0, 2**16))
 def test_formulas_know_states_and_controls_by_name(states: list[str], controls: list[str], seed: int) -> None:
     """The same system with its states in any order: its rates by name do not depend on the order, to the last bit."""

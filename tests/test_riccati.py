@@ -185,7 +185,7 @@ def test_bad_problems_get_one_line(wrong, message: str) -> None:
         wrong()
 
 
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["primal", "dual"]))
 def test_weights_in_rotated_coordinates_are_symmetric_up_to_rounding(seed: int, form: str) -> None:
     """U diag(w) U' of equal weights has entries beside its diagonal that are rounding alone.

@@ -236,7 +236,7 @@ def among_discs(seed: int) -> ls.Problem:
 
 class TestConstraintsInTheWay:
     @given(seed=st.integers(0, 10_000))
-    @settings(max_examples=examples(10), deadline=None, derandomize=True)
+    @settings(max_examples=examples(10))
     def test_a_plan_that_touches_one_costs_no_more_than_those_from_either_side(self, seed: int) -> None:
         problem = among_discs(seed)
         found = ls.smooth(problem)

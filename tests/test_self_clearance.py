@@ -50,7 +50,7 @@ KINDS = {"box": 'size="0.08 0.03 0.03"', "ellipsoid": 'size="0.08 0.04 0.03"', "
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=examples(8), deadline=None, derandomize=True)
+@settings(max_examples=examples(8))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_are_mujocos_and_slopes_those_of_differences(kind: str, seed: int) -> None:
     """With a free and a ball joint: both links move, and in other coordinates than MuJoCo's."""
@@ -90,7 +90,7 @@ def drawn_tree(seed: int) -> str:
       <actuator>{"".join(f'<motor joint="j{k}"/>' for k in joints)}</actuator></mujoco>"""
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_links_are_those_that_mujoco_lets_collide(seed: int) -> None:
     """With margins of 10 m all pairs that may touch are contacts."""

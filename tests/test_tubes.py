@@ -120,7 +120,7 @@ def test_the_chance_of_collision_beside_a_plane_is_that_of_monte_carlo() -> None
 @hypothesis.given(
     st.lists(st.tuples(st.sampled_from([0, 1]), st.booleans(), st.sampled_from([0.1, 0.2])), min_size=1, max_size=6)
 )
-@hypothesis.settings(max_examples=20, deadline=None)
+@hypothesis.settings(max_examples=20)
 def test_the_same_obstacles_count_once_however_often_they_are_stated(stated: list[tuple[int, bool, float]]) -> None:
     """By costs and clearances, with one World or with equal ones: the first of each kind, and its chance once."""
     walls = [

@@ -84,7 +84,7 @@ def close(found: tuple[Array, Array], wanted: tuple[Array, Array]) -> None:
 
 
 @pytest.mark.parametrize("base", ["fixed", "free"])
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60))
 @given(seed=SEEDS)
 def test_the_equations_of_motion_are_those_of_the_file(
     tmp_path_factory: pytest.TempPathFactory, base: str, seed: int
@@ -103,7 +103,7 @@ def test_the_equations_of_motion_are_those_of_the_file(
     close(forces_of(robot, qpos, qvel), drawn_urdfs.equations(urdf, *each, base=frame))
 
 
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS)
 def test_pinocchio_has_the_same_equations(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     pinocchio: Any = pytest.importorskip("pinocchio", reason="pin takes 400 MB, so that no extra has it")

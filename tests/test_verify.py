@@ -430,7 +430,7 @@ def test_a_robot_without_position_or_balls_is_measured_by_a_geom_that_is_whole_i
     assert "position" in failed(ls.verify_run(late))
 
 
-@settings(max_examples=examples(200), deadline=None)
+@settings(max_examples=examples(200))
 @given(
     thickness=st.floats(1.0, 16.0), length=st.floats(20.0, 90.0), angle=st.floats(0.0, np.pi),
     centre=st.tuples(st.floats(95.0, 105.0), st.floats(95.0, 105.0)),
@@ -445,7 +445,7 @@ def test_the_middle_of_a_thin_mask_is_its_centre(
     np.testing.assert_allclose(checks.mask_middle(mask), centre, rtol=0, atol=1.0)
 
 
-@settings(max_examples=examples(12), deadline=None)
+@settings(max_examples=examples(12))
 @given(
     kind=st.sampled_from(["capsule", "cylinder", "box", "ellipsoid", "sphere"]),
     size=st.tuples(*[st.floats(0.3, 1.0)] * 3), seed=st.integers(0, 1000),

@@ -68,7 +68,7 @@ def length(states: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1).sum())
 
 
-@settings(max_examples=examples(6), deadline=None)
+@settings(max_examples=examples(6))
 @given(st.floats(0.3, 1.2), st.floats(-0.2, 0.2))
 def test_the_shortest_path_round_a_disc_is_two_tangents_and_an_arc(radius: float, height: float) -> None:
     """And the second path passes on the other side.
@@ -138,7 +138,7 @@ def test_a_robot_that_cannot_stop_drives_half_a_circle_to_turn_round() -> None:
     assert solution.trajectory.horizon == pytest.approx(np.pi / turning, rel=1e-3)
 
 
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=examples(25))
 @given(st.floats(-20, 20), st.floats(-20, 20), st.booleans())
 def test_an_angle_reaches_its_goal_up_to_whole_turns(end: float, goal: float, count: bool) -> None:
     """As `numpy.remainder` says, unless turns count."""
