@@ -1,0 +1,345 @@
+"""Plans that see: the outlook of the paper on belief space, beside iLQG in belief space, and what seeing is worth.
+
+    python experiments/belief_space.py                                        # some minutes
+    python experiments/belief_space.py --video docs/figures/belief_space.gif  # also a run of two plans
+
+light     The light-dark domain and its car: the smoother beside iLQR in belief space, from the same starts.
+spread    The predicted spread of runs of a light-dark plan, against drawn runs.
+drive     The packaged drive among pillars, three of them beacons, in MuJoCo: how often plans fail with and without seeing.
+
+The domains are Platt, Tedrake, Kaelbling and Lozano-Perez (2010), and van den Berg, Patil and Alterovitz (2012), with
+the numbers of the public code of Abdulsamad (github.com/hanyas/trajopt).
+"""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.patches import Circle
+from paper.common import figure, picture
+from runner import FolderSettings, Result, at_most, between, interval, opening, run, table
+
+import lqrsim as ls
+from lqrsim.belief import Belief, BeliefFeedback, NoisySensors, ReadingErrors
+from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.stress.statistics import rate
+
+BEACONS = (-0.95, -0.5), (-1.2, 0.8), (-1.1, 2.1)  # on three pillars
+MODELS = Path(__file__).parents[1] / "models"
+STARTS = 10
+STRAYS = float(np.sqrt(5)), 0.5, 0.05  # m, of the start in the dark
+MOST = 200  # iterations
+SEEING, AT_END = 50.0, 2000.0  # weights of the variance of the position, along the way and at the end
+CHANCE = 0.002  # of touching one obstacle at one step
+STRAY = 0.03  # m and rad, of the start
+GOAL = {"x": 0.0, "y": 2.5, "heading": np.pi}
+ENDS = {"x": 5000.0, "y": 5000.0, "heading": 50.0}
+WEIGHTS = 10.0 ** np.arange(0.0, 4.1, 0.25)  # of obstacles, for a plan that goes round them more widely
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(FolderSettings):
+    out: Path = Path("runs/belief_space")
+    """Folder for the figure, in a folder of that name."""
+    trials: int = 300
+    """Of each plan in MuJoCo."""
+    drawn: int = 10_000
+    """Runs of the light-dark plan."""
+    video: Path | None = None
+    """FILE.gif or FILE.mp4 of two plans."""
+
+
+def light(x: Any, u: Any, p: Any) -> list[Any]:
+    """Both coordinates; the noise of the first grows with the distance from the light, as a variance."""
+    from sympy import sqrt
+
+    return [(x.x, sqrt(p.floor + (p.light - x.x) ** 2 / 2)), (x.y, sqrt(p.floor))]
+
+
+LIGHT = NoisySensors(light, parameters={"floor": 1e-4, "light": 5.0})
+
+
+def light_dark(stray: float = float(np.sqrt(5))) -> ls.Problem:
+    """A point that is told its velocity; light at 5 m, the start at 2 m, known within `stray`, and the goal at 0."""
+
+    def point(x: Any, u: Any, p: Any) -> list[Any]:
+        return [x.x + u.vx, x.y + u.vy]
+
+    dynamics = ls.Dynamics(point, states={"x": "m", "y": "m"}, controls={"vx": "m/s", "vy": "m/s"}, period=1.0)
+    belief = Belief(dynamics, dt=1.0, noise=ls.Noise(1e-4 * np.eye(2)), sensors=LIGHT)
+    off = ls.QuadraticCost({"x": 1, "y": 1} | belief.uncertainty({"x": 400}), about={})
+    return ls.Problem(
+        dynamics=belief, dt=1.0, steps=25, initial=ls.FixedState(belief.state([2, 2], [stray, 1e-4])),
+        stage_cost=ls.ControlCost([1.0, 1.0]) + off, final_cost=off, noise=belief.innovations,
+    )  # fmt: skip
+
+
+def car() -> ls.Problem:
+    """A car, 0.1 m long, in the same light."""
+
+    def step(x: Any, u: Any, p: Any) -> list[Any]:
+        from sympy import cos, sin, tan
+
+        way, turn = 0.5 * x.speed, 0.5 * x.speed * tan(u.steering) / 0.1
+        return [x.x + way * cos(x.heading), x.y + way * sin(x.heading), x.heading + turn, x.speed + 0.5 * u.gas]
+
+    states = {"x": "m", "y": "m", "heading": "rad", "speed": "m/s"}
+    dynamics = ls.Dynamics(step, states=states, controls={"gas": "m/s^2", "steering": "rad"}, period=0.5)
+    belief = Belief(dynamics, dt=0.5, noise=ls.Noise(0.01 * np.eye(4)), sensors=LIGHT)
+    along, at_end = (belief.uncertainty(dict.fromkeys(states, weight)) for weight in (2.0, 200.0))
+    return ls.Problem(
+        dynamics=belief, dt=0.5, steps=30, initial=ls.FixedState(belief.state([2, 2, 0, 0], np.ones(4))),
+        stage_cost=ls.ControlCost([2.0, 2.0]) + ls.QuadraticCost(along, about={}),
+        final_cost=ls.QuadraticCost(dict.fromkeys(states, 200.0) | at_end, about={}), noise=belief.innovations,
+    )  # fmt: skip
+
+
+def compared(name: str, problem: ls.Problem, starts: int) -> list[Result]:
+    """Both solvers from the same controls: zero, and drawn ones. Each is compiled before it is timed."""
+    rng, size = np.random.default_rng(0), (problem.steps, len(problem.dynamics.control_coordinates))
+    given = [np.zeros(size), *(0.1 * rng.normal(size=size) for _ in range(starts - 1))]
+    rows = []
+    for solver, solve in (("smooth", ls.smooth), ("ilqr", ls.ilqr)):
+        solve(problem, start=given[0], max_iterations=1)
+        for start, controls in enumerate(given):
+            began = time.perf_counter()
+            found = solve(problem, start=controls, max_iterations=MOST)
+            rows.append({
+                "problem": name, "solver": solver, "start": start, "status": found.status.name,
+                "cost": found.cost if np.isfinite(found.cost) else None, "iterations": len(found.iterations),
+                "seconds": time.perf_counter() - began,
+            })  # fmt: skip
+    return rows
+
+
+def spread(problem: ls.Problem, solution: ls.Solution, trials: int) -> Result:
+    """Standard deviations of the light-dark plan's end: of the state about the plan, and of the filter's error."""
+    belief, plan, rng = belief_of(problem), solution.trajectory, np.random.default_rng(1)
+    n, policy = belief.size, solution.policy
+    strayed = np.zeros((n, n))  # covariance of the mean, about the plan
+    for t in range(plan.steps):
+        a, b, _ = belief.linearize(plan.states[t], plan.controls[t], plan.dt)
+        moves = (a + b @ policy.gain[t])[:n, :n]
+        column = belief.innovations.matrices(belief, plan.states[t : t + 1], plan.controls[t : t + 1])[0, :n]
+        strayed = moves @ strayed @ moves.T + column @ column.T
+    known = belief.covariance(plan.states[-1])
+    beliefs = np.tile(plan.states[0], (trials, 1))
+    root = np.linalg.cholesky(belief.covariance(plan.states[0]))
+    states = plan.states[0, :n] + rng.normal(size=(trials, n)) @ root.T
+    for t in range(plan.steps):
+        controls = beliefs @ policy.gain[t].T + policy.offset[t]
+        states = states + controls + 1e-4 * rng.normal(size=(trials, n))
+        exact, deviations = belief.read(states)
+        beliefs = belief.corrected(beliefs, controls, exact + deviations * rng.normal(size=exact.shape))
+    found = {"of the state about the plan": states - plan.states[-1, :n], "of the filter": states - beliefs[:, :n]}
+    said = {"of the state about the plan": known + strayed, "of the filter": known}
+    return {what: {"said": float(np.sqrt(said[what][0, 0])), "found": deviation(off[:, 0])}
+            for what, off in found.items()}  # fmt: skip
+
+
+def deviation(sample: np.ndarray) -> list[float]:
+    """A standard deviation with its interval of 95 %, by normal numbers."""
+    value, error = float(np.sqrt(np.mean(sample**2))), 1.96 / np.sqrt(2 * len(sample))
+    return [value, value * (1 - error), value * (1 + error)]
+
+
+def belief_of(problem: ls.Problem) -> Belief:
+    assert isinstance(problem.dynamics, Belief)
+    return problem.dynamics
+
+
+def beacons(x: Any, u: Any, p: Any) -> list[Any]:
+    """The position relative to the beacons, measured the worse the farther these are."""
+    found = []
+    for a, b in BEACONS:
+        deviation = p.least + p.growth * ((x.x - a) ** 2 + (x.y - b) ** 2)
+        found += [(x.x - a, deviation), (x.y - b, deviation)]
+    return found
+
+
+def slips(x: Any, u: Any, p: Any) -> list[Any]:
+    """Noise along the way, and of the heading."""
+    from sympy import cos, sin
+
+    return [[p.along * cos(x.heading), 0], [p.along * sin(x.heading), 0], [0, p.turn]]
+
+
+def drives(world: ls.World) -> dict[str, ls.Problem]:
+    """The packaged drive among its pillars: without an eye on what it will see, with one, and with chances."""
+    scenario = ls.scenarios.differential_drive()
+    problem, radius = scenario.problem, scenario.robot.radius
+    sensors = NoisySensors(beacons, parameters={"least": 0.01, "growth": 0.4})
+    noise = ls.Noise(slips, size=2, parameters={"along": 0.005, "turn": 0.01})
+    belief = Belief(scenario.robot.dynamics, dt=problem.dt, noise=noise, sensors=sensors)
+    blind = ls.Problem(
+        dynamics=belief, dt=problem.dt, steps=problem.steps, stage_cost=problem.stage_cost,
+        initial=ls.FixedState(belief.state([0.0, -2.5, np.pi], [STRAY] * 3)),
+        final_cost=ls.QuadraticCost(ENDS, about=GOAL),
+    )  # fmt: skip
+    along, at_end = (belief.uncertainty({"x": weight, "y": weight}) for weight in (SEEING, AT_END))
+    seeing = dataclasses.replace(
+        blind, stage_cost=blind.stage_cost + ls.QuadraticCost(along, about={}), noise=belief.innovations,
+        final_cost=ls.QuadraticCost(ENDS | at_end, about=GOAL),
+    )  # fmt: skip
+    pillars = [tuple(one.position[:2]) for one in world.obstacles if one.kind == "cylinder"]
+
+    def clear(x: Any, u: Any, p: Any) -> list[Any]:
+        from sympy import sqrt
+
+        return [sqrt((x.x - a) ** 2 + (x.y - b) ** 2) - p.apart for a, b in pillars]
+
+    chance = belief.chance_constraint(clear, chance=CHANCE, parameters={"apart": radius + 0.2})
+    return {
+        "without seeing": blind,
+        "with seeing": seeing,
+        "with seeing, chances of pillars": dataclasses.replace(seeing, constraints=[chance]),
+    }
+
+
+def nominal(plan: ls.Trajectory) -> float:
+    """The cost of a plan's mean without obstacles and variances: that of controls and of the end."""
+    off = plan.states[-1, :3] - list(GOAL.values())
+    return float(30 * np.sum((plan.controls - 0.25) ** 2) + 0.5 * off @ (list(ENDS.values()) * off))
+
+
+def as_costly(blind: ls.Problem, world: ls.World, cost: float) -> ls.Solution:
+    """The plan without seeing that goes round the obstacles as widely as it can at this nominal cost."""
+    radius, found = ls.DifferentialDrive().radius, list[ls.Solution]()
+    for weight in WEIGHTS:
+        away = ls.ObstacleCost(world, radius=radius, sharpness=10.0, weight=float(weight))
+        wide = dataclasses.replace(blind, stage_cost=ls.ControlCost([60.0, 60.0], about=[0.25, 0.25]) + away)
+        plan = ls.smooth(wide)
+        if plan.success:
+            found.append(plan)
+    return min(found, key=lambda plan: abs(nominal(plan.trajectory) - cost))
+
+
+def scene() -> ls.Scene:
+    """The arena, with the pillars that are beacons in another colour, and light about them, which is only drawn."""
+    spec = mujoco.MjSpec.from_file(str(MODELS / "arena.xml"))
+    for geom in spec.geoms:
+        if any(np.allclose(geom.pos[:2], place) for place in BEACONS) and geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            geom.material, geom.rgba = "", [1.0, 0.75, 0.1, 1.0]
+    for i, (x, y) in enumerate(BEACONS):
+        for k, size in enumerate((0.35, 0.5, 0.65)):
+            spec.worldbody.add_geom(
+                name=f"light_{i}_{k}", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[size, 0.001, 0],
+                pos=[x, y, 0.001 * (k + 1)], rgba=[1.0, 0.8, 0.1, 0.25], contype=0, conaffinity=0,
+            )  # fmt: skip
+    return scene_from_xml(spec.to_xml(), "arena")
+
+
+def driven(config: Config, result: Result) -> list[Result]:
+    """How often each plan fails in MuJoCo, with the same filter, noise and readings."""
+    plant = ls.Plant(ls.DifferentialDrive(), scene())
+    problems = drives(plant.world)
+    plans = {name: ls.smooth(problem) for name, problem in problems.items()}
+    blind, cost = problems["without seeing"], nominal(plans["with seeing"].trajectory)
+    problems["without seeing, as costly"] = blind
+    plans["without seeing, as costly"] = as_costly(blind, plant.world, cost)
+    belief, rows, shown = belief_of(blind), list[Result](), dict[str, ls.Rollout]()
+    met = [ls.disturbances.InitialStateError(STRAY), belief.process, ReadingErrors(belief)]
+    for name, plan in plans.items():
+        law = BeliefFeedback(problems[name], plan)
+        runs = ls.simulate(
+            plant, controller=law, disturbances=met, trials=config.trials, frames=config.video is not None
+        )
+        known = np.sqrt(np.trace(belief.covariance(plan.trajectory.states)[:, :2, :2], axis1=1, axis2=2))
+        fails = {how: runs.outcome.count(how) for how in ("reached", "collided", "timed out")}
+        rows.append({
+            "plan": name, "status": plan.status.name, "iterations": len(plan.iterations),
+            "nominal": nominal(plan.trajectory), "deviation": float(known.max()), "end": float(known[-1]),
+        } | {how: interval(rate(count, config.trials)) for how, count in fails.items()})  # fmt: skip
+        tube = belief.covariance(plan.trajectory.states)[:, :2, :2]
+        shown[name] = dataclasses.replace(runs, tube=tube, collision_chance=np.zeros(len(tube)))
+    draw(config, result, plant.world, {name: (problems[name], plan) for name, plan in plans.items()})
+    if config.video is not None:
+        names = "without seeing", "with seeing"
+        lost = [np.array([one != "reached" for one in shown[name].outcome]) for name in names]
+        trial = int(np.argmax(lost[0] & ~lost[1]))
+        ls.render([shown[name] for name in names], config.video, trial=trial, titles=names, camera="top",
+                  overlays=("plan", "trace", "tube", "caption"), size=(560, 316), fps=8, speed=3.0)  # fmt: skip
+    return rows
+
+
+def draw(config: Config, result: Result, world: ls.World, plans: dict[str, tuple[ls.Problem, ls.Solution]]) -> None:
+    """The plans with two standard deviations of what they know, over how well the best beacon is seen."""
+    x, y = np.meshgrid(np.linspace(-2, 2, 161), np.linspace(-3, 3, 241))
+    near = np.min([(x - a) ** 2 + (y - b) ** 2 for a, b in BEACONS], axis=0)
+    with figure(config, result, "belief_space", (10, 4.4)) as drawn:
+        panes = drawn.subplots(1, len(plans), sharey=True)
+        for pane, (name, (problem, plan)) in zip(panes, plans.items(), strict=True):
+            pane.pcolormesh(x, y, np.log(0.01 + 0.4 * near), cmap="cividis_r", shading="gouraud", rasterized=True)
+            for one in world.obstacles:
+                if one.kind == "cylinder":
+                    pane.add_patch(Circle(tuple(one.position[:2]), 0.2, color="0.35"))
+            states = plan.trajectory.states
+            for place, covariance in zip(
+                states[::6, :2], belief_of(problem).covariance(states)[::6, :2, :2], strict=True
+            ):
+                circle = np.linspace(0, 2 * np.pi, 40)
+                ring = place[:, None] + 2 * np.linalg.cholesky(covariance) @ [np.cos(circle), np.sin(circle)]
+                pane.plot(*ring, color="white", linewidth=0.7)
+            pane.plot(*states[:, :2].T, color="C3", linewidth=1.2)
+            pane.plot(*np.transpose(BEACONS), "*", color="gold", markersize=9, markeredgecolor="black")
+            pane.set(title=name, xlabel="x (m)", aspect="equal", xlim=(-2, 2), ylim=(-3, 3))
+            pane.title.set_fontsize(8)
+        panes[0].set_ylabel("y (m)")
+        drawn.set_layout_engine("tight")
+
+
+def main(config: Config) -> Result:
+    config = at_most(config, trials=3, drawn=200)
+    result, starts = opening(config), 2 if config.quick else STARTS
+    problems = {"light-dark": light_dark()} | ({} if config.quick else {"car": car()})
+    result["light"] = [row for name, problem in problems.items() for row in compared(name, problem, starts)]
+    result["spread"] = []
+    for stray in STRAYS:
+        problem = light_dark(stray)
+        result["spread"].append({"stray": stray} | spread(problem, ls.smooth(problem), config.drawn))
+    result["drive"] = driven(config, result)
+    return result
+
+
+def report(result: Result) -> str:
+    solvers = []
+    for name, solver in dict.fromkeys((row["problem"], row["solver"]) for row in result["light"]):
+        own = [row for row in result["light"] if (row["problem"], row["solver"]) == (name, solver)]
+        good = [row for row in own if row["status"] == "CONVERGED"]
+        middle = {
+            key: np.median([row[key] for row in good]) if good else np.nan for key in ("cost", "iterations", "seconds")
+        }
+        least = min((row["cost"] for row in good), default=np.nan)
+        solvers.append([name, f"`{solver}`", f"{len(good)} of {len(own)}", f"{least:.2f}", f"{middle['cost']:.2f}",
+                        f"{middle['iterations']:.0f}", f"{middle['seconds']:.3f}"])  # fmt: skip
+    spreads = [
+        [f"{row['stray']:.2f}", what, f"{row[what]['said']:.4f}", between(row[what]["found"], ".4f")]
+        for row in result["spread"] for what in row if what != "stray"
+    ]  # fmt: skip
+    driven = [
+        [row["plan"], f"{row['nominal']:.1f}", f"{row['deviation']:.3f}", f"{row['end']:.3f}",
+         *(between([100 * part for part in row[how]], ".1f") for how in ("reached", "collided", "timed out"))]
+        for row in result["drive"]
+    ]  # fmt: skip
+    return "\n\n".join([
+        "## Plans that see",
+        "The light-dark domain and its car, from zero and random controls. Costs are expectations; medians are of the"
+        f" solves that converged within {MOST} iterations.",
+        table(("problem", "solver", "converged", "least cost", "median cost", "iterations", "s"), solvers),
+        f"Standard deviation (m) of x at the end of the light-dark plan, predicted and in {result['config']['drawn']}"
+        " drawn runs, by that of the start:",
+        table(("start (m)", "what", "predicted", "found, 95 %"), spreads),
+        f"The differential drive in MuJoCo, {result['config']['trials']} trials of each plan, all with the same filter,"
+        " noise and readings. The nominal cost is that of controls and end, deviations those of the position by the plan.",
+        table(("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "reached (%)", "collided (%)",
+               "timed out (%)"), driven),
+        picture(result, "belief_space", "Plans, what they know within two standard deviations, and how well beacons are seen"),
+    ])  # fmt: skip
+
+
+if __name__ == "__main__":
+    run(Config, main, report, __doc__)
