@@ -5,7 +5,7 @@
 
 light     The light-dark domain and its car: the smoother beside iLQR in belief space, from the same starts.
 spread    The predicted spread of runs of a light-dark plan, against drawn runs.
-drive     The packaged drive among pillars, three of them beacons, in MuJoCo: how often plans fail with and without seeing.
+drive     The packaged drive among pillars, three of them beacons, in MuJoCo: how often plans fail.
 
 The domains are Platt, Tedrake, Kaelbling and Lozano-Perez (2010), and van den Berg, Patil and Alterovitz (2012), with
 the numbers of the public code of Abdulsamad (github.com/hanyas/trajopt).
@@ -334,7 +334,7 @@ def report(result: Result) -> str:
         " drawn runs, by that of the start:",
         table(("start (m)", "what", "predicted", "found, 95 %"), spreads),
         f"The differential drive in MuJoCo, {result['config']['trials']} trials of each plan, all with the same filter,"
-        " noise and readings. The nominal cost is that of controls and end, deviations those of the position by the plan.",
+        " noise and readings. The nominal cost is that of controls and end; deviations are of the position.",
         table(("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "reached (%)", "collided (%)",
                "timed out (%)"), driven),
         picture(result, "belief_space", "Plans, what they know within two standard deviations, and how well beacons are seen"),

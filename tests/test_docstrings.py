@@ -10,7 +10,7 @@ import pytest
 import lqrsim as ls
 
 SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises):$")
-MODULES = (ls.disturbances, ls.lq, ls.robots, ls.rotations, ls.scenarios, ls.stress, ls.types, ls.view)
+MODULES = (ls.belief, ls.disturbances, ls.lq, ls.robots, ls.rotations, ls.scenarios, ls.stress, ls.types, ls.view)
 
 
 def sections(doc: str) -> dict[str, list[str]]:
