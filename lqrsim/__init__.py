@@ -10,6 +10,7 @@
 Names are imported when they are first used, so that importing lqrsim costs nothing; `__init__.pyi` lists them.
 """
 
+import os
 from typing import Any
 
 import lazy_loader
@@ -25,6 +26,8 @@ def __getattr__(name: str) -> Any:
     try:
         return _attribute(name)
     except Exception as error:
+        if "MUJOCO_GL" not in os.environ or name not in __all__:
+            raise
         from lqrsim.errors import opengl_error
 
         if (other := opengl_error(error)) is not None:

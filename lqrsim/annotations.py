@@ -44,7 +44,6 @@ from lqrsim.errors import (
     check_text,
     excerpt,
     numbers_of,
-    owned,
     real,
 )
 
@@ -299,9 +298,9 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any
 
 
 def _owned(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any:
-    """As `_checked`, with an array of one's own."""
+    """As `_checked`; an array is a copy, for the caller may write into the given one later."""
     found = _checked(field, value, said, sizes)
-    return owned(found) if isinstance(found, np.ndarray) else found
+    return found.copy() if found is value and isinstance(found, np.ndarray) else found
 
 
 def _names(said: Declared) -> str:

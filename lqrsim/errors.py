@@ -66,17 +66,6 @@ def keep(record: object, **values: object) -> None:
         object.__setattr__(record, name, value)
 
 
-def owned(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The array if nobody can change it, also through one that it is a view of; else a read-only copy."""
-    base: object = array
-    while isinstance(base, np.ndarray) and not base.flags.writeable:
-        base = base.base
-    if base is not None:
-        array = array.copy()
-        array.setflags(write=False)
-    return array
-
-
 def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...], *, infinite: bool = False) -> Array:
     """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
 

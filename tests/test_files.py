@@ -603,10 +603,10 @@ def test_outputs_with_names_that_are_too_long_give_one_line(
 
 @pytest.mark.parametrize("name", [LONG, f"{LONG}/solution.npz", "a\0b.npz", f"x.{LONG}"])
 def test_names_that_no_file_can_have(name: str, tmp_path: Path, drive_solution: ls.Solution) -> None:
-    with pytest.raises(ls.InputError, match=r"output: got .*want the path of a file, of names of at most 255"):
+    with pytest.raises(ls.InputError, match=r"output: got .*want the path of a file, of names in UTF-8 of at most 255"):
         ls.save(drive_solution, tmp_path / name)
     for load in (ls.load, ls.load):
-        with pytest.raises(ls.InputError, match="want the path of a file, of names of at most 255 bytes"):
+        with pytest.raises(ls.InputError, match="want the path of a file, of names in UTF-8 of at most 255 bytes"):
             load(tmp_path / name)
 
 

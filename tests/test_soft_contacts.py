@@ -159,7 +159,8 @@ def test_a_plan_that_does_not_converge_among_contacts_goes_on_through_softer_one
     assert solution.candidates[0].status is not ls.Status.CONVERGED  # or nothing is softened
     names = [one.start for one in solution.candidates]
     soft = [name.removeprefix("contacts of softness ") for name in names if name.startswith("contacts of softness")]
-    origins = ["", *(f", swaying {sign}{cycles} times" for cycles in (1, 2, 4, 8) for sign in ("", "-"))]
+    periods = ("1 period", "2 periods", "4 periods", "8 periods")
+    origins = ["", *(f", sinusoidal controls of {one}{side}" for one in periods for side in ("", ", mirrored"))]
     assert [name for name in soft if name.startswith("0.1")] == [f"0.1{origin}" for origin in origins]
     assert {name for name in soft if name.startswith("0.03")} <= {f"0.03{origin}" for origin in origins}
     first = [name for name in soft if "again" not in name]

@@ -45,6 +45,12 @@ MOTIONS, FOLLOWED, FOLLOW = 5, 100.0, 8
 SWAYS, SWAY = (1, 2, 4, 8), 0.3
 
 
+def sinusoidal_name(cycles: int) -> str:
+    """The name of `sinusoidal_controls` as a start."""
+    periods = f"{abs(cycles)} period{'s' if abs(cycles) > 1 else ''}"
+    return f"sinusoidal controls of {periods}{', mirrored' if cycles < 0 else ''}"
+
+
 def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
     """The starts of a search and their names: paths to the goal, the straight path first.
 

@@ -57,6 +57,7 @@ from lqrsim.solvers.multistart import (
     pushes,
     reweighted,
     sinusoidal_controls,
+    sinusoidal_name,
 )
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
@@ -416,7 +417,7 @@ class Search:
         if exact:
             self._follow_ways()
         motions = dict[str, StartLike](self._motions()) if exact and not self.best[1].success else {}
-        sways = {f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
+        sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, one in (motions | sways).items():
             if self._budget.stop.due or self.best[1].success:
                 return
@@ -509,7 +510,7 @@ class Search:
         problem = self._problem
         runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
         chosen = choose(runs, self._threads)[0]
-        self._named.append((f"controls that sway {SWAYS[runs.index(chosen)]} times", chosen))
+        self._named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
         found, best = self._finish(chosen, known=Known()), self.best[1]
         # Even a plan that has not converged is better than doing nothing.
         self._offer(chosen, found, better=found.violation <= best.violation and found.cost < best.cost)
@@ -714,7 +715,7 @@ class Search:
         found = {"": self._keep_softer(name, *self._search_softly(widest))}
         for cycles, side in itertools.product(SWAYS, (1, -1)):
             if not self._budget.stop.due:
-                begin, origin = sinusoidal_controls(widest, side * cycles), f", swaying {side * cycles} times"
+                begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
                 found[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
         self._stiffen(found, harder, [name], self._budget.left)
 

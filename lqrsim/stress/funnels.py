@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Bounds, Chance, Index, NonNegative, Positive, Seed, TextProgress, Want, checked
 from lqrsim.control.controllers import ControllerLike, as_controller
 from lqrsim.control.tubes import Tube
-from lqrsim.errors import Array, InputError, check_array, check_name, check_symmetric, excerpt, keep, numbers_of, owned
+from lqrsim.errors import Array, InputError, check_array, check_name, check_symmetric, excerpt, keep, numbers_of
 from lqrsim.problem.noise import Noise
 from lqrsim.process import keeping
 from lqrsim.results.coordinates import Coordinates
@@ -175,7 +175,7 @@ class FunnelCheck:
     successes: npt.NDArray[np.bool_] = field(repr=False)
 
     def __post_init__(self) -> None:
-        keep(self, successes=owned(check_array("FunnelCheck: successes", self.successes, (None,)) != 0))
+        keep(self, successes=check_array("FunnelCheck: successes", self.successes, (None,)) != 0)
 
     def __str__(self) -> str:
         trials, sure = len(self.successes), f"{self.reached.confidence:g}"

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Count, checked
-from lqrsim.errors import Array, InputError, check_shape, excerpt, keep, numbers_of, owned
+from lqrsim.errors import Array, InputError, check_shape, excerpt, keep, numbers_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.goal import OUTCOMES
@@ -57,13 +57,13 @@ class Outcomes:
         check_shape("Outcomes: trial", trial, self.cost.shape)
         if not ((trial >= 0) & (trial == np.floor(trial)) & (trial < 2**63)).all():
             raise InputError(f"Outcomes: trial: got {excerpt(self.trial)}, want whole numbers >= 0")
-        keep(self, trial=owned(trial.astype(np.int64)))
+        keep(self, trial=trial.astype(np.int64))
         for field in ("outcome", "obstacle"):
             value, name = getattr(self, field), f"Outcomes: {field}"
             if not isinstance(value, np.ndarray) or value.dtype.kind != "U":
                 raise InputError(f"{name}: got {excerpt(value)}, want an array of texts")
             check_shape(name, value, trial.shape)
-            keep(self, **{field: owned(value)})
+            keep(self, **{field: value.copy()})
         if not np.isin(self.outcome, OUTCOMES).all():
             raise InputError(f"Outcomes: outcome: got {excerpt(self.outcome)}, want each one of {', '.join(OUTCOMES)}")
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Bounds, Line, Seed, Want, checked
-from lqrsim.errors import InputError, check_array, keep, owned
+from lqrsim.errors import InputError, check_array, keep
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -38,7 +38,7 @@ class ComparedPlan:
     successes: npt.NDArray[np.bool_]
 
     def __post_init__(self) -> None:
-        keep(self, successes=owned(check_array("ComparedPlan: successes", self.successes, (None,)) != 0))
+        keep(self, successes=check_array("ComparedPlan: successes", self.successes, (None,)) != 0)
 
 
 @checked
