@@ -26,7 +26,7 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.edge_pushing import Operations, hessian_of, jacobian_of
 from lqrsim.codegen.sources import text_source
 from lqrsim.codegen.user_functions import check_signature, level_of, name_of, rows_of
-from lqrsim.errors import Array, InputError, check_array, check_kind, check_name
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_name, real, shaped, vectors_of
 from lqrsim.problem.dynamics import MOST_STEPS, Dynamics
 from lqrsim.problem.formulas import SymbolicConstraint
 from lqrsim.problem.noise import Noise
@@ -138,7 +138,7 @@ class Belief(Dynamics):
           covariance: (n, n), positive definite; or (n,) standard deviations.
         """
         n = self.size
-        given = np.asarray(covariance, dtype=np.float64)
+        given = real("covariance", covariance)
         full = np.diag(check_array("covariance", given, (n,)) ** 2) if given.ndim == 1 else given
         try:
             root = np.linalg.cholesky(check_array("covariance", full, (n, n)))
@@ -152,7 +152,8 @@ class Belief(Dynamics):
         Args:
           states: (..., N).
         """
-        given, n = np.asarray(states, dtype=np.float64), self.size
+        n = self.size
+        given = vectors_of("states", states, len(self.state_coordinates))
         root = np.zeros((*given.shape[:-1], n, n))
         root[..., *np.tril_indices(n)] = given[..., n:]
         return root @ root.swapaxes(-1, -2)
@@ -222,7 +223,11 @@ class Belief(Dynamics):
           controls: (K, m), held over the period.
           readings: (K, Y), taken at its end.
         """
-        return self._each("corrected", len(self.state_coordinates), states, controls, readings)
+        size = len(self.state_coordinates)
+        states = shaped("states", states, (None, size))
+        controls = shaped("controls", controls, (len(states), len(self.control_coordinates)))
+        readings = shaped("readings", readings, (len(states), self.readings))
+        return self._each("corrected", size, states, controls, readings)
 
     def read(self, states: Array) -> tuple[Array, Array]:
         """The exact readings (K, Y) in states of the robot, and the standard deviations of their noise.
@@ -230,7 +235,7 @@ class Belief(Dynamics):
         Args:
           states: (K, n), of the robot.
         """
-        found = self._each("read", 2 * self.readings, states)
+        found = self._each("read", 2 * self.readings, shaped("states", states, (None, self.size)))
         return found[:, ::2], found[:, 1::2]
 
     @functools.cached_property

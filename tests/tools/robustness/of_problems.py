@@ -82,6 +82,10 @@ FOLDED = """
 """
 
 
+def light(x: Any, u: Any, p: Any) -> list[Any]:
+    return [(x.x, p.least + x.x**2)]
+
+
 def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     cart = ls.Dynamics(
         rate, states={"x": "m", "v": "m/s"}, controls={"force": "N"}, parameters={"mass": 1.0}, level="plain"
@@ -120,6 +124,14 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     }  # fmt: skip
     rests = {kind: np.zeros(len(robot.dynamics.state_coordinates)) for kind, robot in known.items()}
     robots = [(kind, robot, rests[kind], robot.configuration(rests[kind])) for kind, robot in known.items()]
+    seen = ls.belief.NoisySensors(light, parameters={"least": 0.1})
+    of_belief = {"dynamics": place.problem.dynamics, "dt": 0.1, "noise": ls.Noise(0.1 * np.eye(3)), "sensors": seen}
+    belief = ls.belief.Belief(**of_belief)
+    known_at = {"state": np.arange(1.0, 10.0), "control": [0.1, 0.2]}
+    planned = ls.Problem(
+        dynamics=belief, dt=0.1, steps=2, initial=ls.FixedState(belief.state(np.zeros(3), np.ones(3))),
+        stage_cost=ls.ControlCost([1.0, 1.0]), final_cost=ls.QuadraticCost({"m": 1.0}, about={}),
+    )  # fmt: skip
     stated = {
         name: getattr(place.problem, name)
         for name in ("dynamics", "dt", "steps", "initial", "stage_cost", "final_cost")
@@ -151,6 +163,27 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         }, 0.3),
         **{f"{kind}.among": ({"self": robot, "world": place.plant.world},) for kind, robot in known.items()},
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
+        "NoisySensors": ({"function": light, "parameters": {"least": 0.1}},),
+        "Belief": (of_belief,),
+        "Belief.state": ({"self": belief, "mean": np.zeros(3), "covariance": np.eye(3)},),
+        "Belief.covariance": ({"self": belief, "states": np.ones((2, 9))},),
+        "Belief.chance_constraint": (
+            {"self": belief, "function": light, "chance": 0.1, "parameters": {"least": 0.1}, "name": "light"},
+        ),
+        "Belief.read": ({"self": belief, "states": np.ones((2, 3))},),
+        "Belief.corrected": (
+            {"self": belief, "states": np.ones((2, 9)), "controls": np.ones((2, 2)), "readings": np.ones((2, 1))},
+        ),
+        "Belief.rate": ({"self": belief, **known_at},),
+        "Belief.rate_jacobian": ({"self": belief, **known_at},),
+        "Belief.step": ({"self": belief, **known_at, "dt": 0.1},),
+        "Belief.linearize": ({"self": belief, **known_at, "dt": 0.1},),
+        "Belief.period_near": ({"self": belief, "dt": 0.11},),
+        "Belief.with_parameters": ({"self": belief, "least": 0.2},),
+        "Belief.with_substeps": ({"self": place.problem.dynamics, "count": 2},),  # a map has none
+        "BeliefFeedback": ({"problem": planned, "solution": ls.smooth(planned)}, 0.5),
+        "ReadingErrors": ({"belief": belief, "strength": 1.0},),
+        "ReadingErrors.scaled": ({"self": ls.belief.ReadingErrors(belief), "strength": 2.0},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),
         "Dynamics.step": ({"self": cart, **at, "dt": 0.1},),

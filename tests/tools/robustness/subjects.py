@@ -63,7 +63,7 @@ class Subject:
 def public() -> Iterator[tuple[str, Any]]:
     """Each public callable by its name: `smooth`, `Problem`, `AffinePolicy.control`, `rotations.rotate`."""
     offered = {name: getattr(ls, name) for name in ls.__all__}
-    for room in (ls.disturbances, ls.lq, ls.simulators, ls.stress, ls.types, ls.view):
+    for room in (ls.belief, ls.disturbances, ls.lq, ls.simulators, ls.stress, ls.types, ls.view):
         del offered[room.__name__.removeprefix("lqrsim.")]
         offered |= {name: getattr(room, name) for name in room.__all__}
     offered |= {f"gym.{name}": getattr(gym, name) for name in gym.__all__}
@@ -101,7 +101,7 @@ def _own(item: type, key: str) -> int:
 
 def _offered(name: str) -> Any:
     """A public name, in whichever room it is."""
-    rooms = (ls.disturbances, ls.lq, ls.simulators, ls.stress, ls.types, ls.view)
+    rooms = (ls.belief, ls.disturbances, ls.lq, ls.simulators, ls.stress, ls.types, ls.view)
     return getattr(next((room for room in rooms if name in room.__all__), ls), name)
 
 
