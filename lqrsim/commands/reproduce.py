@@ -33,6 +33,7 @@ SCRIPTS = (
     "stress_test",
     "robust_policies",
     "noise_aware",
+    "belief_space",
     "funnels",
     "solver_league",
     "race",
