@@ -337,7 +337,8 @@ def report(result: Result) -> str:
         " noise and readings. The nominal cost is that of controls and end; deviations are of the position.",
         table(("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "reached (%)", "collided (%)",
                "timed out (%)"), driven),
-        picture(result, "belief_space", "Plans, what they know within two standard deviations, and how well beacons are seen"),
+        picture(result, "belief_space",
+                "Plans, what they know within two standard deviations, and how well beacons are seen"),
     ])  # fmt: skip
 
 

@@ -28,7 +28,7 @@ FETCHED = re.compile(
 def test_reference_has_every_public_name_once() -> None:
     pages = [page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md")]
     listed = Counter(name for page in pages for name in re.findall(r"^::: lqrsim\.([\w.]+)$", page, re.MULTILINE))
-    rooms = ("disturbances", "lq", "simulators", "stress", "types", "view")
+    rooms = ("belief", "disturbances", "lq", "simulators", "stress", "types", "view")
     inside = {f"{room}.{name}" for room in rooms for name in getattr(ls, room).__all__}
     assert listed == Counter(inside | set(ls.__all__) - set(rooms))
 

@@ -163,6 +163,9 @@ class Belief(Dynamics):
 
         Args:
           weights: name of a state of the robot -> weight of its variance.
+
+        Returns:
+          Name of an entry of the root -> its weight.
         """
         names = self.robot.state_coordinates.names
         for name in weights:
