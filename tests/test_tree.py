@@ -197,3 +197,23 @@ def test_without_a_goal_or_steps_backwards_there_is_no_way(pushed_trap: ls.Probl
         final_cost=ls.QuadraticCost([1.0], about=[1.0]),
     )  # fmt: skip
     assert grow(mapped, seed=0) is None
+
+
+@pytest.mark.parametrize("growth", [1.0, 10.0, 30.0, 100.0])
+def test_trees_survive_what_diverges(growth: float) -> None:
+    """One control moves two states alike: the covariance of e^(2 growth t) is singular but for what rounding leaves."""
+
+    def diverging(x: Any, u: Any, p: Any) -> list[Any]:
+        return [p.growth * x.a + u.f, p.growth * x.b + u.f]
+
+    dynamics = ls.Dynamics(
+        diverging, states={"a": "m", "b": "m"}, controls={"f": "m/s"}, parameters={"growth": growth},
+        position=("a", "b"), plane="xy", control_limits=(-1.0, 1.0),
+    )  # fmt: skip
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=20, initial=ls.FixedState([0.1, 0.2]), stage_cost=ls.ControlCost([1.0]),
+        final_cost=ls.QuadraticCost([1.0, 1.0], about=[1.0, -1.0]),
+    )  # fmt: skip
+    planner = LocalPlanner(problem, np.array([0.1, 0.2]), np.array([1.0, -1.0]), 20)
+    reach = planner.reach(np.array([0.1, 0.2]), 1)
+    assert reach is not None if growth == 1.0 else reach is None or np.isfinite(reach.root).all()

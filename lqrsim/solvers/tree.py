@@ -187,11 +187,14 @@ class LocalPlanner:
         return bool(np.mean(((state - other) / self._spread) ** 2) < 1) and self.free_until(between) == len(between)
 
     def reach(self, state: Array, sign: int) -> Reach | None:
-        """Where plans from a state lead, forwards or backwards in time; None if that is not finite."""
+        """Where plans from a state lead, forwards or backwards in time; None if that is beyond rounding, or infinite."""
         covariance, mean, constant = (part[self.arrivals] for part in self._come(state, sign))
         if not all(np.isfinite(part).all() for part in (covariance, mean, constant)):
             return None
-        root = np.linalg.inv(np.linalg.cholesky(covariance + np.diag(self._spread**2)))
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(covariance + np.diag(self._spread**2)))
+        except np.linalg.LinAlgError:
+            return None
         return Reach(root, (root @ mean[..., None])[..., 0], constant + self.arrivals)
 
     def plan(self, state: Array, target: Array, sign: int, steps: int) -> Motion:
