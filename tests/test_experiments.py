@@ -572,3 +572,14 @@ def test_a_race_says_how_far_off_a_path_passes_the_waypoints() -> None:
     ]
     np.testing.assert_allclose(found[0], nearest, rtol=0, atol=2e-3)  # the sampling's: 16 m in 10,000 parts
     assert not (found[1] <= 1.0).any()  # a run that diverged passes nothing
+
+
+def test_what_a_script_prints_as_json_has_no_infinity(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runner: Any = import_module("runner")
+    monkeypatch.setattr(sys, "argv", ["script", "--json"])
+    found = {"figures": [], "ratio": np.inf, "rows": [np.nan, 1.0, -np.inf]}
+    runner.run(runner.Settings, lambda config: found, lambda result: "", None)
+    printed = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert printed["result"] == {"figures": [], "ratio": None, "rows": [None, 1.0, None]}

@@ -238,13 +238,16 @@ class Campaign(Setup):
           policies: as in `Campaign`; by default those of the first four that the scenario allows.
           **options: the other attributes of `Campaign`.
         """
+        check_kind("setup", setup, Setup, "a Setup")
+        sets = check_items("sets", sets, str, "a tuple of names of sets of disturbances")
+        policies = check_items("policies", policies, str, "a tuple of names of policies")
         scenario, design = setup.resolved, setup.design_disturbances
         impossible = impossible_policies(scenario, setup.given)
         shared = {one.name: getattr(setup, one.name) for one in dataclasses.fields(Setup)}
         named = {
             "design_disturbances": None if design is None else tuple(design_disturbances(scenario, design)),
             "sweeps": {name: disturbance_set(name, scenario) for name in sets},
-            "policies": tuple(policies) or tuple(one for one in DEFAULT_POLICIES if one not in impossible),
+            "policies": policies or tuple(one for one in DEFAULT_POLICIES if one not in impossible),
         }
         campaign = cls(**options | shared | named)
         keep(campaign, resolved=scenario, given=setup.given)
