@@ -112,7 +112,7 @@ def test_the_predicted_covariance_is_that_of_drawn_runs() -> None:
 
 
 def test_what_is_no_belief_is_refused() -> None:
-    given = {"dt": DT, "noise": ls.Noise(0.1 * np.eye(3)), "sensors": ls.belief.NoisySensors(beacons)}
+    given: dict[str, Any] = {"dt": DT, "noise": ls.Noise(0.1 * np.eye(3)), "sensors": ls.belief.NoisySensors(beacons)}
     plain = ls.Dynamics(lambda x, u, p: x, states={"x": "m"}, controls={"u": "m"}, period=DT, level="plain")
     known = ls.belief.NoisySensors(lambda x, u, p: [(x.x, 0.1 + u.speed**2)])
     for message, call in (
