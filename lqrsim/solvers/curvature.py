@@ -15,12 +15,14 @@ from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Curvature
 from lqrsim.solvers.stages import Sizes, Stages
 
-HELD = 1e6  # weight of a row that is at zero: of the plan's cost for a change by the row's size
+# Weight of a row that is at zero, for a change by its size: of the plan's cost or, if it is more, the largest force.
+# Forces bend the Lagrangian by the rows' own curvature; where the duration was free, they are in the cost of time.
+HELD = 1e6
 AT_ZERO = 1e-5  # value of a row, relative to its size, that counts as zero
 TANGENT = 1e-3  # change of a held row, relative to its size and that of the direction, that is only the weight's
 FLAT = 1e-6  # curvature of a direction that counts as zero, relative to its terms without cancellation
 FLATTER = 1e-10  # the same relative to the typical cost of a change
-CLEAR = 1e-7  # curvature of a control that is positive beyond doubt, relative to the typical cost of a change
+CLEAR = 1e-7  # curvature of a control that is positive beyond doubt, relative to what the weights are
 PRESSING = 1e-9  # cost of a change by a row's size, relative to the typical cost, from which on the row presses
 SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below which its direction is looked at
 
@@ -58,6 +60,7 @@ class _Reduced:
         numbers = stages.values(plan) / sizes.rows
         at_zero = stages.live & (stages.equality | (numbers <= AT_ZERO) | ((forces > 0) & ~limit))
         pressing: Flags = forces * sizes.rows / sizes.cost > PRESSING
+        self._scale = max(sizes.cost, float(np.abs(forces * sizes.rows).max(initial=0.0, where=at_zero)))
         self._all: Flags = at_zero
         self._strict: Flags = at_zero & (stages.equality | pressing)
 
@@ -73,7 +76,7 @@ class _Reduced:
 
     def _weights(self, held: Flags) -> Array:
         """Weights (T+1, R) on these rows."""
-        return np.where(held & self._stages.live, HELD * self._sizes.cost / self._sizes.rows**2, 0.0)
+        return np.where(held & self._stages.live, HELD * self._scale / self._sizes.rows**2, 0.0)
 
     def _bends_up(self, held: Flags) -> bool:
         """Whether the curvature is positive beyond doubt: a compiled look, which most plans pass."""
@@ -81,7 +84,7 @@ class _Reduced:
         for row, (_, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             fixed[:, i] |= held[:-1, row]
         least = stages.least_curvatures(self._weights(held & (stages.owners >= 0)), fixed)
-        return least is not None and bool((least * self._sizes.controls**2 > CLEAR * self._sizes.cost).all())
+        return least is not None and bool((least * self._sizes.controls**2 > CLEAR * self._scale).all())
 
     def _recursion(self, held: Flags) -> tuple[Curvature, Motion | None]:
         stages, sizes, n = self._stages, self._sizes, self._stages.n
