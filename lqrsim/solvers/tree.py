@@ -187,7 +187,7 @@ class LocalPlanner:
         return bool(np.mean(((state - other) / self._spread) ** 2) < 1) and self.free_until(between) == len(between)
 
     def reach(self, state: Array, sign: int) -> Reach | None:
-        """Where plans from a state lead, forwards or backwards in time; None if that is beyond rounding, or infinite."""
+        """Where plans from a state lead, forwards or backwards in time; None where that is infinite or singular."""
         covariance, mean, constant = (part[self.arrivals] for part in self._come(state, sign))
         if not all(np.isfinite(part).all() for part in (covariance, mean, constant)):
             return None
