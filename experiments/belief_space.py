@@ -314,8 +314,9 @@ def report(result: Result) -> str:
             key: np.median([row[key] for row in good]) if good else np.nan for key in ("cost", "iterations", "seconds")
         }
         least = min((row["cost"] for row in good), default=np.nan)
-        solvers.append([name, f"`{solver}`", f"{len(good)} of {len(own)}", f"{least:.2f}", f"{middle['cost']:.2f}",
-                        f"{middle['iterations']:.0f}", f"{middle['seconds']:.3f}"])  # fmt: skip
+        most = max((row["cost"] for row in good), default=np.nan)
+        solvers.append([name, f"`{solver}`", f"{len(good)} of {len(own)}", f"{least:.2f}", f"{most:.3g}",
+                        f"{middle['cost']:.2f}", f"{middle['iterations']:.0f}", f"{middle['seconds']:.3f}"])  # fmt: skip
     spreads = [
         [f"{row['stray']:.2f}", what, f"{row[what]['said']:.4f}", between(row[what]["found"], ".4f")]
         for row in result["spread"] for what in row if what != "stray"
@@ -329,7 +330,8 @@ def report(result: Result) -> str:
         "## Plans that see",
         "The light-dark domain and its car, from zero and random controls. Costs are expectations; medians are of the"
         f" solves that converged within {MOST} iterations.",
-        table(("problem", "solver", "converged", "least cost", "median cost", "iterations", "s"), solvers),
+        table(("problem", "solver", "converged", "least cost", "highest cost", "median cost", "iterations", "s"),
+              solvers),
         f"Standard deviation (m) of x at the end of the light-dark plan, predicted and in {result['config']['drawn']}"
         " drawn runs, by that of the start:",
         table(("start (m)", "what", "predicted", "found, 95 %"), spreads),
