@@ -99,6 +99,21 @@ def test_all_statements_pass_and_none_is_slower_than_the_published(case: Case) -
 
 
 @pytest.mark.long
+def test_a_plan_between_corners_is_no_saddle() -> None:
+    """Corners that touch curve without bound. From beside the plan, which is as fast as it can be, it is found again."""
+    case = CASES["unicycle2_v0/kink_0"]
+    problem = statements.in_least_time(case)
+    solution = ls.smooth(problem, time_limit=600)
+    assert solution.status is ls.Status.CONVERGED and solution.curvature == "minimum"
+    assert case.published is not None and solution.trajectory.horizon < case.published
+    rng, plan = np.random.default_rng(0), solution.trajectory
+    for size in (1e-3, 1e-2):
+        beside = replace(plan, controls=plan.controls + size * rng.normal(size=plan.controls.shape))
+        again = ls.smooth(problem, start=beside, time_limit=600)
+        assert again.trajectory.horizon > plan.horizon - 1e-4
+
+
+@pytest.mark.long
 def test_the_search_from_outside_leaves_a_trap() -> None:
     """A straight line leads nowhere there."""
     plan = outside.found(CASES["unicycle1_v0/bugtrap_0"])
