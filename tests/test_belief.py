@@ -113,12 +113,14 @@ def test_the_predicted_covariance_is_that_of_drawn_runs() -> None:
 
 def test_what_is_no_belief_is_refused() -> None:
     given: dict[str, Any] = {"dt": DT, "noise": ls.Noise(0.1 * np.eye(3)), "sensors": ls.belief.NoisySensors(beacons)}
+    two: dict[str, Any] = given | {"noise": ls.Noise(M)}
     plain = ls.Dynamics(lambda x, u, p: x, states={"x": "m"}, controls={"u": "m"}, period=DT, level="plain")
     known = ls.belief.NoisySensors(lambda x, u, p: [(x.x, 0.1 + u.speed**2)])
+    told: dict[str, Any] = given | {"sensors": known}
     for message, call in (
         ("dynamics: got a function of arrays, want a formula", lambda: ls.belief.Belief(plain, **given)),
-        ("got a matrix of 2 rows", lambda: ls.belief.Belief(robot(), **given | {"noise": ls.Noise(M)})),
-        ("got a reading that depends on u", lambda: ls.belief.Belief(robot(), **given | {"sensors": known}).readings),
+        ("got a matrix of 2 rows", lambda: ls.belief.Belief(robot(), **two)),
+        ("got a reading that depends on u", lambda: ls.belief.Belief(robot(), **told).readings),
         ("covariance: got one that is not positive definite", lambda: belief().state([0, 0, 0], [1, 1, 0])),
         ("chance: got 0.7", lambda: belief().chance_constraint(unicycle, chance=0.7)),
         ("parameters: got 'skid' twice", lambda: ls.belief.Belief(
