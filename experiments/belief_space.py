@@ -315,8 +315,10 @@ def report(result: Result) -> str:
         }
         least = min((row["cost"] for row in good), default=np.nan)
         most = max((row["cost"] for row in good), default=np.nan)
-        solvers.append([name, f"`{solver}`", f"{len(good)} of {len(own)}", f"{least:.2f}", f"{most:.3g}",
-                        f"{middle['cost']:.2f}", f"{middle['iterations']:.0f}", f"{middle['seconds']:.3f}"])  # fmt: skip
+        solvers.append([
+            name, f"`{solver}`", f"{len(good)} of {len(own)}", f"{least:.2f}", f"{most:.3g}",
+            f"{middle['cost']:.2f}", f"{middle['iterations']:.0f}", f"{middle['seconds']:.3f}",
+        ])  # fmt: skip
     spreads = [
         [f"{row['stray']:.2f}", what, f"{row[what]['said']:.4f}", between(row[what]["found"], ".4f")]
         for row in result["spread"] for what in row if what != "stray"

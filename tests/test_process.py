@@ -264,7 +264,7 @@ def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ready", ["manifest.json", pytest.param("shards/*.parquet", marks=pytest.mark.long)])
-def test_ctrl_c_in_a_stress_test_is_one_line(ready: str, tmp_path: Path) -> None:
+def test_ctrl_c_in_a_stress_test_says_how_to_go_on(ready: str, tmp_path: Path) -> None:
     """To all processes at once, as a terminal does: while workers start, and while they work."""
     asked = "--policies smooth --trials 2000 --shard 20 --strengths 1 --workers 2 --out"
     with start(*COMMAND, "stress", "quadrotor", *asked.split(), tmp_path / "run") as process:
@@ -272,7 +272,9 @@ def test_ctrl_c_in_a_stress_test_is_one_line(ready: str, tmp_path: Path) -> None
         time.sleep(random.Random(ready).uniform(0, 0.5))
         os.killpg(process.pid, signal.SIGINT)
         _, error = process.communicate(timeout=600)
-    assert (process.returncode, error) == (130, STOPPED)
+    note, end = error.splitlines(keepends=True)
+    assert (process.returncode, end) == (130, STOPPED)
+    assert f"lqrsim stress quadrotor --resume --out {tmp_path / 'run'}" in note
     assert not list((tmp_path / "run").rglob(".unfinished-*"))
 
 

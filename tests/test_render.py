@@ -511,9 +511,9 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
     images = [pixels(render_still(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
     # The captions, upper left, tell the time; the marks of the plan move on.
     assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
-    states[:], frames[:] = np.nan, np.nan
+    lost = dataclasses.replace(broken, states=np.full_like(states, np.nan), frames=np.full_like(frames, np.nan))
     with pytest.raises(ls.InputError, match="without a finite state"):
-        render_still(broken, tmp_path / "still.png", size=SMALL)
+        render_still(lost, tmp_path / "still.png", size=SMALL)
 
 
 @draws

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import lqrsim as ls
 from lqrsim import process
 from lqrsim.commands import as_json
-from lqrsim.errors import check_path
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -95,6 +94,7 @@ def say(text: str = "") -> None:
 
 def check_output(field: str, folder: Path, name: str = "") -> None:
     """Check before the work starts that `folder`, or the file `name` in it, can be written."""
+    from lqrsim.errors import check_path
     from lqrsim.results.archive import excerpt_of
 
     check_path(field, folder / name, "the path of an output")

@@ -137,8 +137,8 @@ class Reproduce:
 
     results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
     """Results: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
-    robust_policies, noise_aware, funnels, solver_league, race, other_simulators, adaptive_quad_bench, export_c. By
-    default all."""
+    robust_policies, noise_aware, belief_space, funnels, solver_league, race, other_simulators, adaptive_quad_bench,
+    export_c. By default all."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
     """Output folder."""
     quick: bool = False

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import Count, Index, Line, NonNegative, OneOf, Positive, Seed, Want, checked
-from lqrsim.errors import InputError, check_kind, check_name, excerpt, keep
+from lqrsim.errors import InputError, check_items, check_kind, check_name, excerpt, keep
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.packaged import Scenario
@@ -229,7 +229,6 @@ class Campaign(Setup):
             )
 
     @classmethod
-    @checked
     def of_sets(cls, setup: Setup, sets: Sequence[str], *, policies: Sequence[str] = (), **options: Any) -> "Campaign":
         """A campaign whose disturbances are sets by name, as in `lqrsim stress`.
 
@@ -239,6 +238,9 @@ class Campaign(Setup):
           policies: as in `Campaign`; by default those of the first four that the scenario allows.
           **options: the other attributes of `Campaign`.
         """
+        check_kind("setup", setup, Setup, "a Setup")
+        sets = check_items("sets", sets, str, "a tuple of names of sets of disturbances")
+        policies = check_items("policies", policies, str, "a tuple of names of policies")
         scenario, design = setup.resolved, setup.design_disturbances
         impossible = impossible_policies(scenario, setup.given)
         shared = {one.name: getattr(setup, one.name) for one in dataclasses.fields(Setup)}
