@@ -10,7 +10,7 @@ start, by smooth and ilqr, with a clearance, limits, noise and a risk, and of a 
 cost, plan, policy and cost-to-go; every column of a small campaign; what small searches find for rare failures, the
 smallest failure, a hardened plan and a funnel; a run that re-plans; and a policy as C. To the last bit; with a
 tolerance, the same status and iterations, and costs that differ by less than that, relatively. Of the rest it then says
-the largest difference, relative to the largest number of its array.
+the largest difference, relative to the largest number of its array. Exits with 1 if anything differs.
 """
 
 import hashlib
@@ -232,7 +232,9 @@ def _hash(arrays: Sequence[np.ndarray]) -> str:
 
 def report(result: dict[str, Any]) -> str:
     exact = float(result["config"]["tolerance"]) == 0
-    lines = ["same bits" if exact else "same status, iterations and counts, and cost within the tolerance"]
+    same = not any(result["different"].values())
+    what = "bits" if exact else "status, iterations and counts, and cost within the tolerance"
+    lines = [f"the same {what}" if same else f"NOT the same {what}; of each kind, how many are:"]
     for name, count in result["compared"].items():
         different = result["different"][name]
         which = f"; different: {', '.join(map(str, different[:10]))}" if different else ""
@@ -245,4 +247,5 @@ if __name__ == "__main__":
     config = tyro.cli(Config, description=__doc__)
     result = main(config)
     print(text_of(result) if config.json else report(result))
+    sys.exit(any(result["different"].values()))
     sys.exit(any(result["different"].values()))
