@@ -337,6 +337,7 @@ def test_a_filter_becomes_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert "#define POLICY_MEASURED 12\n" in (tmp_path / "firmware" / "filter" / "policy.h").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_beliefs() -> None:
     names = run_page("belief_space.md")  # which has assertions of its own
     assert names["solution"].success
