@@ -1,8 +1,8 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
-`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `run_checks.py`
-checks the arguments, `effects.py` applies the disturbances, `mujoco_physics.py` advances MuJoCo, `collisions.py`
-detects collisions, and `recorder.py` records.
+`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py`
+applies the disturbances, `mujoco_physics.py` advances MuJoCo, `collisions.py` detects collisions, and `recorder.py`
+records.
 """
 
 import copy
@@ -14,10 +14,22 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
-from lqrsim.control.controllers import ControllerLike, ControllerRun, as_controller
-from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
+from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, as_controller
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_items,
+    check_kind,
+    check_memory,
+    check_text,
+    excerpt,
+    format_error,
+)
 from lqrsim.problem.belief import Belief
+from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.noise import Noise
+from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import MOVED, MovingObstacles, Rollout
@@ -28,10 +40,9 @@ from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
 from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
-from lqrsim.simulation.physics import SimulatorPhysics
-from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.physics import SimulatorPhysics, part_of
+from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.simulation.recorder import Recorder
-from lqrsim.simulation.run_checks import check_plan, check_size, coordinates_of, shape_among
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.versions import versions
 
@@ -195,8 +206,8 @@ class ClosedLoop:
         self.acting = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
-        self.state_coordinates, self.control_coordinates = coordinates_of(self.law, plant)
-        check_plan(plan, plant)
+        self.state_coordinates, self.control_coordinates = _coordinates_of(self.law, plant)
+        _check_plan(plan, plant)
         self.whole = plan.trajectory
         if self.knot >= self.whole.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {self.whole.steps - 1}, before the plan's end")
@@ -207,8 +218,8 @@ class ClosedLoop:
             plant.robot.radius, self.goal_radius, self.goal_tolerance
         )
         dt = self.trajectory.dt
-        substeps, passing = plant.substeps(dt), shape_among(plant, self.moving, self.knot * dt)
-        check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
+        substeps, passing = plant.substeps(dt), _shape_among(plant, self.moving, self.knot * dt)
+        _check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
         numbers = range(self.first_trial, self.first_trial + trials)
         self.effects = Effects(plant, self.whole, self.acting, numbers, self.generators or seeded(self.seed))
         self.physics: AnyPhysics
@@ -456,3 +467,67 @@ def _not_finite(rows: Array) -> npt.NDArray[np.bool_]:
     if finite.all():  # much faster than testing each row
         return np.zeros(len(rows), dtype=bool)
     return ~np.all(finite, axis=1)
+
+
+def _shape_among(plant: Plant, moving: World | None, time: float) -> ShapeInWorld | None:
+    """The robot's shape among obstacles that MuJoCo does not have, at this time in s."""
+    if moving is None:
+        return None
+    robot = plant.robot
+    if twice := sorted({*moving.names} & {*plant.obstacles, *plant.world.names}):
+        raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")
+    return robot.among(moving.moved(time))
+
+
+def _coordinates_of(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
+    """The coordinates of the controller's states and controls. Raises InputError unless they match the plant's."""
+    dynamics = plant.robot.dynamics
+    kind = type(controller).__name__
+    check_text(f"{kind}.digest", controller.digest, "a hash as text")
+    wanted_kind = "Coordinates of states and of controls"
+    spaces = check_items(f"{kind}.coordinates", controller.coordinates, Coordinates, wanted_kind)
+    if len(spaces) != 2:
+        raise InputError(f"{kind}.coordinates: got {len(spaces)}, want two: of the states, of the controls")
+    check_same_system(
+        "controller", "a policy", (spaces[0], spaces[1]), spaces_of(dynamics), f"robot {plant.robot.name}"
+    )
+    meant, moves = spaces[0], dynamics.state_coordinates
+    if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
+        raise InputError(
+            f"controller: got a policy for a position {_place(meant)}, want the position of robot {plant.robot.name}:"
+            f" {_place(moves)}"
+        )
+    # A command that the robot clips is at a limit, whatever limits the policy assumed.
+    own = dynamics.control_coordinates
+    low, high = np.maximum(spaces[1].low, own.low), np.minimum(spaces[1].high, own.high)
+    return spaces[0], spaces[1].limited((low, high))
+
+
+def _check_plan(given: Plan, plant: Plant) -> None:
+    """Raise InputError unless the plan is finite, and has the plant's states and controls."""
+    plan, dynamics = given.trajectory, plant.robot.dynamics
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    if plan.states.shape[1] != n or plan.controls.shape[1] != m:
+        shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
+        raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
+    if not plan.finite:
+        raise InputError(f"plan: got a plan that is not finite ({given.status.name}), want one that can be run")
+
+
+def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
+    """Raise InputError for a run that takes too many physics steps or too much memory."""
+    if plan.steps * substeps > MOST_STEPS:
+        raise InputError(
+            f"plan: got {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
+            f" physics steps, want at most {MOST_STEPS}"
+        )
+    n, m = plan.states.shape[1], plan.controls.shape[1]
+    pictures = plan.steps * (substeps // part_of(plant, substeps)) + 1 if frames else 1
+    numbers = (plan.steps + 1) * 3 * (2 * n + 2 * m + 6 + 1) + 2 * pictures * plant.model.nq + 3 * len(plant.world)
+    check_memory("trials", trials, 8 * numbers + 2000, "whose records")
+
+
+def _place(space: Coordinates) -> str:
+    names = ", ".join(space.names[index] for index in space.position) or "of no states"
+    plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
+    return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")
