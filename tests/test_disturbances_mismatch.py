@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances import (
 )
 from lqrsim.simulation.disturbances.mismatch import cut_normal
 from lqrsim.simulation.effects import Effects, seeded
-from lqrsim.simulation.mujoco_physics import MujocoPhysics
+from lqrsim.simulation.physics import MujocoPhysics
 from lqrsim.simulation.plant import Plant
 
 DT = 1 / 30

@@ -47,6 +47,7 @@ from lqrsim.kernels import (
     cost_to_come_primal,
     declarations,
     descent,
+    entry_points,
     estimation,
     exponential,
     interior_point,
@@ -55,7 +56,6 @@ from lqrsim.kernels import (
     mjcf_distances,
     mjcf_dynamics,
     model_functions,
-    plan_methods,
     policy_evaluation,
     projection,
     restoration,
@@ -64,7 +64,6 @@ from lqrsim.kernels import (
     secants,
     signed_distance,
     sphere_centers,
-    within_periods,
 )
 from lqrsim.kernels import stages as stage_kernels
 from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
@@ -1068,7 +1067,7 @@ class TestParts:
         for again in (True, False):
             found = np.zeros((2 * 3, 3))
             replay(
-                source_of(within_periods),
+                source_of(model_functions),
                 SIZES,
                 "states_within",
                 2,
@@ -1448,7 +1447,7 @@ class TestPlanMethods:
     def test_models_and_steps(self) -> None:
         """The entries that no method leads to; and models that have no minimum."""
         stages, plan = self.made()
-        source, rng = source_of(plan_methods), np.random.default_rng(0)
+        source, rng = source_of(entry_points), np.random.default_rng(0)
         costates, rows = rng.normal(size=(4, 3)), stages.live.size
         assert replay(source, SIZES, "survey", stages.about, plan) > 0
         stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)

@@ -153,7 +153,7 @@ def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> 
     for _ in range(20):
         z = rng.uniform(-1, 1, size=16)
         hessian, gradient = np.zeros((16, 16)), np.zeros(16)
-        value = costs.cost_quadratic(z[:12], z[12:], 1, stage, hessian, gradient)
+        value = costs.cost_of_order(z[:12], z[12:], 1, stage, 0.0, hessian, gradient)
         assert value == pytest.approx(costs.cost_value(z[:12], z[12:], 1, stage), rel=1e-12)
         for i, unit in enumerate(np.eye(16)):
             ahead, behind = (

@@ -21,6 +21,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import Counted, SampledLoop, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
+from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.collision_shape import KeepsClear, each_once
 
 
@@ -309,7 +310,7 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
         loop = LinearLoop(model, policy.gain, offset, None, np.full(1, -1e6), np.full(1, 1e6))
     moments, n = loop.moments(), loop.model.n
     surroundings, counted = Surroundings.of(system.problem, 0.0), Counted.of(system.solution, ())
-    found = sample_loop(loop.model, controller, (loop.low, loop.high), surroundings, counted, 20_000, 0)
+    found = sample_loop(loop.model, controller, (loop.low, loop.high), surroundings, counted, 20_000, 0).moments
     std = np.sqrt(np.diagonal(moments.covariance[:, :n, :n], axis1=1, axis2=2))
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), std, rtol=0.05)
     assert (np.abs(found.mean - moments.mean[:, :n]) < 5 * std / np.sqrt(20_000)).all()
@@ -385,8 +386,8 @@ def test_a_chance_is_between_the_predicted_and_the_counted_one(collided: int, pr
     """And the counted one, none as a half, where an exact interval of 95 % does not have the predicted one."""
     trials = 1000
     hit = np.arange(trials) < collided
-    none = np.zeros((0, 0))
-    found = SampledLoop(none, none, none, none, none, hit, np.zeros(trials)).chance(predicted)
+    none = LoopMoments(*[np.zeros((0, 0))] * 5)
+    found = SampledLoop(none, hit, np.zeros(trials)).chance(predicted)
     low, high = binomtest(collided, trials).proportion_ci(0.95, method="exact")
     if low <= predicted <= high:
         assert min(predicted, collided / trials) <= found <= max(predicted, collided / trials)

@@ -177,7 +177,7 @@ def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float
             solution = replace(solution, policy=replace(policy, control_coordinates=wider))
         law = plan.controller
         if isinstance(law, OffsetFree):
-            law = law._redesigned(solution, replace(law.uncertainty, **changes))
+            law = OffsetFree(law.problem, solution, replace(law.uncertainty, **changes), **law.options)
         elif strong:
             law = replace(law, control_coordinates=wider)
         found[what] = predict_tube(plan.problem, solution, told, law).collision_chance

@@ -15,7 +15,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import square_root_filter
-from lqrsim.kernels.records import FilterModel, FilterRoots, FilterSizes
+from lqrsim.kernels.records import FilterModel, FilterRoots, FilterSizes, zeros_of
 
 # The least noise of a measured number, relative to the standard deviation of its prediction. It makes the covariance of
 # exact or redundant sensors invertible. A decision on the rank would also be discontinuous.
@@ -57,16 +57,17 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         used already; the gain there is then zero. By default the filter begins before that measurement, with the
         model's start.
     """
-    knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
-    disturbing = model.disturbing
-    before, after = np.empty((2, knots, size, size))
-    innovation_root, learned = np.empty((knots, measured, measured)), np.zeros((knots, size, measured))
-    sizes = FilterSizes(knots, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING)
+    size, measured, n, disturbing = model.size, model.sensor.size, model.n, model.disturbing
+    sizes = FilterSizes(
+        model.plan.steps + 1, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING
+    )
     work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
-    root = np.array(model.start_root if known is None else known, order="C")
-    roots = FilterRoots(*map(np.ravel, (root, before, after, innovation_root, learned, work)))
+    own = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
+    roots = zeros_of(FilterRoots, own, T=model.plan.steps, Z=size, Y=measured)
     given = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
-    module_of(source_of(square_root_filter), "Kalman filters").filter_along(sizes, given, roots)
+    filter_along = module_of(source_of(square_root_filter), "Kalman filters").filter_along
+    filter_along(sizes, given, FilterRoots(*map(np.ravel, roots)))
+    _, before, after, innovation_root, learned, _ = roots
     limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
     predicted, corrected, innovation = (one @ one.transpose(0, 2, 1) for one in (before, after, innovation_root))
     return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)

@@ -19,7 +19,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
 from lqrsim.kernels import loop_moments
-from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork
+from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork, zeros_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,32 +39,22 @@ class ClosedLoop:
     def moments(self, count: int) -> LoopMoments:
         """The moments of the first entries of y in each system under each law, (L, C, ...)."""
         loops, (steps, laws, m, width), (systems, own) = self.arrays, self.arrays.K.shape, self.arrays.F.shape[1:3]
-        many, lossy = (systems, laws), 0 < self.lost < 1
-        rows, columns = loops.noise.shape[2:]
+        rows, columns, lossy = *loops.noise.shape[2:], 0 < self.lost < 1
         sizes = LoopSizes(
             steps, systems, laws, own, width, m, count, self.stated, rows, columns, bool(loops.jointly.size), lossy,
             self.lost / (1 - self.lost) if lossy else 0.0,
         )  # fmt: skip
-        P, M = np.zeros((2, *many, width, width))
-        M[..., own:, own:], moved = loops.transition, np.empty((*many, own, width))
-        given = np.empty((systems + 1, *loops.transition.shape))
-        response, law = np.empty((2, *many, m, width))
-        pushed, shaken, held = np.empty((3, *many, m, own))
-        slope, level, left = np.empty((3, *many, m))
-        work = LoopWork(
-            P, M, moved, given[1:], given[0], np.zeros((*many, own)), np.empty(own), response, law, pushed, shaken,
-            held, slope, level, left,
-        )  # fmt: skip
-        shapes = ((count,), (count, count), (count, count), (m,), (m,))
-        lengths = steps + 1, steps + 1, steps, steps, steps
-        found = LoopMoments(*(np.empty((length, *many, *shape)) for length, shape in zip(lengths, shapes, strict=True)))
+        lengths = {"T": steps, "L": systems, "C": laws, "Y": own, "X": width, "R": width - own, "m": m, "N": count}
+        work, found = zeros_of(LoopWork, **lengths), zeros_of(LoopMoments, **lengths)
+        P, M = work.P, work.M
+        M[..., own:, own:] = loops.transition
         arguments = sizes, *(type(one)(*map(np.ravel, one)) for one in (loops, work, found))
         advance = kernels().lay_out("advance", 0, *arguments)
         for t in range(steps + 1):
             advance(t, *arguments)
             if t < steps:
-                np.matmul(M[..., :own, :], P, out=moved)
-                np.matmul(moved, M.swapaxes(-1, -2), out=P[..., :own, :])
+                np.matmul(M[..., :own, :], P, out=work.moved)
+                np.matmul(work.moved, M.swapaxes(-1, -2), out=P[..., :own, :])
         return LoopMoments(*(np.moveaxis(one, 0, 2) for one in found))
 
 

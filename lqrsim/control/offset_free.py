@@ -91,6 +91,7 @@ class OffsetFree(Controller):
     has the new `plans` of each trial, by the step at which they begin, and a `log`, as a `Replanner`.
 
     Attributes:
+      options: the keyword arguments.
       model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
       filter: the filter's gains and covariances.
       weights: the law's weights of deviations from the plan; `weights.emphasis` is None with given tolerances.
@@ -118,7 +119,7 @@ class OffsetFree(Controller):
         memory = min(plan.horizon, MEMORY) if memory is None else memory
         memory = check_seconds("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
-        self._stated: dict[str, Any] = {
+        self.options: dict[str, Any] = {
             "tolerate": tolerate, "effort": effort, "at_end": at_end, "sensors": sensors, "memory": memory,
             "record": record, "replan_every": replan_every, "replan_always": replan_always,
         }  # fmt: skip
@@ -151,10 +152,6 @@ class OffsetFree(Controller):
     def __repr__(self) -> str:
         plan, unknowns = self.solution.trajectory, len(self.uncertainty.unknowns)
         return f"OffsetFree({plan.steps} steps of {plan.dt:g} s, {self.model.n} states and {unknowns} unknowns)"
-
-    def _redesigned(self, solution: Solution, uncertainty: Uncertainty) -> "OffsetFree":
-        """The same kind of law, with its sensors, tolerances and memory, for another uncertainty or solution."""
-        return OffsetFree(self.problem, solution, uncertainty, **self._stated)
 
     def _sensor_filter(self, sensors: RobotSensors, replan_every: float | None) -> SensorFilter:
         sensors.check_robot(self.problem.dynamics)

@@ -85,7 +85,7 @@ class ReplanLog:
     Attributes:
       records: a `ReplanRecord` of each solve.
       solved: number of solves that were used, over all trials.
-      kept: reason why a solve was not used, and the previous law continued -> number of such solves.
+      kept: reason why a solve was not used or did not begin, and the previous law continued -> number of such solves.
     """
 
     def __init__(self) -> None:
@@ -113,10 +113,6 @@ class ReplanLog:
             )
         )  # fmt: skip
         return used
-
-    def refuse(self, reason: str) -> None:
-        """Count a solve that did not begin."""
-        self.kept[reason] += 1
 
     def summary(self, *, times: bool = False) -> str:
         """The number of solves, and why the previous law continued, in one line; with `times`, how long solves took."""
@@ -149,14 +145,8 @@ class ReplanRule:
     """The problem that is solved, when, and from which state. Runs do not change it.
 
     Args:
-      who: name for messages. problem: the problem that was solved. solution: its solution.
-      every: seconds between two solves. deadline: seconds until an answer comes into force; by default a control
-        period, or `at_least` if that is longer. Both are rounded to control periods, the deadline up.
-      horizon: "shrinking", to the end of the first plan, or "moving", always as long as the first plan.
-      predict: whether to solve from the state that the law in force reaches by the deadline, or from the present state.
-      when: a funnel of the solution, if solves are only for states outside it.
-      share: fraction of the funnel's level that counts as its boundary.
-      changes: (time in s, problem) -> the problem as known at that time.
+      who, name: the user's call and its argument for `every`, in messages. at_least: the least deadline by default.
+        The others are as in `Replanner`.
 
     Attributes:
       periods: control periods between two solves. delay: control periods until the answer comes into force.

@@ -99,7 +99,7 @@ class ReplannedRun(ControllerRun):
             dynamics = model.dynamics.with_parameters(**values)
             problem = replace(self._rule.problem, dynamics=dynamics)
         except InputError as error:  # an estimate is not finite
-            self.log.refuse(str(error))
+            self.log.kept[str(error)] += 1
             return
         # In that model the actuators have no lag, gains or offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]

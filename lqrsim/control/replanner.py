@@ -147,7 +147,7 @@ class LiveReplanner:
             return
         self._solve = None
         if solve.answer is None:
-            self.log.refuse(str(solve.error))
+            self.log.kept[str(solve.error)] += 1
         elif self.log.enter(solve.request.step, 0, solve.answer, late=solve.missed):
             self.active = ActivePlan(solve.answer, solve.request.first)
 

@@ -20,6 +20,7 @@ from lqrsim.control.controllers import Controller, turn_to_nearest
 from lqrsim.control.plan_model import Lag, PlanModel
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array
+from lqrsim.kernels.records import LoopMoments
 from lqrsim.results.goal import scale_of
 from lqrsim.results.solution import Solution
 
@@ -56,19 +57,12 @@ class SampledLoop:
     """The result of K trials.
 
     Attributes:
-      mean: mean of the states' deviations from the plan, (T+1, n). covariance: (T+1, n, n). across: covariance with the
-        deviation at the previous knot, (T, n, n).
-      command: standard deviation of each command, (T, m). saturation: fraction of the commands at their limits, (T, m).
-        Like the moments, they are over the trials whose states stay finite.
+      moments: of the states' deviations from the plan and of the commands, over the trials whose states stay finite.
       collided: whether each trial collides at a knot, or its state is not finite, (K,).
       farthest: largest distance of each trial from its plan, (K,), in m, or as `Counted` has it.
     """
 
-    mean: Array
-    covariance: Array
-    across: Array
-    command: Array
-    saturation: Array
+    moments: LoopMoments
     collided: npt.NDArray[np.bool_]
     farthest: Array
 
@@ -108,10 +102,11 @@ def sample_loop(
     off -= mean[:, None]
     count = max(off.shape[1], 1)
     at_limit = (commands <= limits[0]) | (commands >= limits[1])
-    return SampledLoop(
+    moments = LoopMoments(
         mean, off.transpose(0, 2, 1) @ off / count, off[1:].transpose(0, 2, 1) @ off[:-1] / count,
-        commands.std(axis=1), at_limit.mean(axis=1), collided, farthest,
+        commands.std(axis=1), at_limit.mean(axis=1),
     )  # fmt: skip
+    return SampledLoop(moments, collided, farthest)
 
 
 class _Robots:

@@ -17,11 +17,10 @@ from lqrsim.control.controllers import ControllerLike, Feedback
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import Counted, SampledLoop, sample_loop
+from lqrsim.control.sampled_loop import Counted, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind
-from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
@@ -145,25 +144,14 @@ def predict_tube(
         )
     counted, limits = Counted.of(solution, problem.dynamics.state_coordinates.position), (loop.low, loop.high)
     trials = sample_loop(loop.model, law, limits, surroundings, counted, samples, seed) if samples else None
-    return _tube(loop, None if late else loop.moments(), trials, surroundings, counted)
-
-
-def _tube(
-    loop: LinearLoop, moments: LoopMoments | None, trials: SampledLoop | None, surroundings: Surroundings,
-    counted: Counted,
-) -> Tube:  # fmt: skip
-    """The tube by the moments, or else by the moments of the trials."""
-    model, n, estimate = loop.model, loop.model.n, None
-    if moments is not None and loop.filter_gain is not None:
-        whole, guess = moments.covariance, slice(n + model.lagging, 2 * n + model.lagging)
+    shown, estimate = trials.moments if late and trials else loop.moments(), None
+    model, n = loop.model, loop.model.n
+    if not late and loop.filter_gain is not None:
+        whole, guess = shown.covariance, slice(n + model.lagging, 2 * n + model.lagging)
         both = whole[:, :n, guess]
         estimate = whole[:, :n, :n] + whole[:, guess, guess] - both - both.transpose(0, 2, 1)
-    shown = moments or trials
-    assert shown is not None
-    mean, covariance = shown.mean[:, :n], shown.covariance[:, :n, :n]
-    across = shown.across[:, :n, :n]
-    chance, linear = collision_chance(model.plan.states + mean, covariance, across, surroundings)
-    linear = float(linear)
+    mean, covariance, across = shown.mean[:, :n], shown.covariance[:, :n, :n], shown.across[:, :n, :n]
+    chance, linear = collision_chance(plan.states + mean, covariance, across, surroundings)
     strays = None
     if trials is not None:
         own = covariance[:, counted.states][:, :, counted.states] / np.outer(counted.scale, counted.scale)
@@ -172,7 +160,7 @@ def _tube(
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,
         across=across, estimate_covariance=estimate, command=shown.command, saturation=shown.saturation,
-        step_chance=chance, linear_chance=linear, strays=strays,
-        collision_chance=linear if trials is None else trials.chance(linear),
+        step_chance=chance, linear_chance=float(linear), strays=strays,
+        collision_chance=float(linear) if trials is None else trials.chance(float(linear)),
         samples=0 if trials is None else len(trials.collided),
     )  # fmt: skip

@@ -55,14 +55,11 @@ BEGIN, PREPARE, PIVOT, TAKE, ROLL_OUT = 0, 1, 2, 3, 4
 
 @compact
 def active_set(task, violation, stages, work, memory):
-    """Do a part of a step with an active set, so that the caller can end it in time.
+    """Do a part of a step with an active set, so that the caller can end it in time; for PIVOT as `pivot` returns.
 
     Args:
       task: one of BEGIN, PREPARE, PIVOT, TAKE and ROLL_OUT. violation: tolerance of equalities.
       stages: PlanStages. work: ActiveSetArrays. memory: (1,) row of ACTIVE_SET.
-
-    Returns:
-      For PIVOT, CONVERGED if the step was found, STALLED if there is none, otherwise RUNNING.
     """
     mem = memory[0]
     if task == PIVOT:
@@ -130,8 +127,7 @@ def prepare_step(stages, work, mem):
 def pivot(softness, stages, work, mem):
     """Solve the quadratic problem with the rows that are held; then change rows, or go to the next phase, if need be.
 
-    Returns:
-      CONVERGED if the step was found, STALLED if there is none, otherwise RUNNING.
+    Returns CONVERGED if the step was found, STALLED if there is none, otherwise RUNNING.
     """
     phase, count = int(mem.phase), stages.rows.size * (stages.steps + 1)
     hold(mem.scale / softness, mem.scale / softness, stages, work)

@@ -21,11 +21,8 @@ def limited_control(gain, offset, x, limits, u):
 def fix_controls_at_limits(u, gain, limits, stage, step):
     """Fix the controls that the last backward pass fixed: the controls at a limit without a gain, (M, N).
 
-    Args:
-      stage, step: about the origin, in the form for `riccati_forward`; changed in place.
-
-    Returns:
-      The increase of the stage's constant.
+    Stage and step, about the origin in the form for `riccati_forward`, are changed. Returns the stage's new constant
+    minus the old.
     """
     constant, jacobian, c = 0.0, step.jacobian, step.offset
     for i in range(M):
@@ -58,13 +55,10 @@ def fix_control(i, value, stage):
 
 
 def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient):
-    """Minimise a stage over the control as `minimize_control` does, with controls clamped at the state x (N,).
+    """Minimise a stage over the control, clamped at the state x (N,); return the decrease, and whether E is definite.
 
     Args:
       stage: about the origin; controls at a limit are fixed in it. gain, feedforward, hessian, gradient: written.
-
-    Returns:
-      The decrease due to the feedforward, and whether the control block is positive definite.
     """
     low, high = limits.low, limits.high
     u, outward = stack(M), stack(M)
@@ -114,14 +108,11 @@ def slope_at(stage, x, u, i):
 
 
 def riccati_backward(t, step, stage, constant, x, limits, policy, to_go):
-    """Write policy and cost-to-go at t, given the cost-to-go at t + 1. Eqs. (9)-(11), (13).
+    """Write policy and cost-to-go at t, if the control block is definite. Eqs. (9)-(11), (13).
 
     Args:
       step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin; overwritten.
       x: (N,) the state at which controls are clamped to their limits.
-
-    Returns:
-      Whether the control block is positive definite.
     """
     shifted = add_cost_to_go(t, step, stage, constant, to_go)
     decrease, good = minimize_within(

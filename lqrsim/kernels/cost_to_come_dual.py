@@ -160,8 +160,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
 def eliminate_control(step, stage, reduced):
     """Eliminate the control from a step and its stage; see EliminatedControl, which is written.
 
-    Returns:
-      Whether R is positive definite; and a number that is zero if no cost couples states and controls.
+    Returns whether R is positive definite, and a number that is zero if no cost couples states and controls.
     """
     jacobian, cost, slope = step.jacobian, stage.hessian, stage.gradient
     factor, F, h, AT, BT, Q, q = reduced.factor, reduced.F, reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
@@ -287,11 +286,7 @@ def update(V, Q, size):
 
 
 def smoothed_state(t, to_go, to_come, costate, x):
-    """Write the smoothed state x = x0 - V costate, (N,), and costate = (I + S V)^-1 (S x0 + s), (N,), at t.
-
-    Returns:
-      Whether I + S V is invertible.
-    """
+    """Write the smoothed state x = x0 - V costate, (N,), and costate = (I + S V)^-1 (S x0 + s), (N,), at t."""
     S, s, V, x0 = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     a = stack(N, N)
     for i in range(N):

@@ -20,11 +20,7 @@ from lqrsim.kernels.model_functions import advance, step_jacobian
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
-    """Write the cost-to-come at 0: c_0 about the origin, (N, N), (N,), constant. Eq. (18).
-
-    Returns:
-      The constant of the cost-to-come, and whether it exists.
-    """
+    """Write the cost-to-come at 0: c_0 about the origin, (N, N), (N,), constant. Eq. (18)."""
     copy(q, N, to_come.vector[0])
     copy_matrix(Q, N, N, to_come.matrix[0])
     return constant, True
@@ -46,15 +42,12 @@ def forward_jacobian(x, u, model, arrived, step, spare):
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """Write the cost-to-come at t + 1, given the cost-to-come at t, and the inverse policy at t. Eqs. (15)-(17), (19).
+    """Write the cost-to-come at t + 1 and the inverse policy at t, if R is definite. Eqs. (15)-(17), (19).
 
     Args:
       step: LinearStep, the inverse step x_t = [Abar Bbar] (x_{t+1}, u_t) + cbar.
       stage, constant: the cost at t about the origin. to_come: CostToCome.
       smoothing: SmootherGains; gets the inverse policy u_t = Lbar x_{t+1} + lbar.
-
-    Returns:
-      Whether the control block is positive definite.
     """
     S0, s0, jacobian, c = to_come.matrix[t], to_come.vector[t], step.jacobian, step.offset
     cost, slope = stage.hessian, stage.gradient
@@ -91,11 +84,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
 
 
 def smoothed_state(t, to_go, to_come, costate, x):
-    """Write the smoothed state x = -(S + Sbar)^-1 (s + sbar), (N,), Eq. (21), and the costate S x + s, (N,), at t.
-
-    Returns:
-      Whether S + Sbar is positive definite.
-    """
+    """Write the smoothed state x = -(S + Sbar)^-1 (s + sbar), (N,), Eq. (21), and the costate S x + s, (N,), at t."""
     S, s, Sbar, sbar = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     total = stack(N, N)
     for i in range(N):

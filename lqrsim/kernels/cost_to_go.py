@@ -34,12 +34,10 @@ def add_cost_to_go(t, step, stage, constant, to_go):
 def minimize_control(g, h, gain, feedforward, hessian, gradient):
     """Minimise `1/2 z'gz + h'z` over the control in z = (x, u), as above; the minimiser is `u = gain x + feedforward`.
 
-    Args:
-      g: (W, W). h: (W,).
-      gain, feedforward: L (M, N) and l (M,), written. hessian, gradient: S (N, N) and s (N,) of the minimum, written.
+    Returns the decrease due to the feedforward, or -1 if E is not positive definite.
 
-    Returns:
-      The decrease due to the feedforward, or -1 if E is not positive definite.
+    Args:
+      gain, feedforward: L (M, N) and l (M,), written. hessian, gradient: S (N, N) and s (N,) of the minimum, written.
     """
     e, c, y = stack(M, M), stack(M, N), stack(M)
     for i in range(M):

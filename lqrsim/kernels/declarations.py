@@ -150,7 +150,7 @@ def rate_jacobian(x, u, p, out, fx, fu) -> None:
 
 
 def rate_curvature(x, u, p, w, curve) -> None:
-    """Write the second derivatives of `sum_i w[i] f[i]` that may be nonzero, in the entries that `step_curvature.py`
+    """Write the second derivatives of `sum_i w[i] f[i]` that may be nonzero, in the entries that `runge_kutta.py`
     lists; of symmetric pairs the one below the diagonal.
     """
 
@@ -158,7 +158,7 @@ def rate_curvature(x, u, p, w, curve) -> None:
 def part_curvature(x, u, p, h, weights, out, jacobian, hessian) -> None:
     """Write a Runge-Kutta step (N,) and its Jacobian (N, W); add the Hessian (W, W) of the step times weights (N,).
 
-    `step_curvature.py`, and what `differences.py` has in its place.
+    `runge_kutta.py`, and what `differences.py` has in its place.
     """
 
 
@@ -187,7 +187,7 @@ def constraint_slope(x, u, t, row, data, gradient) -> None:
 def places(x, data, out) -> None:
     """Write the centres of a robot's balls, three coordinates each, ball by ball.
 
-    `user_functions.py`, `mjcf_places.py`; for costs and constraints of a residual, its rows: `residual` of
+    `user_functions.py`, `mjcf_distances.py`; for costs and constraints of a residual, its rows: `residual` of
     `mjcf_distances.py`, and of the files of costs and constraints.
     """
 

@@ -82,9 +82,6 @@ def descend(first, last, settings, model, work, memory, log):
       settings: IterationSettings, with the Descent. model: ProblemModel. log: rows of LOG.
       work: SmootherArrays, with the plan, `best`.
       memory: row of MEMORY, after `Workspace.begin_descent`.
-
-    Returns:
-      As `iterations.py` says.
     """
     how, damped, plan = settings.descent, settings.descent.method == DAMPED, work.best
     for done in range(first, last):
@@ -267,7 +264,7 @@ def turn_to_ilqr(memory):
 
 
 def judge(settings, settled, ending, model, work, memory, row):
-    """Measure the optimality of the plan, and compute policy and value functions about it; write the log's row.
+    """Measure the plan's optimality; compute policy and value functions about it. CONVERGED if optimal, else RUNNING.
 
     Newton's pass that measures it is the next step's, and value functions are computed at its end alone: as in
     smoothing, without second-order terms. They are convex, so that the minimum of their sum is at the plan. If it is
@@ -275,10 +272,7 @@ def judge(settings, settled, ending, model, work, memory, row):
     small.
 
     Args:
-      settled: whether the cost has settled. ending: whether this is the last iteration in any case.
-
-    Returns:
-      CONVERGED or COST_CONVERGED if the plan is optimal, else RUNNING.
+      settled: whether the cost has settled. ending: whether this is the last iteration in any case. row: of the log.
     """
     how = settings.descent
     if how.method == DAMPED:

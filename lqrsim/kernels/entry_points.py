@@ -1,4 +1,4 @@
-"""The functions that Python calls: one for each solver, and single passes and rollouts.
+"""The functions that Python calls: one for each solver and method, single passes and rollouts.
 
 All code that a solve can need is compiled together, before the solve begins. Code that its parts share is compiled
 once.
@@ -6,6 +6,7 @@ once.
 
 from math import inf
 
+from lqrsim.kernels.active_set import active_set as active_set
 from lqrsim.kernels.certificate import certify, reduced_curvature
 from lqrsim.kernels.control_limits import riccati_backward
 from lqrsim.kernels.declarations import (
@@ -24,12 +25,20 @@ from lqrsim.kernels.declarations import (
     zeros,
 )
 from lqrsim.kernels.descent import descend, judge
+from lqrsim.kernels.interior_point import interior_point as interior_point
 from lqrsim.kernels.iterations import ilqr_iterations, relative_optimality, smoother_iterations
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.records import Limits, LinearStep, QuadraticStage
+from lqrsim.kernels.restoration import restoration as restoration
 from lqrsim.kernels.rollouts import ilqr_pass
 from lqrsim.kernels.rollouts import rollout as rollout
+from lqrsim.kernels.stages import adjoint as adjoint
+from lqrsim.kernels.stages import least_curvatures as least_curvatures
+from lqrsim.kernels.stages import look as look
+from lqrsim.kernels.stages import read_rows as read_rows
+from lqrsim.kernels.stages import survey as survey
+from lqrsim.kernels.stages import trial as trial
 
 
 def smoother(task, first, last, settings, model, work, memory, log):
@@ -40,9 +49,6 @@ def smoother(task, first, last, settings, model, work, memory, log):
         to certify the last policy and rollout with the Hessians of the cost-to-go; or EVALUATE, the same with Hessians
         of the policy itself, which overwrite them; or CURVE, to measure the curvature of the cost about that rollout.
       first, last: iterations to run, `last` excluded. The rest are records.
-
-    Returns:
-      As `iterations.py` says.
     """
     if task == CURVE:
         reduced_curvature(settings, work.last, model, work.certificate[0])

@@ -8,7 +8,7 @@ gain and the offset of each control (V = P + 2 M).
 from math import nan
 
 from lqrsim.kernels.declarations import M, N, call, outline, stack
-from lqrsim.kernels.linear_algebra import affine, clear, copy
+from lqrsim.kernels.linear_algebra import affine, clear, copy, fill
 from lqrsim.kernels.policy_evaluation import to_nearest
 
 LAG, D, Y = 0, 1, 1  # counts of lagging controls, states of unknowns, measured numbers
@@ -82,8 +82,7 @@ def correct_one(shown, lost, near, gain, limit, wider, sensor, angular, z, innov
     share = 1.0
     to_nearest(z, near, angular)
     if lost != 0.0:
-        for j in range(Y):
-            innovation[j] = nan
+        fill(innovation, Y, nan)
         return share
     copy(shown, N, x)
     to_nearest(x, z, angular)

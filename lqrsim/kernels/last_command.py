@@ -5,6 +5,7 @@ a formula's Runge-Kutta step, a user's function, or MuJoCo's steps. `p` has the 
 """
 
 from lqrsim.kernels.declarations import M, N, W, at, call, stack, zeros
+from lqrsim.kernels.linear_algebra import clear
 
 ADVANCE, STEP_JACOBIAN, STEP_CURVATURE, NUMBERS = 0, 1, 2, 3  # of g's functions, and of the numbers that they call p
 
@@ -37,9 +38,7 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
 
 def write_jacobian(u, own, out, jacobian):
     """Write the last M states, and the Jacobian of all, given that of the others, (N - M, N)."""
-    for i in range(N):
-        for j in range(W):
-            jacobian[i, j] = 0.0
+    clear(jacobian, N, W)
     for i in range(N - M):
         for j in range(N - M):
             jacobian[i, j] = own[i, j]

@@ -1,10 +1,13 @@
-"""Distances between a robot's geoms and others, by MuJoCo's `mj_geomDistance`.
+"""Distances between a robot's geoms and others, by MuJoCo's `mj_geomDistance`; and the centres of a robot's balls.
 
-`data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
-of interest, and for each pair: its row, the robot's geom and its body, the other geom, which is an obstacle's or on
-another body of the robot, the sum of the radii of their bounding spheres, whether the other is a plane, and its body if
-that moves, else 0. A row is the least distance of its pairs. Pairs whose
-bounding spheres are farther apart than the least distance so far are skipped.
+For distances `data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the
+largest distance of interest, and for each pair: its row, the robot's geom and its body, the other geom, which is an
+obstacle's or on another body of the robot, the sum of the radii of their bounding spheres, whether the other is a
+plane, and its body if that moves, else 0. A row is the least distance of its pairs. Pairs whose bounding spheres are
+farther apart than the least distance so far are skipped.
+
+For balls, points fixed to bodies, it has that address, their number, and for each the number of its body and its place
+in the body's axes; `differences.py` has the derivatives.
 """
 
 from math import sqrt
@@ -30,6 +33,8 @@ from lqrsim.kernels.mjcf_dynamics import (
     SLOT,
     SLOTS,
     TABLE,
+    XMAT,
+    XPOS,
     take_slot,
     write_positions,
 )
@@ -69,6 +74,24 @@ def slopes_of(count, states, data, out, slopes, which, segments):
     rows = int(data[1])
     for i in range(count):
         find_with_slopes(states[i], data, rows * i, out, slopes, which, segments)
+
+
+def places(x, data, out):
+    """Write the coordinates of the balls, ball by ball."""
+    p = at(data[0])
+    slot = take_slot(p)
+    one = at(p[SLOTS] + 8 * SLOT * slot)
+    write_positions(x, p, at(one[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    origins, axes = at(one[XPOS]), at(one[XMAT])
+    for k in range(int(data[1])):
+        body = int(data[2 + 4 * k])
+        for i in range(3):
+            place = origins[3 * body + i]
+            for j in range(3):
+                place += axes[9 * body + 3 * i + j] * data[3 + 4 * k + j]
+            out[3 * k + i] = place
+    store(p[FLAGS], slot, 0)
 
 
 @outline

@@ -4,7 +4,7 @@ Passes and iterations are therefore compiled once per size, and serve all proble
 `records.ProblemModel`.
 """
 
-from lqrsim.kernels.declarations import HESSIANS, STATES, N, W, call, call_for_value, stack
+from lqrsim.kernels.declarations import HESSIANS, STATES, N, W, call, call_for_value, compact, stack
 from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill
 from lqrsim.kernels.records import NextStep
 
@@ -98,19 +98,12 @@ def cost_added(x, u, t, cost):
     return total
 
 
-def cost_quadratic(x, u, t, cost, hessian, gradient):
-    """Write the convex quadratic model of a cost and its augmented Lagrangian at (x, u); return the value.
-
-    The sum of the terms that may be indefinite is projected to the nearest positive-semidefinite matrix.
-
-    Args:
-      hessian: (W, W), written. gradient: (W,), written.
-    """
-    return cost_of_order(x, u, t, cost, 0.0, hessian, gradient)
-
-
 def cost_of_order(x, u, t, cost, share, hessian, gradient):
-    """As `cost_quadratic`, with a mixture of Hessians: `share` of the true one and 1 - `share` of the projected one."""
+    """Write the quadratic model of a cost and its augmented Lagrangian at (x, u); return the value.
+
+    The Hessian (W, W) is a mixture: `share` of the true one, and 1 - `share` of that with the sum of the terms that may
+    be indefinite projected to the nearest positive-semidefinite matrix.
+    """
     own = cost_alone(x, u, t, cost, share, hessian, gradient)
     return own + augment_cost(x, u, t, cost, hessian, gradient)
 
@@ -208,3 +201,19 @@ def cost_of_each(count, t, plans, cost, costs):
     """Write a cost at step t, (count,), of states (count, N) and controls (count, M)."""
     for k in range(count):
         costs[k] = cost_value(plans.states[k], plans.controls[k], t, cost)
+
+
+@compact
+def states_within(steps, parts, again, plan, model, found):
+    """Write the states (steps parts, N) at the ends of `parts` equal parts of each period, with the controls held.
+
+    Args:
+      again: whether each period begins at the plan's knot; else where the last one ended.
+    """
+    z = stack(N)
+    for t in range(steps):
+        if again or t == 0:
+            copy(plan.states[t], N, z)
+        for k in range(parts):
+            advance(z, plan.controls[t], model, model.dt / parts, found[t * parts + k])
+            copy(found[t * parts + k], N, z)

@@ -193,15 +193,12 @@ def add_trace_model(S, weighed, slopes, stage):
 
 
 def factor_of_risk(theta, values, weighed, factor, root):
-    """Factor I - theta M'SM = L D L'.
+    """Factor I - theta M'SM = L D L'; return -1/(2 theta) log det, and whether the matrix is positive definite.
 
     Pivots are stored as their distance from 1, so that no digits are lost if theta is small.
 
     Args:
       factor: (SIZE, SIZE), gets 1 - L below the diagonal. root: (SIZE,), gets the reciprocal square roots of D.
-
-    Returns:
-      -1/(2 theta) log det, and whether the matrix is positive definite.
     """
     X, total = stack(SIZE, SIZE), 0.0
     for k in range(SIZE):

@@ -30,7 +30,7 @@ from lqrsim.kernels.linear_algebra import (
     finite,
     step_offset,
 )
-from lqrsim.kernels.model_functions import advance, cost_quadratic, noise_quadratic, step_jacobian
+from lqrsim.kernels.model_functions import advance, cost_of_order, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Linearization, LinearStep, NextStep, QuadraticStage
 
 
@@ -43,9 +43,6 @@ def forward_pass(settings, model, about, work):
       settings: IterationSettings. model: ProblemModel. about: Linearization.
       work: SmootherArrays. `x_hat` is the state at which c_0 is quadratised, and on return the smoothed state at T, at
         which c_l was quadratised.
-
-    Returns:
-      The step at which it failed, or -1, and whether all numbers there were finite.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, costate, u, spare = stack(N), stack(N), stack(M), stack(N, W)
@@ -88,9 +85,8 @@ def backward_pass(settings, model, about, work):
       work: SmootherArrays. On return `x_hat` is the smoothed state at 0, where c_0 was quadratised anew, and `x_hats`
         has all smoothed states. The rest is as for `forward_pass`.
 
-    Returns:
-      The step at which it failed, or -1; whether all numbers there were finite; and the negligible cost. If the optimal
-      cost is zero, squares of rounding errors of the constants of the stages' models remain, which cancel.
+    It also returns the negligible cost: if the optimal cost is zero, squares of rounding errors of the constants of the
+    stages' models remain, which cancel.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, x, u, costate = stack(N), stack(N), stack(M), stack(N)
@@ -130,9 +126,6 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
 
     Args:
       guess: Motion. prior: Prior. policy, to_go: written.
-
-    Returns:
-      The step at which it failed, or -1, and whether all numbers there were finite.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, x, x_hat, u = stack(N), stack(N), stack(N), stack(M)
@@ -174,7 +167,7 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
       ahead: NextStep. convex: as in `noise_quadratic`. stage: QuadraticStage, written.
     """
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
-    value = cost_quadratic(x, u, t, model.stage, hessian, gradient)
+    value = cost_of_order(x, u, t, model.stage, 0.0, hessian, gradient)
     if NOISY:
         value += noise_quadratic(x, u, t, model.noise, ahead, convex, stage)
     if t > 0:
@@ -197,15 +190,14 @@ def add_square(i, weight, error, hessian, gradient):
 def final_model(x, steps, model, to_go):
     """Write the cost-to-go at T: c_l quadratised at x, Eq. (31)."""
     hessian, gradient, none = stack(W, W), stack(W), zeros(M)
-    value = cost_quadratic(x, none, steps, model.final, hessian, gradient)
+    value = cost_of_order(x, none, steps, model.final, 0.0, hessian, gradient)
     to_go.constant[steps] = end_model(hessian, gradient, value, x, to_go.hessian[steps], to_go.gradient[steps])
 
 
 def initial_model(x, fixed, model, about, to_go, to_come):
-    """Write the cost-to-come at 0: c_0 quadratised at x, Eq. (23), or the cost-to-come of a fixed start.
+    """Write the cost-to-come at 0: c_0 quadratised at x, Eq. (23), or that of a fixed start.
 
-    Returns:
-      Whether it exists, and the constant of c_0's model about the origin.
+    Returns whether it exists, and the constant of c_0's model about the origin.
     """
     hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), zeros(M)
     if fixed:
@@ -213,7 +205,7 @@ def initial_model(x, fixed, model, about, to_go, to_come):
         copy(x, N, to_come.vector[0])
         to_come.constant[0] = 0.0
         return True, 0.0
-    value = cost_quadratic(x, none, 0, model.initial, hessian, gradient)
+    value = cost_of_order(x, none, 0, model.initial, 0.0, hessian, gradient)
     if about.damping > 0:
         for i in range(N):
             value += add_square(i, about.damping * hessian[i, i], x[i] - about.plan.states[0, i], hessian, gradient)

@@ -48,66 +48,44 @@ class Limits(NamedTuple):
 
 
 class DynamicsModel(NamedTuple):
-    """Addresses of the functions of the dynamics, and their parameters (any,).
-
-    `step_curvature` is the address of a step's second derivatives; 0 if they vanish or are not needed. `all_steps` is
-    that of all steps of a plan; 0 if there is only one step at a time.
-    """
+    """Addresses of the functions of the dynamics, and their parameters."""
 
     advance: float
     step_jacobian: float
-    step_curvature: float
-    all_steps: float
+    step_curvature: float  # second derivatives of a step; 0 if they vanish or are not needed
+    all_steps: float  # of all steps of a plan; 0 if there is only one step at a time
     parameters: Arrays
 
 
 class Constraints(NamedTuple):
-    """The constraints that act on a cost.
+    """The constraints that act on a cost."""
 
-    Attributes:
-      functions: (C, 5) addresses of each constraint's functions, and 1 if it uses the control; see
-        `model_functions.py`.
-      data, multipliers: a vector for each; see `augmented_lagrangian.py`.
-      size: C.
-    """
-
-    functions: Arrays
-    data: Any
+    functions: Arrays  # (C, 5) addresses of functions, and 1 if it uses the control; see `model_functions.py`
+    data: Any  # a vector for each, as are the multipliers; see `augmented_lagrangian.py`
     multipliers: Any
-    size: int
+    size: int  # C
 
 
 class CostModel(NamedTuple):
-    """A cost as the sum of its terms, and the constraints that act with it.
+    """A cost as the sum of its terms, and the constraints that act with it."""
 
-    Attributes:
-      functions: (K, 2) addresses of each term's value and derivatives; terms that may be indefinite come first.
-      data: a vector for each term. size: K. indefinite: number of terms that may be indefinite.
-      project: address of the projection of the sum of these terms; 0 if there are none.
-    """
-
-    functions: Arrays
-    data: Any
-    size: int
-    indefinite: int
-    project: float
+    functions: Arrays  # (K, 2) addresses of each term's value and derivatives; those that may be indefinite come first
+    data: Any  # a vector for each term
+    size: int  # K
+    indefinite: int  # number of terms that may be indefinite
+    project: float  # address of the projection of the sum of these terms; 0 if there are none
     constraints: Constraints
 
 
 class NoiseModel(NamedTuple):
-    """Noise: addresses of its functions, and what they read.
-
-    Attributes:
-      data: (any,). risk: (3,) the risk; 1 if it was too high; and 1 if a given cost-to-go weighs the noise.
-      hessian, gradient: (T+1, N, N) and (T+1, N), that cost-to-go; see `SolveRun.weigh_noise`.
-    """
+    """Noise: addresses of its functions, and what they read."""
 
     value: float
     quadratic: float
     data: Arrays
-    risk: Arrays
-    hessian: Arrays
-    gradient: Arrays
+    risk: Arrays  # (3,) the risk; 1 if it was too high; and 1 if a given cost-to-go weighs the noise:
+    hessian: Arrays  # (T+1, N, N); see `SolveRun.weigh_noise`
+    gradient: Arrays  # (T+1, N)
 
 
 class ProblemModel(NamedTuple):
@@ -174,32 +152,25 @@ class Prior(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """The points about which a pass linearises: a fraction `reach` of the way from the plan to the smoothed states.
-
-    With `guided`, the forward pass linearises about the plan. `damping` weighs changes of the controls, relative to the
-    control's own curvature.
-    """
+    """The points about which a pass linearises: a fraction `reach` of the way from the plan to the smoothed states."""
 
     plan: Motion
-    guided: bool
+    guided: bool  # whether the forward pass linearises about the plan
     reach: float
-    damping: float
+    damping: float  # weight on changes of the controls, relative to the control's own curvature
     prior: Prior
 
 
 class ModelOrder(NamedTuple):
     """The models of a pass about a plan.
 
-    Attributes:
-      damping: weight on changes of the controls.
-      share: fraction of the second-order terms: 0 for iLQR's models, with projected costs and linearised dynamics; 1
-        for Newton's, with true Hessians of the costs, and Hessians of the dynamics times the costate.
-      known: the cost-to-go that weighs noise, if `share` is above 0.
+    The share of second-order terms is 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
+    Newton's, with true Hessians of the costs, and Hessians of the dynamics times the costate.
     """
 
-    damping: float
+    damping: float  # weight on changes of the controls
     share: float
-    known: CostToGo
+    known: CostToGo  # that which weighs noise, if `share` is above 0
 
 
 class LinearStep(NamedTuple):
@@ -210,14 +181,12 @@ class LinearStep(NamedTuple):
 
 
 class NextStep(NamedTuple):
-    """The rest of the problem after a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there,
-    Hessian (N, N) and gradient at the origin (N,).
-    """
+    """The rest of the problem after a step."""
 
-    jacobian: Arrays
-    arrived: Arrays
-    hessian: Arrays
-    gradient: Arrays
+    jacobian: Arrays  # [A B] (N, W)
+    arrived: Arrays  # (N,) the next state
+    hessian: Arrays  # (N, N) of the cost-to-go there
+    gradient: Arrays  # (N,) at the origin
 
 
 class QuadraticStage(NamedTuple):
@@ -236,263 +205,180 @@ class WeightedStep(NamedTuple):
 
 
 class StageModels(NamedTuple):
-    """Models of all stages at a plan, which need not satisfy the dynamics.
+    """Models of all stages at a plan, which need not satisfy the dynamics."""
 
-    Attributes:
-      hessian: of the Lagrangian. convex: of the cost alone, projected. gradient: of the cost.
-      jacobian: of the steps. arrived: next states. slopes: gradients of the rows.
-      learned: what secants say that the Hessians lack; see `secants.py`.
-    """
-
-    hessian: Annotated[Arrays, "T+1 W W"]
-    convex: Annotated[Arrays, "T+1 W W"]
-    gradient: Annotated[Arrays, "T+1 W"]
+    hessian: Annotated[Arrays, "T+1 W W"]  # of the Lagrangian
+    convex: Annotated[Arrays, "T+1 W W"]  # of the cost alone, projected
+    gradient: Annotated[Arrays, "T+1 W"]  # of the cost
     jacobian: Annotated[Arrays, "T N W"]
-    arrived: Annotated[Arrays, "T N"]
-    slopes: Annotated[Arrays, "K W"]
-    learned: Annotated[Arrays, "T+1 W W"]
+    arrived: Annotated[Arrays, "T N"]  # next states
+    slopes: Annotated[Arrays, "K W"]  # gradients of the rows
+    learned: Annotated[Arrays, "T+1 W W"]  # what secants say that the Hessians lack; see `secants.py`
 
 
 class StageRows(NamedTuple):
-    """The rows of all constraints, then those of the control limits, R at each step.
+    """The rows of all constraints, then those of the control limits, R at each step."""
 
-    Attributes:
-      size: R.
-      limits: for rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and its value.
-        For rows of constraints: the distance between their bounds, and whether they are linear.
-      first: the first row of each constraint, of C. support: 0 where a row does not depend on that entry.
-      acts, live: 1 for rows that can act, and for those that do at the plan, else 0.
-      held: what rows do in an active set; see `active_set.py`.
-      kinds: INEQUALITY, LIMIT or EQUALITY. sizes: typical sizes. targets: the values at which rows are held.
-      prices: the largest multipliers, infinite unless the row is elastic.
-      numbers: values. force: multipliers.
-    """
-
-    size: int
+    size: int  # R
+    # For rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and its value. For
+    # rows of constraints: the distance between their bounds, and whether they are linear.
     limits: Annotated[Arrays, "R 5"]
-    first: Annotated[Arrays, "C"]
-    support: Annotated[Arrays, "R W"]
-    acts: Annotated[Arrays, "K"]
-    live: Annotated[Arrays, "K"]
-    held: Annotated[Arrays, "K"]
-    kinds: Annotated[Arrays, "K"]
-    sizes: Annotated[Arrays, "K"]
-    targets: Annotated[Arrays, "K"]
-    prices: Annotated[Arrays, "K"]
-    numbers: Annotated[Arrays, "K"]
-    force: Annotated[Arrays, "K"]
+    first: Annotated[Arrays, "C"]  # the first row of each constraint
+    support: Annotated[Arrays, "R W"]  # 0 where a row does not depend on that entry
+    acts: Annotated[Arrays, "K"]  # 1 for rows that can act, else 0
+    live: Annotated[Arrays, "K"]  # 1 for those that do at the plan
+    held: Annotated[Arrays, "K"]  # what rows do in an active set; see `active_set.py`
+    kinds: Annotated[Arrays, "K"]  # INEQUALITY, LIMIT or EQUALITY
+    sizes: Annotated[Arrays, "K"]  # typical sizes
+    targets: Annotated[Arrays, "K"]  # the values at which rows are held
+    prices: Annotated[Arrays, "K"]  # the largest multipliers, infinite unless the row is elastic
+    numbers: Annotated[Arrays, "K"]  # values
+    force: Annotated[Arrays, "K"]  # multipliers
 
 
 class PlanStages(NamedTuple):
-    """A problem as stages about a plan: its numbers, its models and rows, and the last step.
+    """A problem as stages about a plan: its numbers, its models and rows, and the last step."""
 
-    Attributes:
-      steps: T. soft: 1 if there is an initial cost. free: 0 for the states that the start fixes, else 1.
-      jumps: 1 at the knots at which the last state is free again, as the start is: it may jump there. At the start,
-        whether there are any. reset: the law of its change there.
-      reach: distances from the start to the goal. state_size, control_size: typical sizes.
-      projected: 1 if the projected Hessians are those of the last plan.
-      keeps: 1 if models of a plan keep the derivatives of the dynamics that are there.
-      learns: 1 if the dynamics have no second derivatives. slow: 1 if the Hessians have what is learned of them.
-      values: a vector for each constraint.
-      policy, to_go, changes: see `direction` of `stages.py`.
-    """
-
-    steps: int
-    soft: int
-    free: Annotated[Arrays, "N"]
-    jumps: Annotated[Arrays, "T+1"]
-    reset: Annotated[Arrays, "T+1 N+1"]
-    reach: Annotated[Arrays, "N"]
-    state_size: Annotated[Arrays, "N"]
+    steps: int  # T
+    soft: int  # 1 if there is an initial cost
+    free: Annotated[Arrays, "N"]  # 0 for the states that the start fixes, else 1
+    jumps: Annotated[Arrays, "T+1"]  # 1 where the last state is free, and may jump; at the start, if there are any
+    reset: Annotated[Arrays, "T+1 N+1"]  # the law of its change there
+    reach: Annotated[Arrays, "N"]  # distances from the start to the goal
+    state_size: Annotated[Arrays, "N"]  # typical sizes
     control_size: Annotated[Arrays, "M"]
-    projected: Annotated[Arrays, "1"]
-    keeps: Annotated[Arrays, "1"]
-    learns: int
-    slow: Annotated[Arrays, "1"]
+    projected: Annotated[Arrays, "1"]  # 1 if the projected Hessians are those of the last plan
+    keeps: Annotated[Arrays, "1"]  # 1 if models of a plan keep the derivatives of the dynamics that are there
+    learns: int  # 1 if the dynamics have no second derivatives
+    slow: Annotated[Arrays, "1"]  # 1 if the Hessians have what is learned of these
     model: ProblemModel
-    values: Any
+    values: Any  # a vector for each constraint
     rows: StageRows
     models: StageModels
-    policy: Policy
+    policy: Policy  # this and the next two: see `direction` of `stages.py`
     to_go: CostToGo
     changes: Motion
 
 
 class ActiveSetArrays(NamedTuple):
-    """All arrays of an active set.
+    """All arrays of an active set."""
 
-    Attributes:
-      plan: the iterate. costates, gaps: there. out, limits: of its rollout.
-      curves, forces: see `direction` of `stages.py`. pressing: multipliers after a step.
-      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
-      before, chosen: the rows that were held before the step, and that convex models choose.
-    """
-
-    plan: Motion
+    plan: Motion  # the iterate
     costates: Annotated[Arrays, "T+1 N"]
     gaps: Annotated[Arrays, "T N"]
-    out: Motion
+    out: Motion  # its rollout, within these limits
     limits: Annotated[Limits, "T M"]
-    curves: Annotated[Arrays, "K"]
+    curves: Annotated[Arrays, "K"]  # this and the next: see `direction` of `stages.py`
     forces: Annotated[Arrays, "K"]
-    pressing: Annotated[Arrays, "K"]
-    wrong: Annotated[Arrays, "K"]
-    before: Annotated[Arrays, "K"]
-    chosen: Annotated[Arrays, "K"]
-
-
-class Slacks(NamedTuple):
-    """The two slacks of each row d, or numbers that belong to these: `d = slack - excess`.
-
-    A row without a price has no excess, and an equality without a price has neither.
-    """
-
-    slack: Annotated[Arrays, "K"]
-    excess: Annotated[Arrays, "K"]
+    pressing: Annotated[Arrays, "K"]  # multipliers after a step
+    wrong: Annotated[Arrays, "K"]  # relative distance of a row on the wrong side after a step, negative; else 0
+    before: Annotated[Arrays, "K"]  # the rows that were held before the step
+    chosen: Annotated[Arrays, "K"]  # those that convex models choose
 
 
 class PlanPoint(NamedTuple):
-    """A plan, the states at which its steps arrive, the values of its rows, and their slacks."""
+    """A plan, the states at which its steps arrive, the values of its rows, and the slacks of their two sides."""
 
     plan: Motion
     arrived: Annotated[Arrays, "T N"]
     numbers: Annotated[Arrays, "K"]
-    slacks: Slacks
+    slacks: Annotated[Arrays, "K 2"]
 
 
 class PlanStep(NamedTuple):
     """A step in plan, slacks and multipliers, and the costates after it."""
 
     changes: Motion
-    slacks: Slacks
+    slacks: Annotated[Arrays, "K 2"]
     force: Annotated[Arrays, "K"]
     costates: Annotated[Arrays, "T+1 N"]
 
 
 class PlanBeginning(NamedTuple):
-    """What an interior point begins with.
+    """What an interior point begins with."""
 
-    Attributes:
-      plan: within the limits of its controls. known: ((T+1) size,) multipliers. informed: whether these are known.
-      barrier: the first barrier parameter of each row, as a fraction of the cost divided by the number of rows.
-      room: the least first slack, relative to a row's size.
-      oldest: the largest number of steps for which derivatives of the dynamics serve after the step that they are for.
-    """
-
-    plan: Motion
-    known: Arrays
-    informed: bool
-    barrier: float
-    room: float
-    oldest: float
+    plan: Motion  # within the limits of its controls
+    known: Arrays  # (K,) multipliers
+    informed: bool  # whether these are known
+    barrier: float  # the first barrier parameter of each row, as a fraction of the cost divided by the number of rows
+    room: float  # the least first slack, relative to a row's size
+    oldest: float  # most further steps for which derivatives of the dynamics serve
 
 
 class InteriorArrays(NamedTuple):
-    """All arrays of an interior point.
+    """All arrays of an interior point."""
 
-    Attributes:
-      now: the iterate. costates, gaps: there.
-      tried, closer: trials of a line search. kept, kept_force, kept_costates: a point to go back to.
-      step: the step of an iteration. other: another that may take its place.
-      curves, forces: see `direction` of `stages.py`.
-      corrections, others: corrections of the products of slacks and multipliers.
-      beyond: further residuals of the rows. wider: further gaps.
-      moves, turns: the last step, and the change of the Lagrangian's gradients by it.
-      active: the arrays of the crossover to an active set. active_memory: (1,) row of `ACTIVE_SET`.
-      filter: violations and merits that a trial must not both exceed, any number. errors: the last LATELY errors.
-    """
-
-    now: PlanPoint
+    now: PlanPoint  # the iterate
     costates: Annotated[Arrays, "T+1 N"]
     gaps: Annotated[Arrays, "T N"]
-    tried: PlanPoint
+    tried: PlanPoint  # trials of a line search
     closer: PlanPoint
-    kept: PlanPoint
+    kept: PlanPoint  # a point to go back to
     kept_force: Annotated[Arrays, "K"]
     kept_costates: Annotated[Arrays, "T+1 N"]
-    step: PlanStep
-    other: PlanStep
-    curves: Annotated[Arrays, "K"]
+    step: PlanStep  # of an iteration
+    other: PlanStep  # another that may take its place
+    curves: Annotated[Arrays, "K"]  # this and the next: see `direction` of `stages.py`
     forces: Annotated[Arrays, "K"]
-    corrections: Slacks
-    others: Slacks
-    beyond: Annotated[Arrays, "K"]
-    wider: Annotated[Arrays, "T N"]
-    moves: Annotated[Arrays, "T+1 W"]
-    turns: Annotated[Arrays, "T+1 W"]
-    active: ActiveSetArrays
-    active_memory: Arrays
-    filter: Annotated[Arrays, "0 2"]
-    errors: Annotated[Arrays, "LATELY"]
+    corrections: Annotated[Arrays, "K 2"]  # of the products of slacks and multipliers, for both steps
+    others: Annotated[Arrays, "K 2"]
+    beyond: Annotated[Arrays, "K"]  # further residuals of the rows
+    wider: Annotated[Arrays, "T N"]  # further gaps
+    moves: Annotated[Arrays, "T+1 W"]  # the last step
+    turns: Annotated[Arrays, "T+1 W"]  # the change of the Lagrangian's gradients by it
+    active: ActiveSetArrays  # of the crossover
+    active_memory: Arrays  # (1,) row of `ACTIVE_SET`
+    filter: Annotated[Arrays, "0 2"]  # violations and merits that a trial must not both exceed, any number
+    errors: Annotated[Arrays, "LATELY"]  # the last ones
 
 
 class RestorationArrays(NamedTuple):
-    """All arrays of a restoration.
+    """All arrays of a restoration."""
 
-    Attributes:
-      plan: the iterate, a trajectory. trial: of the line search. limits: of the controls in one step.
-      gaps: zero. arrived, numbers: of the trial. curves: see `direction` of `stages.py`.
-      duals, aims: multipliers, and those after the whole step. shares: multipliers relative to the price.
-    """
-
-    plan: Motion
-    trial: Motion
-    limits: Annotated[Limits, "T M"]
+    plan: Motion  # the iterate, a trajectory
+    trial: Motion  # of the line search
+    limits: Annotated[Limits, "T M"]  # of the controls in one step
     costates: Annotated[Arrays, "T+1 N"]
-    gaps: Annotated[Arrays, "T N"]
-    arrived: Annotated[Arrays, "T N"]
+    gaps: Annotated[Arrays, "T N"]  # zero
+    arrived: Annotated[Arrays, "T N"]  # of the trial
     numbers: Annotated[Arrays, "K"]
-    curves: Annotated[Arrays, "K"]
-    duals: Annotated[Arrays, "K"]
-    aims: Annotated[Arrays, "K"]
-    shares: Annotated[Arrays, "K"]
+    curves: Annotated[Arrays, "K"]  # see `direction` of `stages.py`
+    duals: Annotated[Arrays, "K"]  # multipliers
+    aims: Annotated[Arrays, "K"]  # those after the whole step
+    shares: Annotated[Arrays, "K"]  # relative to the price
 
 
 class EliminatedControl(NamedTuple):
-    """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
+    """A step and its stage with the control eliminated by u = w - F x - h, for the dual form."""
 
-    `factor` (M, M) is the Cholesky factor of R, AT (N, N) and BT (M, N) are the step's matrices transposed, Q (N, N)
-    and q (N,) the cost of the state, and `size` (N,) the diagonal of its Hessian before.
-    """
-
-    factor: Arrays
+    factor: Arrays  # (M, M) Cholesky factor of R
     F: Arrays
     h: Arrays
-    AT: Arrays
+    AT: Arrays  # (N, N) and (M, N), the step's matrices transposed
     BT: Arrays
-    Q: Arrays
+    Q: Arrays  # (N, N) and (N,), the cost of the state
     q: Arrays
-    size: Arrays
+    size: Arrays  # (N,) the diagonal of its Hessian before
 
 
 class Descent(NamedTuple):
-    """How steps from a plan are made, accepted and regularised; see `descent.py`.
+    """How steps from a plan are made, accepted and regularised; see `descent.py`."""
 
-    Attributes:
-      method: DAMPED or NEWTON.
-      changes: number of small changes of cost in a row after which the plan is judged; 0 to judge each plan.
-      idle: number of steps in a row that improve by rounding which ends the descent.
-      share: fraction of second-order terms in the first models of a plan. reach: that of the first step.
-      smallest, armijo: the smallest fraction of a step that the line search tries, and the fraction of the predicted
-        decrease that a step must achieve; of models at reach 0 without second-order terms SHORTEST and 0, if `patient`.
-      lightest, factor: the first weight on changes of the controls, for Newton's method relative to the merit and for
-        damped steps to their curvature; and the factor to the next.
-      weights: number of weights that are tried where a pass fails. heaviest: largest weight that is tried where steps
-        are rejected.
-    """
-
-    method: int
-    changes: int
-    idle: float = inf
-    share: float = 0.0
-    reach: float = 0.0
+    method: int  # DAMPED or NEWTON
+    changes: int  # number of small changes of cost in a row after which the plan is judged; 0 to judge each plan
+    idle: float = inf  # number of steps in a row that improve by rounding which ends the descent
+    share: float = 0.0  # fraction of second-order terms in the first models of a plan
+    reach: float = 0.0  # that of the first step
+    # The smallest fraction of a step that the line search tries, and the fraction of the predicted decrease that a step
+    # must achieve; of models at reach 0 without second-order terms SHORTEST and 0, if `patient`.
     smallest: float = 0.0
     armijo: float = 0.0
+    # The first weight on changes of the controls, for Newton's method relative to the merit and for damped steps to
+    # their curvature; and the factor to the next.
     lightest: float = 0.0
     factor: float = 0.0
-    weights: int = 0
-    heaviest: float = 0.0
+    weights: int = 0  # number of weights that are tried where a pass fails
+    heaviest: float = 0.0  # largest weight that is tried where steps are rejected
     patient: bool = True
 
 
@@ -500,74 +386,51 @@ NO_DESCENT = Descent(method=0, changes=0)
 
 
 class IterationSettings(NamedTuple):
-    """Limits of a solve's iterations, and tolerances of convergence.
+    """Limits of a solve's iterations, and tolerances of convergence."""
 
-    Attributes:
-      steps: T. tolerance, gap_tolerance: tolerances of relative changes of cost, and of the gap.
-      optimal: whether a settled cost must also be optimal. fixed: whether the start is given exactly.
-      guided: whether the first iteration linearises about the guess. prior_iterations: number of iterations with the
-        prior.
-      rounding: negligible cost relative to the stages' constants, of which it is left where the least cost is zero.
-      valley: the gap below which Newton's method takes over from smoothing; 0 for never.
-      descent: the steps of a descent.
-    """
-
-    steps: int
+    steps: int  # T
     max_iterations: int
-    tolerance: float
+    tolerance: float  # of relative changes of cost
     gap_tolerance: float
-    optimal: bool
-    fixed: bool
-    guided: bool
-    prior_iterations: int
-    rounding: float
-    valley: float = 0.0
+    optimal: bool  # whether a settled cost must also be optimal
+    fixed: bool  # whether the start is given exactly
+    rounding: float  # negligible cost, relative to the stages' constants that cancel where the least cost is zero
+    guided: bool = False  # whether the first iteration linearises about the guess
+    prior_iterations: int = 0
+    valley: float = 0.0  # the gap below which Newton's method takes over from smoothing; 0 for never
     descent: Descent = NO_DESCENT
 
 
 class SmootherArrays(NamedTuple):
-    """All arrays of a smoother.
-
-    Attributes:
-      start: the first state. x_hat: the smoothed state that a pass has reached. x_hats: all of them.
-      homotopy_scaled: the stage cost of the passes; not the true one in the first iterations of a homotopy.
-      given: the trajectory that guides the first pass. best: the best one so far. last: that of the last policy.
-      certificate: (1,) row of `CERTIFICATE`.
-    """
+    """All arrays of a smoother."""
 
     start: Annotated[Arrays, "N"]
-    x_hat: Annotated[Arrays, "N"]
+    x_hat: Annotated[Arrays, "N"]  # the smoothed state that a pass has reached
     x_hats: Annotated[Arrays, "T+1 N"]
     policy: Policy
     to_go: CostToGo
     to_come: CostToCome
     smoothing: SmootherGains
-    homotopy_scaled: Any
+    homotopy_scaled: Any  # the stage cost of the passes; not the true one in the first iterations of a homotopy
     prior: Prior
-    given: Motion
-    best: Motion
-    last: Motion
+    given: Motion  # what guides the first pass
+    best: Motion  # the best trajectory so far
+    last: Motion  # that of the last policy
     last_policy: Policy
-    certificate: Arrays
+    certificate: Arrays  # (1,) row of `CERTIFICATE`
 
 
 class FilterSizes(NamedTuple):
-    """Sizes of a Kalman filter; see `square_root_filter.py`.
+    """Sizes of a Kalman filter; see `square_root_filter.py`."""
 
-    Attributes:
-      knots: T+1. entries: Z. measured: Y. states: n. disturbing: D, number of columns of the process noise's root.
-      used: whether the filter begins after the first measurement.
-      resolution, nothing: the least noise of a measurement, relative to its std and absolute.
-    """
-
-    knots: int
-    entries: int
-    measured: int
-    states: int
-    disturbing: int
-    used: bool
-    resolution: float
-    nothing: float
+    knots: int  # T+1
+    entries: int  # Z
+    measured: int  # Y
+    states: int  # n
+    disturbing: int  # D, columns of the process noise's root
+    used: bool  # whether the filter begins after the first measurement
+    resolution: float  # the least noise of a measurement, relative to its std
+    nothing: float  # the same, absolute
 
 
 class FilterModel(NamedTuple):
@@ -580,173 +443,113 @@ class FilterModel(NamedTuple):
 
 
 class FilterRoots(NamedTuple):
-    """Square roots of a Kalman filter's covariances; the first is given, the others are written.
+    """Square roots of a Kalman filter's covariances; the first is given, the others are written."""
 
-    Attributes:
-      root: (Z, Z) at the start; overwritten. before, after: before and after each measurement, (T+1, Z, Z).
-      innovation: S, (T+1, Y, Y). learned: K S, (T+1, Z, Y). work: ((Y+Z) (n+Y+Z),) and at least (Z (Z+D),).
-    """
-
-    root: Arrays
-    before: Arrays
-    after: Arrays
-    innovation: Arrays
-    learned: Arrays
-    work: Arrays
+    root: Annotated[Arrays, "Z Z"]  # at the start; overwritten
+    before: Annotated[Arrays, "T+1 Z Z"]  # each measurement
+    after: Annotated[Arrays, "T+1 Z Z"]
+    innovation: Annotated[Arrays, "T+1 Y Y"]  # S
+    learned: Annotated[Arrays, "T+1 Z Y"]  # K S
+    work: Arrays  # ((Y+Z) (n+Y+Z),) and at least (Z (Z+D),)
 
 
 class LoopSizes(NamedTuple):
-    """Sizes of C laws in L systems; see `loop_moments.py`.
+    """Sizes of C laws in L systems; see `loop_moments.py`."""
 
-    Attributes:
-      steps: T. systems: L. laws: C. moved: Y. entries: X. controls: m. shown: number of entries of y whose moments are
-        written.
-      stated: number of the first entries of y that are the system's own. With losses, the last m of these are the
-        actuators' states.
-      rows, columns: of the noise.
-      correlated: whether noise of the commands is correlated with that of y. lossy: whether commands get lost.
-      lost: number of lost commands for each that arrives.
-    """
-
-    steps: int
-    systems: int
-    laws: int
-    moved: int
-    entries: int
-    controls: int
-    shown: int
-    stated: int
-    rows: int
+    steps: int  # T
+    systems: int  # L
+    laws: int  # C
+    moved: int  # Y
+    entries: int  # X
+    controls: int  # m
+    shown: int  # number of entries of y whose moments are written
+    stated: int  # first of y that are the system's own; with losses, the last m of these are the actuators' states
+    rows: int  # of the noise, and its columns
     columns: int
-    correlated: bool
-    lossy: bool
-    lost: float
+    correlated: bool  # whether noise of the commands is correlated with that of y
+    lossy: bool  # whether commands get lost
+    lost: float  # number of lost commands for each that arrives
 
 
 class LoopArrays(NamedTuple):
     """The loops y' = F X + G' (u - planned) + c + w under the commands K X + command + r, which are limited to u.
 
     X = (y, d) are Y numbers that commands move, and X - Y that they do not.
-
-    Attributes:
-      F: (T, L, Y, X). G: (T, L, m, Y). c: (T, L, Y).
-      noise: covariance of the first entries of y with the first entries of X: at the start, and then of w, (T+1, L,
-        rows, columns).
-      fresh: covariance of d at the start, and then of its noise, (T+1, L, X - Y, X - Y).
-      transition: d' is this times d and noise, (X - Y, X - Y).
-      K: (T, C, m, X). command: (T, C, m). planned: (T, m).
-      shaking: covariance of r, (T, C, m, m). jointly: covariance of r with w, (T, C, m, Y); empty if it is zero.
-      reached: nominal actuators' states, (T+1, L, m). low, high: limits of the controls, (m,).
     """
 
-    F: Arrays
-    G: Arrays
-    c: Arrays
-    noise: Arrays
-    fresh: Arrays
-    transition: Arrays
-    K: Arrays
-    command: Arrays
-    planned: Arrays
-    shaking: Arrays
-    jointly: Arrays
-    reached: Arrays
-    low: Arrays
+    F: Arrays  # (T, L, Y, X)
+    G: Arrays  # (T, L, m, Y)
+    c: Arrays  # (T, L, Y)
+    noise: Arrays  # (T+1, L, rows, columns), covariance of the first of y with those of X: at the start, then of w
+    fresh: Arrays  # (T+1, L, X - Y, X - Y), covariance of d at the start, and then of its noise
+    transition: Arrays  # (X - Y, X - Y): d' is this times d and noise
+    K: Arrays  # (T, C, m, X)
+    command: Arrays  # (T, C, m)
+    planned: Arrays  # (T, m)
+    shaking: Arrays  # (T, C, m, m), covariance of r
+    jointly: Arrays  # (T, C, m, Y), covariance of r with w; empty if it is zero
+    reached: Arrays  # (T+1, L, m), nominal actuators' states
+    low: Arrays  # (m,), limits of the controls
     high: Arrays
 
 
 class LoopWork(NamedTuple):
-    """Work arrays of closed loops.
+    """Work arrays of closed loops; R is X - Y."""
 
-    Attributes:
-      P: covariance of X, (L, C, X, X). M: of X' = M X and noise, (L, C, X, X). moved: M P for y alone, (L, C, Y, X).
-      given: covariance of d, (L, X - Y, X - Y). half: the transition times it, (X - Y, X - Y).
-      mean: of y, (L, C, Y). ahead: of y at the next knot, (Y,).
-      response: K P, (L, C, m, X). law: K times the slopes, (L, C, m, X).
-      pushed, shaken, held: G times the noise of the commands, their correlation with w, and G times the change by
-        a loss, (L, C, m, Y).
-      slope, level, left: of the limited commands, (L, C, m).
-    """
-
-    P: Arrays
-    M: Arrays
-    moved: Arrays
-    given: Arrays
-    half: Arrays
-    mean: Arrays
-    ahead: Arrays
-    response: Arrays
-    law: Arrays
-    pushed: Arrays
-    shaken: Arrays
-    held: Arrays
-    slope: Arrays
-    level: Arrays
-    left: Arrays
+    P: Annotated[Arrays, "L C X X"]  # covariance of X
+    M: Annotated[Arrays, "L C X X"]  # of X' = M X and noise
+    moved: Annotated[Arrays, "L C Y X"]  # M P for y alone
+    given: Annotated[Arrays, "L R R"]  # covariance of d
+    half: Annotated[Arrays, "R R"]  # the transition times it
+    mean: Annotated[Arrays, "L C Y"]  # of y
+    ahead: Annotated[Arrays, "Y"]  # of y at the next knot
+    response: Annotated[Arrays, "L C m X"]  # K P
+    law: Annotated[Arrays, "L C m X"]  # K times the slopes
+    pushed: Annotated[Arrays, "L C m Y"]  # G times the noise of the commands
+    shaken: Annotated[Arrays, "L C m Y"]  # their correlation with w
+    held: Annotated[Arrays, "L C m Y"]  # G times the change by a loss
+    slope: Annotated[Arrays, "L C m"]  # of the limited commands, as are the next two
+    level: Annotated[Arrays, "L C m"]
+    left: Annotated[Arrays, "L C m"]
 
 
 class LoopMoments(NamedTuple):
-    """Moments of the first N entries of y about the plan; of several loops, by axes before these or after that of time.
+    """Moments of the first N entries of y about the plan; L and C come first, are missing, or come after the time."""
 
-    Attributes:
-      mean: mean of y, (T+1, N).
-      covariance: covariance of y, (T+1, N, N).
-      across: covariance of y with y at the previous knot, (T, N, N).
-      command: standard deviation of each command, before it is limited, (T, m).
-      saturation: fraction of the commands that are beyond the limits, (T, m).
-    """
-
-    mean: Arrays
-    covariance: Arrays
-    across: Arrays
-    command: Arrays
-    saturation: Arrays
+    mean: Annotated[Arrays, "T+1 L C N"]
+    covariance: Annotated[Arrays, "T+1 L C N N"]
+    across: Annotated[Arrays, "T L C N N"]  # covariance with y at the previous knot
+    command: Annotated[Arrays, "T L C m"]  # standard deviation of each command, before it is limited
+    saturation: Annotated[Arrays, "T L C m"]  # fraction of the commands that are beyond the limits
 
 
 class PassSizes(NamedTuple):
-    """Sizes of the backward pass of C tracking laws; see `tracking_law.py`.
+    """Sizes of the backward pass of C tracking laws; see `tracking_law.py`."""
 
-    Attributes:
-      laws: C. moved: Y, the states that controls move. entries: Z, of z = (y, d). controls: m.
-      lost: fraction of the commands that get lost. The last m of y are then the actuators' states.
-    """
-
-    laws: int
-    moved: int
-    entries: int
-    controls: int
-    lost: float
+    laws: int  # C
+    moved: int  # Y, the states that controls move
+    entries: int  # Z, of z = (y, d)
+    controls: int  # m
+    lost: float  # fraction of the commands that get lost; the last m of y are then the actuators' states
 
 
 class PassArrays(NamedTuple):
-    """What tracking laws are of, by columns for (y, d, 1).
+    """What tracking laws are of, by columns for (y, d, 1)."""
 
-    Attributes:
-      control: diagonal of R, (m,). state: diagonals of Q, (C, Y).
-      undo: R times the controls that cancel the unknowns, (T, C, m, Z+1). held: a lost command, (T, m, Z+1).
-      laws: the laws, written, (T, C, m, Z+1).
-    """
-
-    control: Arrays
-    state: Arrays
-    undo: Arrays
-    held: Arrays
-    laws: Arrays
+    control: Arrays  # (m,) diagonal of R
+    state: Arrays  # (C, Y) diagonals of Q
+    undo: Arrays  # (T, C, m, Z+1) R times the controls that cancel the unknowns
+    held: Arrays  # (T, m, Z+1) a lost command
+    laws: Arrays  # (T, C, m, Z+1), written
 
 
 class PassWork(NamedTuple):
-    """Work arrays of the backward pass.
+    """Work arrays of the backward pass."""
 
-    Attributes:
-      cost: the cost-to-go (S, D, s), (C, Y, Z+1).
-      products: [F G]' (S [F E c G] + (0, D, s, 0)), (C, Y+m, Z+1+m).
-      curve: R + G'SG, then its elimination, (C, m, m). mean: a mean of laws, (m, Z+1).
-    """
-
-    cost: Arrays
-    products: Arrays
-    curve: Arrays
-    mean: Arrays
+    cost: Arrays  # (C, Y, Z+1) the cost-to-go (S, D, s)
+    products: Arrays  # (C, Y+m, Z+1+m): [F G]' (S [F E c G] + (0, D, s, 0))
+    curve: Arrays  # (C, m, m): R + G'SG, then its elimination
+    mean: Arrays  # (m, Z+1), of laws
 
 
 class RiccatiArrays(NamedTuple):
@@ -760,21 +563,14 @@ class RiccatiArrays(NamedTuple):
 
 
 class Predictor(NamedTuple):
-    """The model that predicts estimates over a control period; see `estimation.py`.
-
-    Attributes:
-      dynamics, dt: as in `ProblemModel`. places: (P,) indices of the unknown parameters.
-      lag: (2,) remaining fraction of the difference to a command at the end of a period, and on average over the
-        period.
-      transition: (D, D), for the unknowns' states. output: (V, D), from these to the unknowns.
-    """
+    """The model that predicts estimates over a control period; see `estimation.py`."""
 
     dynamics: DynamicsModel
     dt: float
-    places: Arrays
-    lag: Arrays
-    transition: Arrays
-    output: Arrays
+    places: Arrays  # (P,) indices of the unknown parameters
+    lag: Arrays  # (2,) what is left of the difference to a command at the end of a period, and on average over it
+    transition: Arrays  # (D, D), for the unknowns' states
+    output: Arrays  # (V, D), from these to the unknowns
 
 
 class SensorModel(NamedTuple):
@@ -793,13 +589,11 @@ class Measurements(NamedTuple):
 
 
 class AngularStates(NamedTuple):
-    """Indices (any,) of the angles; of rotation vectors (any, 2) the index, and which entry is an angle, or -1; and
-    their numbers.
-    """
+    """The states that are turned to the nearest, with the numbers of either kind."""
 
-    angles: Arrays
+    angles: Arrays  # indices
     angle_count: int
-    rotations: Arrays
+    rotations: Arrays  # (any, 2): of rotation vectors the index, and which entry is an angle, or -1
     rotation_count: int
 
 

@@ -67,9 +67,8 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
       keep: 1 to write all steps; 0 to overwrite a single step, if only the predicted decrease is needed.
       policy: relative to the plan, written. to_go: about the origin, written.
 
-    Returns:
-      The step at which it failed, or -1; whether all numbers there were finite; and the decrease of cost that the model
-      predicts, without what is only rounding: of an optimal cost of zero nothing else is left.
+    It also returns the decrease of cost that the model predicts, without what is only rounding: of an optimal cost of
+    zero nothing else is left.
     """
     share, stage, arrived, weights = order.share, QuadraticStage(stack(W, W), stack(W)), stack(N), stack(N)
     jacobian, none, no_change = stack(N, W), zeros(M), zeros(N)
@@ -192,14 +191,12 @@ def larger(a, b):
 def line_search(steps, shift, work, model, bound, slope, smallest, trial):
     """Try fractions 1, 1/2, 1/4, ... of a step until the merit is below `bound` by that fraction of `slope`.
 
-    The merit is the true cost, with noise its expectation, plus the augmented Lagrangian's terms.
+    The merit is the true cost, with noise its expectation, plus the augmented Lagrangian's terms. Returns merit, cost
+    and fraction; or `bound`, `bound` and 0 if no fraction down to `smallest` is accepted.
 
     Args:
       shift: (N,) shift of the start. work: its policy contains the changes of the controls, about its plan.
-      smallest: smallest fraction. trial: Motion, written.
-
-    Returns:
-      The merit, the cost, and the fraction; or `bound`, `bound` and 0 if no fraction down to `smallest` is accepted.
+      trial: Motion, written.
     """
     fraction, plan, policy = 1.0, work.best, work.policy
     while fraction >= smallest:

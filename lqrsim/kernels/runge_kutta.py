@@ -1,9 +1,13 @@
-"""One Runge-Kutta step with the control held, and its Jacobian.
+"""One Runge-Kutta step with the control held, its Jacobian and its curvature.
 
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """
 
-from lqrsim.kernels.declarations import M, N, W, compact, rate, rate_jacobian, stack, zeros
+from lqrsim.kernels.declarations import M, N, W, compact, rate, rate_curvature, rate_jacobian, stack, zeros
+
+SUPPORT = (0,)  # entries of (x, u) in which the rates are nonlinear, states first
+K = 1  # their number
+STATES = 1  # the number of states among them
 
 
 def advance(x, u, p, h, out):
@@ -89,3 +93,105 @@ def state_jacobians(count, states, controls, p, slopes):
     for t in range(count):
         k, fu = stack(N), zeros(N, M)
         rate_jacobian(states[t], controls[t], p, k, slopes[t], fu)
+
+
+# The Hessian of a step times weights, for rates with second derivatives. A sweep backwards through the stages turns the
+# weights of the next state into weights of each stage's rates. The Hessian of the weighted rates at a stage is then
+# pulled back to the step's state and control by the Jacobian of the stage.
+
+
+def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
+    """Write a step and its Jacobian as above; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W).
+
+    Args:
+      weights: (N,). out: (N,). jacobian: [A B] (N, W). hessian: (W, W).
+    """
+    k, z2, z3, z4, curve = stack(N), stack(N), stack(N), stack(N), zeros(K, K)
+    fu, fx1, fx2, fx3, fx4 = zeros(N, M), zeros(N, N), zeros(N, N), zeros(N, N), zeros(N, N)
+    slope1, slope2, slope3, slope4 = stack(N, W), stack(N, W), stack(N, W), stack(N, W)
+    w1, w2, w3, w4 = stack(N), stack(N), stack(N), stack(N)
+    rate_jacobian(x, u, p, k, fx1, fu)
+    for i in range(N):
+        out[i] = k[i]
+        z2[i] = x[i] + 0.5 * h * k[i]
+        for j in range(N):
+            slope1[i, j] = fx1[i, j]
+        for j in range(M):
+            slope1[i, N + j] = fu[i, j]
+    rate_jacobian(z2, u, p, k, fx2, fu)
+    chain(fx2, fu, slope1, 0.5 * h, slope2)
+    for i in range(N):
+        out[i] += 2 * k[i]
+        z3[i] = x[i] + 0.5 * h * k[i]
+    rate_jacobian(z3, u, p, k, fx3, fu)
+    chain(fx3, fu, slope2, 0.5 * h, slope3)
+    for i in range(N):
+        out[i] += 2 * k[i]
+        z4[i] = x[i] + h * k[i]
+    rate_jacobian(z4, u, p, k, fx4, fu)
+    chain(fx4, fu, slope3, h, slope4)
+    for i in range(N):
+        out[i] = x[i] + h / 6 * (out[i] + k[i])
+        w4[i] = h / 6 * weights[i]
+        for j in range(W):
+            jacobian[i, j] = h / 6 * (slope1[i, j] + 2 * slope2[i, j] + 2 * slope3[i, j] + slope4[i, j])
+        jacobian[i, i] += 1
+    back(fx4, w4, h, h / 3, weights, w3)
+    back(fx3, w3, 0.5 * h, h / 3, weights, w2)
+    back(fx2, w2, 0.5 * h, h / 6, weights, w1)
+    whole_curvature(x, u, p, w1, curve)
+    for a in range(K):
+        for b in range(K):
+            hessian[SUPPORT[a], SUPPORT[b]] += curve[a, b]
+    add_curvature(z2, u, p, w2, 0.5 * h, slope1, hessian)
+    add_curvature(z3, u, p, w3, 0.5 * h, slope2, hessian)
+    add_curvature(z4, u, p, w4, h, slope3, hessian)
+
+
+def back(fx, after, ahead, share, weights, before):
+    """Write the weights (N,) of a stage's rates, given the next stage's weights."""
+    for j in range(N):
+        total = 0.0
+        for i in range(N):
+            total += fx[i, j] * after[i]
+        before[j] = share * weights[j] + ahead * total
+
+
+def whole_curvature(x, u, p, w, curve):
+    """Write the second derivatives of the weighted rates, (K, K), on both sides of the diagonal."""
+    rate_curvature(x, u, p, w, curve)
+    for a in range(K):
+        for b in range(a):
+            curve[b, a] = curve[a, b]
+
+
+def add_curvature(z, u, p, weights, ahead, slope, total):
+    """Add the Hessian (W, W) of the weighted rates at a stage with state `x + ahead k`; `slope` (N, W) is k's."""
+    curve, rows, product = zeros(K, K), stack(STATES + 1, W), stack(K, W)
+    line = stack(W)  # a local array, not a row of a matrix, stays in registers
+    whole_curvature(z, u, p, weights, curve)
+    for a in range(STATES):
+        for j in range(W):
+            rows[a, j] = ahead * slope[SUPPORT[a], j]
+        rows[a, SUPPORT[a]] += 1
+    for a in range(K):
+        for j in range(W):
+            line[j] = 0.0
+        for b in range(STATES):
+            for j in range(W):
+                line[j] += curve[a, b] * rows[b, j]
+        for b in range(STATES, K):  # controls are held: their rows are the identity's
+            line[SUPPORT[b]] += curve[a, b]
+        for j in range(W):
+            product[a, j] = line[j]
+    for i in range(W):
+        for j in range(W):
+            line[j] = total[i, j]
+        for a in range(STATES):
+            for j in range(W):
+                line[j] += rows[a, i] * product[a, j]
+        for j in range(W):
+            total[i, j] = line[j]
+    for a in range(STATES, K):
+        for j in range(W):
+            total[SUPPORT[a], j] += product[a, j]

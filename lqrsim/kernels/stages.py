@@ -27,7 +27,6 @@ from lqrsim.kernels.model_functions import (
     advance_all,
     all_steps_second_order,
     cost_of_order,
-    cost_quadratic,
     cost_value,
     evaluate_constraints,
     slope_of_constraint,
@@ -121,13 +120,11 @@ def project(stages, plan):
         return
     gradient, none, hessian, model, convex = stack(W), zeros(M), stack(W, W), stages.model, stages.models.convex
     for t in range(stages.steps):
-        cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, convex[t], gradient)
-    cost_quadratic(plan.states[stages.steps], none, stages.steps, model.final, convex[stages.steps], gradient)
+        cost_of_order(plan.states[t], plan.controls[t], t, model.stage, 0.0, convex[t], gradient)
+    cost_of_order(plan.states[stages.steps], none, stages.steps, model.final, 0.0, convex[stages.steps], gradient)
     if stages.soft == 1:
-        cost_quadratic(plan.states[0], none, 0, model.initial, hessian, gradient)
-        for i in range(N):
-            for j in range(N):
-                convex[0, i, j] += hessian[i, j]
+        cost_of_order(plan.states[0], none, 0, model.initial, 0.0, hessian, gradient)
+        add_matrix(hessian, N, convex[0])
     stages.projected[0] = 1.0
 
 
@@ -137,8 +134,7 @@ def add_initial(x, stages):
     cost = cost_of_order(x, none, 0, stages.model.initial, 1.0, hessian, gradient)
     for i in range(N):
         out.gradient[0, i] += gradient[i]
-        for j in range(N):
-            out.hessian[0, i, j] += hessian[i, j]
+    add_matrix(hessian, N, out.hessian[0])
     return cost
 
 
@@ -426,17 +422,14 @@ def direction(stages, plan, gaps, share, weight, base, curves, forces):
 
 
 def regularised_direction(stages, plan, gaps, weight, scale, curves, forces):
-    """The first step of the ladder of regularisation that exists.
+    """The first step of the ladder of regularisation that exists; return the rung, -1 if none has a minimum.
 
     Args:
       weight: weight on changes of the controls, which is added to those of the ladder. scale: the cost to which these
         are relative. The others are as in `direction`.
-
-    Returns:
-      The rung; or -1 if none has a minimum.
     """
     for rung in range(len(MIXES) + len(WEIGHTS)):
-        more = weight + weight_of(rung) * scale
+        more = weight + (WEIGHTS[rung - len(MIXES)] if rung >= len(MIXES) else 0.0) * scale
         if direction(stages, plan, gaps, share_of(rung), more, 1.0, curves, forces) == -1:
             return rung
     return -1
@@ -445,11 +438,6 @@ def regularised_direction(stages, plan, gaps, weight, scale, curves, forces):
 def share_of(rung):
     """The fraction of the projected Hessian at a rung of the ladder."""
     return MIXES[rung] if rung < len(MIXES) else 1.0
-
-
-def weight_of(rung):
-    """The weight on changes of the controls at a rung of the ladder, relative to the cost."""
-    return WEIGHTS[rung - len(MIXES)] if rung >= len(MIXES) else 0.0
 
 
 def blend(share, one, other, out):
@@ -492,15 +480,11 @@ def moved(t, row, stages):
 
 
 def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
-    """Write gains and cost-to-go at t, given the cost-to-go at t + 1, so that the gap closes.
+    """Write gains and cost-to-go at t so that the gap closes; return whether the control block is definite.
 
     Args:
       stage: (W, W) and slope: (W,) of the model at the plan; overwritten. jacobian: (N, W). gap: (N,).
-      policy: its offsets are the changes of the controls for an unchanged state. to_go: the cost-to-go of changes of
-        the state.
-
-    Returns:
-      Whether the control block is positive definite.
+      policy: its offsets are the changes of the controls for an unchanged state. to_go: of changes of the state.
     """
     least = stack(M)
     for i in range(M):
@@ -514,8 +498,7 @@ def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
 def forward_sweep(stages, gaps):
     """Write the changes of the plan that the policy makes, and the costates after them, as gradients of the cost-to-go.
 
-    Returns:
-      Whether the change of the start has a minimum.
+    Returns whether the change of the start has a minimum.
     """
     policy, to_go, changes, jacobian = stages.policy, stages.to_go, stages.changes, stages.models.jacobian
     if not start_change(stages.free, to_go, changes.states[0]):
@@ -544,8 +527,7 @@ def forward_sweep(stages, gaps):
 def jump_law(hessian, gradient, law):
     """Write the best change of the last state, (N+1,) of the others and 1; reduce the cost-to-go to that of these.
 
-    Returns:
-      Whether there is a best one.
+    Returns whether there is a best one.
     """
     last = N - 1
     curve = hessian[last, last]
@@ -608,12 +590,11 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
 def least_curvatures(stages, curves, held, least):
     """Write the least curvatures (M,) of the controls along a plan, while later controls respond at their best.
 
+    Returns whether the reduced Hessian is positive definite.
+
     Args:
       stages: PlanStages; the Hessians of their models are used. curves: ((T+1) size,) weights on rows that are held.
       held: (T, M), not 0 for a control that stays at its limit.
-
-    Returns:
-      Whether the reduced Hessian is positive definite.
     """
     S, stage, none, steps, models = stack(N, N), stack(W, W), zeros(W), stages.steps, stages.models
     slope, law = zeros(W), stack(N + 1)

@@ -29,7 +29,7 @@ from lqrsim.codegen.user_functions import (
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, excerpt
-from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, step_curvature, substeps, user_functions
+from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, substeps, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
@@ -343,7 +343,7 @@ class Dynamics:
 
     @cached_property
     def curvature_source(self) -> Source | None:
-        """Source of `step_curvature`, as in `kernels/step_curvature.py`; None if it is zero everywhere."""
+        """Source of `step_curvature`, as in `kernels/runge_kutta.py`; None if it is zero everywhere."""
         if self.level == "jax":
             return self.step_source
         part = self._curvature_of_part()
@@ -358,10 +358,10 @@ class Dynamics:
         by_values = source_of(differences, AXES=axes).filled(
             **self._rates, **dict.fromkeys(("advance", "step_jacobian"), self._part_source)
         )
-        by_jacobians = source_of(step_curvature).filled(step_curvature=(by_values, "curvature_from_jacobians"))
+        by_jacobians = source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_jacobians"))
         if self.level != "symbolic" and self.jacobian is None:
             by_values = by_values.filled(value=(by_values, "weighted_step"))
-            return source_of(step_curvature).filled(step_curvature=(by_values, "curvature_from_values"))
+            return source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_values"))
         if self.level != "symbolic":
             return by_jacobians
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
@@ -377,7 +377,7 @@ class Dynamics:
         open_source = (
             source_of(discrete_map, SUPPORT=support, K=len(support))
             if self.discrete
-            else source_of(step_curvature, SUPPORT=support, K=len(support), STATES=states)
+            else source_of(runge_kutta, SUPPORT=support, K=len(support), STATES=states)
         )
         return open_source.filled(rate_curvature=curved, **self._rates)
 

@@ -10,7 +10,7 @@ from lqrsim.annotations import Finite, checked
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, vectors_of
-from lqrsim.kernels import differences, mjcf_distances, mjcf_places
+from lqrsim.kernels import differences, mjcf_distances
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
@@ -238,7 +238,7 @@ class MjcfBalls(CollisionSpheres):
         memory = MjcfMemory.of(own)
         positions = tuple(range(own.physics.model.nv))
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
-        source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_places))
+        source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_distances))
         return SphereCenters(source, data, positions, functions=(memory,))
 
 

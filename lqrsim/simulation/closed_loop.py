@@ -1,7 +1,7 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
 `simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py`
-applies the disturbances, `mujoco_physics.py` advances MuJoCo, `collisions.py` detects collisions, and `recorder.py`
+applies the disturbances, `physics.py` advances the physics, `collisions.py` detects collisions, and `recorder.py`
 records.
 """
 
@@ -39,8 +39,7 @@ from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
-from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
-from lqrsim.simulation.physics import SimulatorPhysics, part_of
+from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.simulation.recorder import Recorder
 from lqrsim.solvers.parallel import check_threads
@@ -50,8 +49,6 @@ Watch = Annotated[
     Callable[[float, Array, npt.NDArray[np.bool_]], object],
     Want("a function of the time, MuJoCo's qpos and which trials are unstable"),
 ]
-
-MOVING = "a World of the obstacles, such as ls.World([ls.Obstacle(..., velocity=...)])"
 
 
 def simulate(
@@ -198,7 +195,7 @@ class ClosedLoop:
     watch: Watch | None = None
     starts: Array | None = None
     knot: Index = 0
-    moving: Annotated[World, Want(MOVING)] | None = None
+    moving: Annotated[World, Want("a World of them, such as ls.World([ls.Obstacle(..., velocity=...)])")] | None = None
 
     @unlogged()
     def __post_init__(self) -> None:
@@ -228,8 +225,7 @@ class ClosedLoop:
         else:
             self.physics = MujocoPhysics(plant, trials, substeps, contacts=self.contacts, threads=threads)
         self.physics.place(self.effects.initial_states(np.tile(self.whole.states[0], (trials, 1)), self.starts))
-        self.effects.alter_models(self.physics)
-        self.physics.prepare(altered=self.effects.alters_models)
+        self.physics.prepare(altered=self.effects.alter_models(self.physics))
         name = f"{type(self.law).__name__}.start"
         self.controller_run = check_kind(name, self.law.start(trials), ControllerRun, "a ControllerRun returned")
         self.records = Recorder(self.trajectory, trials)
@@ -303,7 +299,11 @@ class ClosedLoop:
         try:
             commands = _checked_commands(self.controller_run.control(knot, shown), shape)
             failed = _not_finite(commands)
-            reasons = [_not_a_number(row, self._names) for row in commands[failed]]
+            first = np.argmin(np.isfinite(commands), axis=1)
+            reasons = [
+                f"got {commands[k, first[k]]} for {self._names[first[k]]}, want a finite number"
+                for k in np.flatnonzero(failed)
+            ]
         except Exception as error:  # a controller may raise anything; its trials have failed
             commands, failed = np.zeros(shape), np.ones(len(measured), dtype=bool)
             reasons = [format_error(error)] * len(measured)
@@ -454,11 +454,6 @@ def _checked_commands(given: Any, shape: tuple[int, int]) -> Array:
     if command.shape != shape:
         raise InputError(f"got controls of shape {command.shape}, want {shape}")
     return command
-
-
-def _not_a_number(command: Array, names: Sequence[str]) -> str:
-    name, value = next(pair for pair in zip(names, command.tolist(), strict=True) if not np.isfinite(pair[1]))
-    return f"got {value} for {name}, want a finite number"
 
 
 def _not_finite(rows: Array) -> npt.NDArray[np.bool_]:

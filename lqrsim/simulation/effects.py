@@ -13,7 +13,7 @@ from lqrsim.robots.sensors import RobotSensors
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.disturbances.sensors import DEVIATIONS, READINGS
-from lqrsim.simulation.mujoco_physics import AnyPhysics, MujocoPhysics
+from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.plant import Plant
 
 MakeGenerator = Annotated[
@@ -76,10 +76,6 @@ class Effects:
         given = [(name, getattr(effect, kind)) for name, effect in effects or self._effects]
         return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
 
-    @property
-    def alters_models(self) -> bool:
-        return bool(self.displaced.any()) or any(effect.alter or effect.factors for _, effect in self._effects)
-
     def initial_states(self, planned: Array, given: Array | None = None) -> Array:
         """The first states (K, n) of the trials, from the plan's; or given ones, which no disturbance may change."""
         states = planned
@@ -97,8 +93,8 @@ class Effects:
             raise InputError("disturbances: got an infinite first state, want finite numbers")
         return states
 
-    def alter_models(self, physics: AnyPhysics) -> None:
-        """Alter the models of the trials; `prepare` must follow."""
+    def alter_models(self, physics: AnyPhysics) -> bool:
+        """Alter the models of the trials, and return whether there is anything to alter; `prepare` must follow."""
         for name, effect in self._effects:
             for parameter, factors in (effect.factors or {}).items():
                 columns = len(physics.plant.actuators) if parameter == "thrust" else 1
@@ -106,8 +102,10 @@ class Effects:
                 physics.multiply(parameter, shaped(f"{name}: factors: {parameter}", factors, shape))
             if effect.alter is not None:
                 physics.alter(name, effect.alter)
-        if self.displaced.any():
+        moved = bool(self.displaced.any())
+        if moved:
             physics.displace(self.displaced)
+        return moved or any(effect.alter or effect.factors for _, effect in self._effects)
 
     def follow(self, step: int, states: Array, controls: Array) -> None:
         """Call all with the states (K, n) and controls (K, m) of a plan, for those that remember."""

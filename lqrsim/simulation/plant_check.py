@@ -18,7 +18,7 @@ from lqrsim.results.plan import Plan
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import Scene
-from lqrsim.simulation.mujoco_physics import UNSTABLE
+from lqrsim.simulation.physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import Simulator, states_of
 

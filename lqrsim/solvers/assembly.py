@@ -59,7 +59,8 @@ def assemble(
         )  # fmt: skip
 
     unstable = unstable_step(problem, states, controls, sound=found.success)
-    said = found.detail, _usable(found, options), *_doubts(problem, found), unstable.detail if unstable else ""
+    doubts = (_near_singular(problem, found), _fragile(problem, found)) if np.isfinite(states).all() else ()
+    said = found.detail, _usable(found, options), *doubts, unstable.detail if unstable else ""
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -90,13 +91,8 @@ def assemble(
 
 
 def parts_of(problem: Problem) -> dict[str, str]:
-    """What the problem asks for, by part, as a file can hold it."""
-    return {name: _line(text) for name, text in problem.parts.items() if text}
-
-
-def _line(text: str) -> str:
-    """A text, which may contain the repr of a user's object, as a printable line that a file can hold."""
-    return printable(" ".join(text.split()))[: 10 * LINE]
+    """What the problem asks for, by part, each as a printable line that a file can hold: it may have a user's repr."""
+    return {name: printable(" ".join(text.split()))[: 10 * LINE] for name, text in problem.parts.items() if text}
 
 
 def _usable(found: RunResult, options: dict[str, object]) -> str:
@@ -119,13 +115,6 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
         "the plan can be used, for it keeps dynamics, limits and constraints; its cost could still fall by a relative"
         f" {plan.optimality:.1e}{wanted}"
     )
-
-
-def _doubts(problem: Problem, found: RunResult) -> tuple[str, ...]:
-    """Where feedback may fail although the plan is right, in words."""
-    if not np.isfinite(found.states).all():
-        return ()
-    return _near_singular(problem, found), _fragile(problem, found)
 
 
 def _near_singular(problem: Problem, found: RunResult) -> str:
@@ -217,7 +206,7 @@ def _flat_controls(problem: Problem, found: RunResult) -> list[str]:
     hessian, gradient = np.zeros((joint, joint)), np.zeros(joint)
     state, control = found.states[0].copy(), found.controls[0].copy()
     stage = compiled.arguments(problem).stage
-    compiled.costs_module(problem).cost_quadratic(state, control, 0, stage, hessian, gradient)
+    compiled.costs_module(problem).cost_of_order(state, control, 0, stage, 0.0, hessian, gradient)
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 

@@ -12,10 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order, module_of
-from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels import within_periods
 from lqrsim.kernels.declarations import FIRST
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import names_of
@@ -86,13 +84,11 @@ def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
 
 
 def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
-    """The states (T, parts, n) at the ends of equal parts of each period; see `kernels/within_periods.py`."""
+    """The states (T, parts, n) at the ends of equal parts of each period; see `kernels/model_functions.py`."""
     steps, n = len(plan.controls), plan.states.shape[1]
-    sizes = {"N": n, "M": plan.controls.shape[1]}
     found = np.empty((steps * parts, n))
-    module = module_of(source_of(within_periods), f"motion of {n} states and {sizes['M']} controls", **sizes)
     with problem.dynamics.quiet():
-        module.states_within(steps, parts, again, plan, compiled.arguments(problem), found)
+        compiled.costs_module(problem).states_within(steps, parts, again, plan, compiled.arguments(problem), found)
     return found.reshape(steps, parts, n)
 
 

@@ -57,7 +57,7 @@ class Known:
 
 
 class Ladder:
-    """Tries one start after another for a plan that keeps the constraints.
+    """Tries one start after another for a plan that keeps the constraints; `ATTEMPTS` says which each method tries.
 
     Attributes:
       guess, start: the start, and the rollout of its policy. stay: whether only plans from that rollout are tried.
@@ -104,18 +104,14 @@ class Ladder:
         return self._answer()
 
     def finish_found(self) -> RunResult | None:
-        """Finish the optimum that a search for a free duration has found."""
         assert self.guess.found is not None
         return self._remember(self._point.finish(self.guess.found))
 
     def from_neighbour(self) -> RunResult | None:
-        """From the start, with the multipliers of another solution."""
-        return self._interior(
-            copied(self.start), LITTLE, multipliers=tuple(one.values for one in self.guess.multipliers)
-        )
+        known = tuple(one.values for one in self.guess.multipliers)
+        return self._interior(copied(self.start), LITTLE, multipliers=known)
 
     def from_given(self) -> RunResult | None:
-        """From the given trajectory, or the rollout of the given policy."""
         # A sketch of a path is not near the answer, even if standing still keeps the constraints.
         begin = self.guess.trajectory or self.start
         near = self.start.violation <= self._allowed and np.allclose(begin.states, self.start.states)
@@ -136,7 +132,6 @@ class Ladder:
         return self._remember(replace(found, multipliers=()))
 
     def from_valley(self) -> RunResult | None:
-        """From the plan of smoothing without the constraints."""
         run = self._run
         run.smooth(GUIDED if self.guided else OPENING)
         ending = run.checked_ending()
@@ -172,17 +167,14 @@ class Ladder:
         return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
 
     def from_start(self) -> RunResult | None:
-        """From the start itself."""
         self.untried = False
         return self._interior(copied(self.start), MUCH)
 
     def from_start_at_a_price(self) -> RunResult | None:
-        """From the start, after a descent at a price."""
         self._known.from_start = True
         return self._at_a_price(copied(self.start))
 
     def from_damped(self) -> RunResult | None:
-        """From the start, after damped iterations on the augmented Lagrangian."""
         with self._budget.limited(REFINED):
             found = damped_from_rollout(self._run)
         return self._after_multipliers(found)
@@ -200,13 +192,11 @@ class Ladder:
         return self._after_multipliers(found, most=self.start.cost)
 
     def by_multipliers(self) -> RunResult | None:
-        """By the augmented Lagrangian alone, from the plan of smoothing."""
         self._point.without_multipliers()
         found = by_multipliers(self._run)
         return self._remember(found if found.success else None)
 
     def from_smoothed_at_a_price(self) -> RunResult | None:
-        """From the plan of smoothing, after a descent at a price."""
         assert self.smoothed is not None
         return self._at_a_price(self.smoothed)
 

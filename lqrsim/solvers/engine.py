@@ -121,63 +121,6 @@ class Ending:
         return _DETAILS.get(self.outcome, "")
 
 
-def iterate(
-    problem: Problem,
-    run: Callable[[int, int], tuple[int, int, bool, int]],
-    rows: StructuredArray,
-    *,
-    first: int,
-    last: int,
-    budget: Budget,
-    violation: Callable[[], float] = lambda: 0.0,
-) -> Ending:
-    """Run a loop of `kernels/iterations.py` until it ends, there are `last` rows, or the budget is over.
-
-    Args:
-      problem: the problem, whose functions may raise exceptions during the run.
-      run: runs the iterations from its first argument up to its second, or fewer.
-      rows: (any,) `LOG`, where `run` writes.
-      first: the next row. last: the desired number of rows, as far as the budget allows.
-      budget: whose log the iterations join. Compiled code returns after each iteration if there is a callback, a
-        deadline or a constraint to check, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
-        an iteration are averaged over the iterations between two returns.
-      violation: violation of the constraints in the last result of `run`.
-    """
-    functions, stop = functions_of(problem), budget.stop
-    heard = budget.attentive and (budget.watched or bool(functions))
-    single = heard or bool(problem.constraints) or stop.deadline < np.inf
-    bite = 1 if budget.attentive or single else last
-    for function in functions:
-        function.forget()
-    outcome, backward, failed, done = declarations.RUNNING, False, -1, first
-    last = min(last, first + budget.left)
-    while outcome == declarations.RUNNING and done < last:
-        if stop.due:
-            outcome = declarations.TIMED_OUT
-            break
-        clock, begin = time.perf_counter(), done
-        try:
-            done, outcome, backward, failed = run(begin, min(begin + bite, last))
-            stop.error = interrupt_of(functions) or stop.error
-            missed = violation() if done > begin else 0.0
-        except BaseException as error:  # Ctrl-C: raised again when there is a solution
-            stop.error, outcome = error, declarations.TIMED_OUT
-            break
-        seconds = (time.perf_counter() - clock) / max(done - begin, 1)
-        if budget.attentive and not single:
-            bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
-        for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
-            cost, improvement, gap, optimality, residual, method = row
-            found = missed if i == done or not problem.constraints else float("nan")
-            budget.record(
-                Iteration(cost, improvement, gap, optimality, residual, found, seconds, _METHODS[int(method)])
-            )
-        stop.pace = time.perf_counter() - clock
-        if stop.error is not None:
-            outcome = declarations.TIMED_OUT
-    return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
-
-
 def check_finite_at_start(
     problem: Problem, ending: Ending, costs: Array, x: Array, u: Array, *, refuse: bool
 ) -> Ending:
@@ -468,8 +411,11 @@ class SolveRun:
         return self._iterate(arguments, self.work.best)
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
-        """Run more iterations, in separate rows. A prior no longer acts."""
-        self.work.disregard_costs()
+        """Run more iterations, in separate rows. A prior no longer acts.
+
+        With constraints the least cost is no measure, and a rollout of lower cost is no better plan.
+        """
+        self.work.memory["watched"], self.work.memory["plan_cost"] = 0.0, -np.inf
         begin, again = len(self.budget.log), partial(self._arguments, again=True)
         ending = self._iterate(again, self.work.arrays.last, rows, first, last)
         if len(self.budget.log) > begin:
@@ -503,10 +449,6 @@ class SolveRun:
         self._loop(*self._linearize_arguments(rows))
         return float(rows["optimality"][0])
 
-    def about_best(self, status: Status) -> RunResult:
-        """The best plan, with policy and value functions about it."""
-        return self._about_plan(self.linearize_about_plan(), status, "")
-
     def fails_at(self, risk: float) -> int:
         """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
 
@@ -534,22 +476,20 @@ class SolveRun:
         cost = self.work.cost
         if not np.isfinite(cost) or (not cost < found.cost and found.values):
             return found
-        optimality = self.linearize_about_plan()
         detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
         status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan did not
-        return self._about_plan(optimality, status, detail)
+        return self.about_plan(status, detail)
 
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
         """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
         if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # the run was stopped without looking back
             law = self.work.arrays.last_policy
             return self.best(RunResult(status=status, detail=detail, plan=self.work.last, law=law))
-        optimality = self.budget.log[-1].optimality if self.budget.log else np.nan
-        return self._about_plan(optimality, status, detail)
+        return self.about_plan(status, detail, self.budget.log[-1].optimality if self.budget.log else np.nan)
 
-    def _about_plan(self, optimality: float, status: Status, detail: str) -> RunResult:
-        """The plan in memory, with the last policy and value functions about it."""
-        work = self.work
+    def about_plan(self, status: Status, detail: str = "", optimality: float | None = None) -> RunResult:
+        """The plan in memory, with policy and value functions about it; by default these are computed now."""
+        work, optimality = self.work, self.linearize_about_plan() if optimality is None else optimality
         values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
         if not np.isfinite(optimality):  # there is neither a model about the plan nor a policy
             law, gap = (np.zeros_like(work.arrays.policy.gain), work.best.controls.copy()), np.nan
@@ -581,7 +521,11 @@ class SolveRun:
             least=0.0 if self.initial_guess.found is None else self.initial_guess.found.scale,
         )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
-            certificate = replace(certificate, cost=self._expected_cost(found))
+            # The expected cost without penalties of constraints, which the cost-to-go of the solver has.
+            out, none = np.zeros(1, CERTIFICATE), no_value(found.states)
+            task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, found, none, out)
+            self._loop(task, first, last, options, self._without_penalties(), *rest)
+            certificate = replace(certificate, cost=float(out[0]["cost"]))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
@@ -606,13 +550,6 @@ class SolveRun:
                 return Bend(Curvature.MINIMUM)
         stages, plan = self.stages, Motion(*map(in_c_order, found.plan))
         return curvature_at(stages, plan, stages.of_constraints([one.values for one in found.multipliers]))
-
-    def _expected_cost(self, found: RunResult) -> float:
-        """The expected cost of the policy without penalties of constraints, which the cost-to-go of the solver has."""
-        out, none = np.zeros(1, CERTIFICATE), no_value(found.states)
-        task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, found, none, out)
-        self._loop(task, first, last, options, self._without_penalties(), *rest)
-        return float(out[0]["cost"])
 
     def _without_penalties(self) -> ProblemModel:
         """The model without constraints, whose noise is weighed by its own cost-to-go."""
@@ -689,13 +626,50 @@ class SolveRun:
         self, arguments: Callable[[int, int, StructuredArray], tuple[Any, ...]], plan: Motion,
         rows: StructuredArray | None = None, first: int = 0, last: int | None = None,
     ) -> Ending:  # fmt: skip
-        """Run the loop with these arguments; each iteration writes a plan. By default until the budget is over."""
-        left = self.budget.left
-        rows, last = np.zeros(max(left, 1), LOG) if rows is None else rows, left if last is None else last
-        return iterate(
-            self.problem, lambda first, last: self._loop(*arguments(first, last, rows)), rows, first=first, last=last,
-            budget=self.budget, violation=lambda: self._violation_of(plan),
-        )  # fmt: skip
+        """Run the loop with these arguments until it ends, has written `last` rows, or the budget is over.
+
+        Compiled code returns after each iteration if there is a callback, a deadline or a constraint to check, and
+        otherwise after `ATTENTION` if the budget is attentive. The seconds of an iteration are averaged over the
+        iterations between two returns.
+
+        Args:
+          plan: what an iteration writes. rows: (any,) `LOG`, from `first` on; by default as many as are left.
+        """
+        problem, budget, stop = self.problem, self.budget, self.budget.stop
+        rows = np.zeros(max(budget.left, 1), LOG) if rows is None else rows
+        functions = functions_of(problem)
+        heard = budget.attentive and (budget.watched or bool(functions))
+        single = heard or bool(problem.constraints) or stop.deadline < np.inf
+        last = min(budget.left if last is None else last, first + budget.left)
+        bite = 1 if budget.attentive or single else last
+        for function in functions:
+            function.forget()
+        outcome, backward, failed, done = declarations.RUNNING, False, -1, first
+        while outcome == declarations.RUNNING and done < last:
+            if stop.due:
+                outcome = declarations.TIMED_OUT
+                break
+            clock, begin = time.perf_counter(), done
+            try:
+                done, outcome, backward, failed = self._loop(*arguments(begin, min(begin + bite, last), rows))
+                stop.error = interrupt_of(functions) or stop.error
+                missed = self._violation_of(plan) if done > begin else 0.0
+            except BaseException as error:  # Ctrl-C: raised again when there is a solution
+                stop.error, outcome = error, declarations.TIMED_OUT
+                break
+            seconds = (time.perf_counter() - clock) / max(done - begin, 1)
+            if budget.attentive and not single:
+                bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
+            for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
+                cost, improvement, gap, optimality, residual, method = row
+                found = missed if i == done or not problem.constraints else float("nan")
+                budget.record(
+                    Iteration(cost, improvement, gap, optimality, residual, found, seconds, _METHODS[int(method)])
+                )
+            stop.pace = time.perf_counter() - clock
+            if stop.error is not None:
+                outcome = declarations.TIMED_OUT
+        return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
 
     def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
         """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
@@ -706,19 +680,18 @@ class SolveRun:
             tolerance = valley = 0.0  # with only a part of the cost, the iterations must not converge
         guided = self.initial_guess.trajectory is not None and self.settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
-        options = self._options(rows, tolerance)._replace(guided=guided, prior_iterations=count, valley=valley)
-        arrays = work.arrays._replace(homotopy_scaled=work.homotopy_scaled(share), prior=prior)
-        return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, rows
+        options, scaled = {"guided": guided, "prior_iterations": count, "valley": valley}, work.homotopy_scaled(share)
+        return self._stated(
+            declarations.ITERATE, first, last, rows, tolerance, options, homotopy_scaled=scaled, prior=prior
+        )
 
     def _plan_arguments(
         self, task: int, how: Descent, tolerance: float, gap_tolerance: float, first: int, last: int,
         rows: StructuredArray,
     ) -> tuple[Any, ...]:  # fmt: skip
         """Arguments for steps from the plan, with this tolerance of the cost and at least that of the gap."""
-        work = self.work
-        options = self._options(rows, tolerance, gap_tolerance)._replace(descent=how)
-        arrays = work.arrays._replace(prior=work.no_prior, last=work.trial)
-        return task, first, last, options, work.model, arrays, work.memory_rows, rows
+        options = {"descent": how, "gap_tolerance": max(self.settings.gap_tolerance, gap_tolerance)}
+        return self._stated(task, first, last, rows, tolerance, options, prior=self.work.no_prior, last=self.work.trial)
 
     def _linearize_arguments(self, rows: StructuredArray) -> tuple[Any, ...]:
         """Arguments for policy and value functions about the plan."""
@@ -728,18 +701,23 @@ class SolveRun:
         self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
-        work, law = self.work, Policy(*found.law)
-        arrays = work.arrays._replace(to_go=to_go, last=found.plan, last_policy=law, certificate=certificate)
-        options = self._options(self._rows, self.final)
-        return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
-
-    def _options(self, rows: StructuredArray, tolerance: float, least_gap: float = 0.0) -> IterationSettings:
-        """Settings of the kernels, for at most one iteration per row."""
-        return IterationSettings(
-            steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
-            gap_tolerance=max(self.settings.gap_tolerance, least_gap), optimal=self.settings.stop == "optimal",
-            fixed=self.work.fixed, guided=False, prior_iterations=0, rounding=self.problem.dynamics.rounding**2,
+        return self._stated(
+            task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=found.plan, last_policy=Policy(*found.law),
+            certificate=certificate,
         )  # fmt: skip
+
+    def _stated(
+        self, task: int, begin: int, end: int, rows: StructuredArray, tolerance: float, options: dict[str, Any],
+        **arrays: Any,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        """Arguments for at most one iteration per row, with other options than the run's, and other arrays."""
+        work, settings = self.work, IterationSettings(
+            steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
+            gap_tolerance=self.settings.gap_tolerance, optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
+            rounding=self.problem.dynamics.rounding**2,
+        )  # fmt: skip
+        arrays_ = work.arrays._replace(**arrays)
+        return task, begin, end, settings._replace(**options), work.model, arrays_, work.memory_rows, rows
 
     def _violation_of(self, plan: Motion) -> float:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
@@ -749,8 +727,8 @@ class Workspace:
     """The memory of a run, which its iterations read and write.
 
     Attributes:
-      arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
-      memory: what the iterations remember, a row of `MEMORY`; memory_rows: (1,) that row.
+      arrays: `records.SmootherArrays`. model: the problem's numbers. memory: what the iterations remember, a row of
+        `MEMORY`; memory_rows: (1,) that row.
       multipliers: multipliers of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
         that a line search from the best plan tries. core: the compiled iterations.
@@ -814,10 +792,6 @@ class Workspace:
         """Take a plan for the best one; its cost is infinite where it is not known."""
         self.best.states[...], self.best.controls[...] = states, controls
         self.memory["plan_cost"] = cost
-
-    def disregard_costs(self) -> None:
-        """With constraints the least cost is no measure, and a rollout of lower cost is no better plan."""
-        self.memory["watched"], self.memory["plan_cost"] = 0.0, -np.inf
 
     def begin_descent(self, how: Descent, added: float = 0.0, least: float = 0.0) -> None:
         """Begin steps from the best plan.

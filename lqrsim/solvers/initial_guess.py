@@ -65,14 +65,7 @@ class InitialPrior:
             self.controls = numbers_of("InitialPrior: controls", controls, "controls (m,) or (T, m)")
 
     def at(self, step: float) -> Array:
-        """The state at which the prior is zero.
-
-        Args:
-          step: a step, or a number between two steps.
-
-        Returns:
-          (n,).
-        """
+        """The state (n,) at which the prior is zero, at a step or between two."""
         most = None if self.about.ndim == 1 else len(self.about) - 1
         step = check_number("step", step, at_least=0.0, at_most=most)
         if self.about.ndim == 1:
@@ -83,11 +76,7 @@ class InitialPrior:
 
     @checked
     def fitting(self, problem: Problem) -> "InitialPrior":
-        """Check that the prior fits a problem.
-
-        Returns:
-          The prior itself, with one entry per state.
-        """
+        """The prior itself, which is checked to have one entry per state of a problem."""
         n = len(problem.dynamics.state_coordinates)
         check_array("start: InitialPrior: weight", self.weight, (n,))
         if self.about.ndim == 2:

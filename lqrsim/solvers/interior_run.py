@@ -191,7 +191,7 @@ class InteriorRun:
         Penalties give the policy its gains across rows that press. The certificate is that of the multipliers alone.
         """
         work, laps = self._run.work, Laps(self._budget)
-        result = self._run.about_best(Status.CONVERGED)
+        result = self._run.about_plan(Status.CONVERGED)
         self._take_multipliers(found, work.constraint_values(*work.best), FAINT * FIRMNESS)
         lagrangian.evaluate(*work.best)
         found.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)

@@ -46,13 +46,16 @@ class Tolerances(NamedTuple):
 
 
 def tolerances_of(rtol: float, atol: float) -> Tolerances:
-    """Check the tolerances. Raises InputError."""
+    """Check the tolerances."""
     # SciPy replaces a smaller tolerance, with a warning.
     return Tolerances(check_number("rtol", rtol, at_least=1e-13), check_number("atol", atol, above=0.0))
 
 
 class IntegrationFailure(Exception):
-    """The exception for a failed integration. It becomes the status of the solve, and never reaches the caller."""
+    """The exception of all functions here for a failed integration, a lost state, or a model without a minimum.
+
+    It becomes the status of the solve, and never reaches the caller.
+    """
 
     def __init__(self, status: Status, why: str, t: float) -> None:
         super().__init__(why)
@@ -126,11 +129,7 @@ class Pass:
 def riccati_pass(
     model: Callable[[float, Array], Model], end: Array, horizon: float, *, backward: bool, tolerances: Tolerances
 ) -> Pass:
-    """Integrate the Riccati equation of `model(t, V)` from V = `end`: back from the horizon, or forward from 0.
-
-    Raises:
-      IntegrationFailure: the integration failed.
-    """
+    """Integrate the Riccati equation of `model(t, V)` from V = `end`: back from the horizon, or forward from 0."""
     n = len(end) - 1
     sign = 1.0 if backward else -1.0
     rows, columns = np.triu_indices(n + 1)  # only the upper triangle is integrated, so V stays symmetric
@@ -170,10 +169,7 @@ def integrate(
 ) -> Any:
     """Run `solve_ivp` with dense output for `rate(t, y)` from y = `start` over `span`.
 
-    If the rate cannot be evaluated, a shorter step is tried.
-
-    Raises:
-      IntegrationFailure: shorter steps fail, too.
+    If the rate cannot be evaluated, a shorter step is tried. Raises IntegrationFailure if that fails, too.
     """
     last: list[IntegrationFailure] = []
     count = 0
@@ -236,20 +232,20 @@ class System:
         self._linearize = dynamics.compiled.lay_out(
             "rate_jacobian", self._f, self._none, self._parameters, self._f, self._fx, self._fu
         )
-        self._quadratize = costs.lay_out("cost_quadratic", self._f, self._none, 1, data.stage, *joint)
+        self._quadratize = costs.lay_out("cost_of_order", self._f, self._none, 1, data.stage, 0.0, *joint)
 
     def _expand(self, t: float, x: Array, u: Array) -> float:
         """Expand dynamics and stage cost about (x, u), in place; returns the cost. All are per second."""
         self._linearize(x, u, self._parameters, self._f, self._fx, self._fu)
         step = min(max(int(t / self.dt), 1), self._last)
-        value = self._quadratize(x, u, step, self._data.stage, self._hessian, self._gradient)
+        value = self._quadratize(x, u, step, self._data.stage, 0.0, self._hessian, self._gradient)
         self._hessian /= self.dt
         self._gradient /= self.dt
         return value / self.dt
 
     def end_value(self, which: str, x: Array) -> float:
         """The `initial` or `final` cost; its derivatives are left in the buffers."""
-        return self._quadratize(x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
+        return self._quadratize(x, self._none, 0, getattr(self._data, which), 0.0, self._hessian, self._gradient)
 
     def end_model(self, which: str, x: Array) -> Array:
         """The `initial` or `final` cost, quadratised at x, as V. Paper: Eqs. (23), (31)."""
@@ -280,11 +276,7 @@ class System:
         return about
 
     def rollout(self, start: Array, policy: Pass, tolerances: Tolerances) -> tuple[float, PPoly]:
-        """Run a policy under the true dynamics; return its cost, and its states (n,) as a function of time.
-
-        Raises:
-          IntegrationFailure: the trajectory diverges, or dynamics or cost are not finite.
-        """
+        """Run a policy under the true dynamics; return its cost, and its states (n,) as a function of time."""
 
         def rate(t: float, y: Array) -> Array:
             x = y[: self.n]
@@ -297,11 +289,7 @@ class System:
         return float(cost), _pieces(found, lambda t, y: y[: self.n])
 
     def decrease(self, states: PPoly, policy: Pass, tolerances: Tolerances) -> float:
-        """The decrease of cost that a linear-quadratic model about a rollout predicts.
-
-        Raises:
-          IntegrationFailure: the model has no minimum.
-        """
+        """The decrease of cost that a linear-quadratic model about a rollout predicts."""
         still, no_control = np.zeros(self.n), np.zeros(self.m)
 
         def deviation(t: float, _: Array) -> Model:

@@ -97,23 +97,19 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     return _bisect(run.fails_at, high)
 
 
-def named(fails: Fails, risk: float, steps: int) -> str:
-    """Text that says at which step a risk is too high, and which risk is not; empty if this cannot be determined."""
-    failed = fails(risk)
-    if failed < 0 or fails(0.0) >= 0:
-        return ""
-    most = _bisect(fails, risk) * (1 - 1e-5)  # so that even the rounded number works
-    return f"about the best plan risk {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
-
-
 def name_risk(run: SolveRun, found: RunResult) -> str:
-    """The detail of an answer whose risk was too high."""
-    problem, work = run.problem, run.work
+    """The detail of an answer whose risk was too high: at which step, and which risk is not, if that can be told."""
+    work, risk, steps = run.work, run.problem.risk, run.problem.steps
     if not np.isfinite(work.cost):
         work.take(*work.last)
     if not np.isfinite(work.best.states).all():
         return found.detail
-    return "; ".join(part for part in (named(run.fails_at, problem.risk, problem.steps), found.detail) if part)
+    failed = run.fails_at(risk)
+    if failed < 0 or run.fails_at(0.0) >= 0:
+        return found.detail
+    most = _bisect(run.fails_at, risk) * (1 - 1e-5)  # so that even the rounded number works
+    told = f"about the best plan risk {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
+    return f"{told}; {found.detail}" if found.detail else told
 
 
 def _bisect(fails: Fails, high: float) -> float:

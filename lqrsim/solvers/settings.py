@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 
 from lqrsim.annotations import Bounds, OneOf, Positive, checked
-from lqrsim.errors import InputError, check_function, check_memory
+from lqrsim.errors import InputError, check_function
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
@@ -107,22 +107,12 @@ S = TypeVar("S", bound=Settings)
 
 
 def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
-    """Make settings from keyword arguments.
-
-    Raises:
-      InputError: an argument is not as described.
-      TypeError: there is no such argument.
-    """
+    """Make settings from keyword arguments. Raises TypeError for one that there is not."""
     names = [field.name for field in fields(kind)]
     for name in options:
         if name not in names:
             raise TypeError(f"{function}() got an unexpected keyword argument {name!r}, want {', '.join(names)}")
     return kind(**options)
-
-
-def check_runs(problem: Problem, starts: int) -> None:
-    """Raises InputError if the arrays of this number of starts do not fit into memory."""
-    check_memory("starts", starts, problem.steps * problem.bytes_per_step)
 
 
 def warn_of_goal(problem: Problem) -> None:

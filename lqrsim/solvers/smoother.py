@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from lqrsim.annotations import checked
-from lqrsim.errors import InputError
+from lqrsim.errors import InputError, check_memory
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
@@ -15,7 +15,7 @@ from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import StartLike
 from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
-from lqrsim.solvers.settings import SmootherSettings, check_runs, settings_from, warn_of_goal
+from lqrsim.solvers.settings import SmootherSettings, settings_from, warn_of_goal
 from lqrsim.solvers.strategy import solve
 
 
@@ -177,7 +177,8 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
     if problem.duration is not None and not settings.second_order(problem):
         raise InputError('duration: got a free one without the interior point, want finish="newton" and stop="optimal"')
     several = settings.start is None and len(problem.obstacle_costs) > 0
-    check_runs(problem, settings.starts or (STARTS if several else 1))
+    starts = settings.starts or (STARTS if several else 1)
+    check_memory("starts", starts, problem.steps * problem.bytes_per_step)
     if settings.form == "primal" and problem.dynamics.discrete:
         raise InputError(f"form: got 'primal' for {problem.dynamics.name}, whose steps have no inverse, want 'dual'")
     if settings.form == "primal" and isinstance(problem.initial, FixedState):

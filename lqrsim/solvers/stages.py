@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import plan_methods as kernel
+from lqrsim.kernels import entry_points
 from lqrsim.kernels.interior_point import LATELY
 from lqrsim.kernels.records import (
     ACTIVE_SET,
@@ -67,7 +67,7 @@ class Stages:
         self._shape = n, m, steps, counts, lower, upper = _shape(problem)
         rows, self.n, self.m = sum(counts) + len(lower) + len(upper), n, m
         self._lengths = {"T": steps, "N": n, "M": m, "W": n + m, "R": rows, "K": (steps + 1) * rows, "C": len(counts)}
-        self._module = module_of(source_of(kernel), f"stages of {n} states and {m} controls", N=n, M=m)
+        self._module = module_of(source_of(entry_points), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
         own = zeros_of(StageRows, {"size": rows}, **self._lengths)
         own.limits[...], own.first[...] = np.inf, np.cumsum([0, *counts])[:-1]

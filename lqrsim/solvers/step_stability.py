@@ -18,7 +18,7 @@ ROUNDING = 1e-6  # of an eigenvalue by MuJoCo's differences, relative to its siz
 
 
 class UnstableStep(NamedTuple):
-    """The step of a plan that is unstable by the most, in words: what happens there, and what to do."""
+    """The step of a plan that is unstable by the most: in words, what happens there, and what to do."""
 
     detail: str
     remedy: str
@@ -52,13 +52,19 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     rate, t = rates[knot, mode], int(known[knot])
     with np.errstate(over="ignore"):
         growth = abs(np.polyval(_TAYLOR[::-1], step * rate))
-    name = problem.dynamics.state_coordinates.names[_carrier(slopes[knot], rate)]
+    # The state that takes part the most in the eigenvalue, whatever the units of states.
+    each, right = np.linalg.eig(slopes[knot])
+    mode = int(np.argmin(np.abs(each - rate)))
+    carrier = int(np.argmax(np.abs(np.linalg.pinv(right)[mode] * right[:, mode])))
+    shorter = step / float(worst[knot])
+    unit = 10.0 ** (math.floor(math.log10(shorter)) - 2)  # of three digits
+    name = problem.dynamics.state_coordinates.names[carrier]
     value = f"{rate.real:.3g}" + (f" +- {abs(rate.imag):.3g}i" if rate.imag else "")
     return UnstableStep(
         f"Runge-Kutta steps of {step:g} s are unstable: at {problem.begin + t * problem.dt:g} s (step {t + 1} of"
         f" {problem.steps}) df/dx has the stable eigenvalue {value} 1/s, mostly of {name}, whose deviations a"
         f" step multiplies by {growth:.3g}",
-        problem.dynamics._with_finer_steps(step, _rounded_down(step / float(worst[knot]))),
+        problem.dynamics._with_finer_steps(step, math.floor(shorter / unit) * unit),
     )
 
 
@@ -72,16 +78,3 @@ def _reach(rate: complex) -> float:
     square[0] -= 1.0
     roots = np.roots(square[:0:-1])
     return float(roots.real[(np.abs(roots.imag) < ROUNDING) & (roots.real > STABLE)].min(initial=np.inf))
-
-
-def _carrier(slopes: Array, rate: complex) -> int:
-    """The state that takes part the most in an eigenvalue of df/dx (n, n), whatever the units of states."""
-    rates, right = np.linalg.eig(slopes)
-    mode = int(np.argmin(np.abs(rates - rate)))
-    return int(np.argmax(np.abs(np.linalg.pinv(right)[mode] * right[:, mode])))
-
-
-def _rounded_down(number: float) -> float:
-    """A number with three digits that is no larger."""
-    unit = 10.0 ** (math.floor(math.log10(number)) - 2)
-    return math.floor(number / unit) * unit

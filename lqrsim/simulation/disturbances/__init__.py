@@ -1,12 +1,17 @@
 """Disturbances of a run: one class each, in physical units, drawn for each trial from its own generator.
 
-`base.py` explains how to add one; `KINDS` has all classes by name.
+`base.py` explains how to add one; `KINDS` has all classes by name. Presets are named sets of them, from calm to severe;
+a plant gets only those that it supports.
 """
 
 import inspect
 
+import numpy as np
+
+from lqrsim.annotations import checked
+from lqrsim.errors import InputError, check_name
 from lqrsim.simulation.disturbances.actuation import ActuatorLoss, MotorLag, Saturation
-from lqrsim.simulation.disturbances.base import Disturbance, Effect
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, GaussianDisturbance
 from lqrsim.simulation.disturbances.links import (
     CommandDropouts,
     ControlDelay,
@@ -35,10 +40,9 @@ from lqrsim.simulation.disturbances.noise import (
     TorqueNoise,
 )
 from lqrsim.simulation.disturbances.noise import as_disturbances as as_disturbances
-from lqrsim.simulation.disturbances.presets import PRESETS as PRESETS
-from lqrsim.simulation.disturbances.presets import preset
 from lqrsim.simulation.disturbances.sensors import SensorErrors
 from lqrsim.simulation.disturbances.wind import Dryden, Gusts, MeanWind
+from lqrsim.simulation.plant import Plant
 
 KINDS: dict[str, type[Disturbance]] = {
     name: item
@@ -53,3 +57,65 @@ __all__ = [
     "MeasurementDropouts", "MeasurementLatency", "MeasurementNoise", "MotorLag", "Payload", "Push", "Saturation",
     "SensorErrors", "ThrustMismatch", "TorqueNoise", "WheelRadiusMismatch", "preset",
 ]  # fmt: skip
+
+# Strengths relative to light; as in MIL-F-8785C, with 15, 30 and 45 knots for light, moderate and severe turbulence.
+PRESETS = {"calm": 0.5, "light": 1.0, "moderate": 2.0, "strong": 2.5, "severe": 3.0}
+
+# Measurement noise by unit: RotorPy's 5e-4 m, 5e-3 m/s, 5e-4 rad, 5e-4 rad/s per square root of Hz, at 100 Hz.
+MEASURED = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
+# Error of the start by unit: our choice, the order of a careful placement by hand.
+PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
+
+LIQUID = 100.0  # kg/m^3; a medium that is denser has currents, not the turbulence of air
+
+
+@checked
+def preset(name: str, plant: Plant) -> list[Disturbance]:
+    """The disturbances of a preset that the plant supports, in the order in which they act. Each can be scaled by 2.
+
+    Presets leave out disturbances whose strength depends on the robot or the plan. Latency and delay come in whole
+    control periods, and the 6 to 7 ms of motion capture are less than half a period. For pushes, time and direction
+    matter. A quadrotor does not survive the loss of an actuator. There is no `MotorLag` for a robot whose actuators
+    have their own states, because its MJCF describes their lag. In a liquid there are currents in place of turbulence.
+    """
+    strength = PRESETS[check_name("preset", name, PRESETS)]
+    return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one) and _acts(one)]
+
+
+def _light(plant: Plant) -> list[Disturbance]:
+    """All disturbances at strength 1, in the order in which they act."""
+    space, controls = plant.robot.dynamics.state_coordinates, plant.robot.dynamics.control_coordinates
+    ranges = np.subtract(controls.high, controls.low)
+    liquid = plant.simulator is None and plant.has_medium and plant.model.opt.density > LIQUID
+    lag = MotorLag(0.024)  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
+    return [
+        InitialStateError([PLACED.get(unit, 0.0) for unit in space.units]),
+        DisplacedObstacles(0.01),  # our choice: the accuracy of a map
+        MassMismatch(0.02),  # our choice: a battery, a camera
+        InertiaMismatch(0.1 / 3),  # +-10 % in all, SkyJEPA's data card
+        ThrustMismatch(0.12 / 3),  # +-12 % in all, SkyJEPA's data card
+        WheelRadiusMismatch(0.005),  # our choice: 0.2 mm of a wheel of the Create
+        AxleMismatch(0.01),  # our choice: accuracy of the contact points of the wheels
+        FrictionMismatch(0.05),  # our choice: severe is +-45 % in all
+        MeasurementNoise([MEASURED.get(unit, 0.0) for unit in space.units]),
+        MeasurementDropouts(0.01),  # our choice
+        CommandDropouts(0.01),  # our choice: the same link
+        ControlNoise(np.where(np.isfinite(ranges), 0.01 * ranges, 0.0).tolist()),  # our choice: 1 % of the range
+        *([] if plant.robot.activations else [lag]),
+        ForceNoise(0.01 * plant.weight),  # our choice: 1 % of the weight
+        # Our choice: severe are 0.15 m/s along each axis, which change within minutes.
+        Gusts(0.05, time_constant=60.0) if liquid else Dryden("light", altitude=2.0),
+    ]
+
+
+def _acts(disturbance: Disturbance) -> bool:
+    """Whether it is not zero for this robot, as a share of the weight is where there is no gravity."""
+    return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(np.asarray(disturbance.std)))
+
+
+def _can_have(plant: Plant, disturbance: Disturbance) -> bool:
+    try:
+        disturbance.check(plant)
+    except InputError:
+        return False
+    return True

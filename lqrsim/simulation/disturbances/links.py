@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -11,18 +11,14 @@ from lqrsim.annotations import Bounds, Index, Share, checked
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, times, uniform
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, check_strength, times, uniform
 from lqrsim.simulation.plant import Plant
 
 
 @checked
 @dataclass(frozen=True)
 class Late(Disturbance):
-    """Base class of delays.
-
-    Args:
-      periods: the delay in control periods.
-    """
+    """Base class of delays, in control periods."""
 
     periods: Index
 
@@ -41,11 +37,7 @@ class Late(Disturbance):
 
 
 class ControlDelay(Late):
-    """Commands arrive late; until the first one arrives, the plan's controls are applied.
-
-    Args:
-      periods: the delay in control periods.
-    """
+    """Commands arrive late, by control periods; until the first one arrives, the plan's controls are applied."""
 
     what, known_as = "commands", "delay"
 
@@ -62,11 +54,7 @@ class ControlDelay(Late):
 
 
 class MeasurementLatency(Late):
-    """Measurements arrive late; until then the first one is repeated.
-
-    Args:
-      periods: the delay in control periods.
-    """
+    """Measurements arrive late, by control periods; until then the first one is repeated."""
 
     what, known_as = "measurements", "latency"
 
@@ -118,16 +106,16 @@ class GilbertElliott:
 
 @dataclass(frozen=True)
 class Dropouts(Disturbance):
-    """Base class of losses on a link.
+    """Base class of losses on a link, of each value with a probability, independently, or of `GilbertElliott`.
 
-    Args:
-      loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
+    The last value that arrived is repeated; at first, the plan's first one.
     """
 
     loss: float | GilbertElliott
 
     what: ClassVar[str]
     discrete = True
+    hook: ClassVar[Literal["measure", "actuate"]]  # the field of an `Effect`
     known_as: ClassVar[str]  # the field of an Uncertainty
 
     def __post_init__(self) -> None:
@@ -162,41 +150,33 @@ class Dropouts(Disturbance):
             return self.loss.draw(steps, generators)
         return uniform(generators, steps, 1)[..., 0] < self.loss
 
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        steps, first = plan.steps, plan.controls[0]
+        if self.hook == "measure":
+            steps, first = steps + 1, plan.states[0]
+        lost, last = self.draw(steps, generators), np.tile(first, (len(generators), 1))
+
+        def receive(step: int, values: Array) -> Array:
+            last[~lost[:, step]] = values[~lost[:, step]]
+            return last.copy()
+
+        hooks: dict[str, Any] = {self.hook: receive}
+        return Effect(**hooks)
+
 
 class MeasurementDropouts(Dropouts):
-    """Measurements are lost. The last measurement that arrived is repeated; at first, the plan's first state.
+    """Measurements are lost, each with the probability `loss`, or in bursts by `GilbertElliott`.
 
-    Args:
-      loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
+    The last measurement that arrived is repeated; at first, the plan's first state.
     """
 
-    what, known_as = "measurements", "loss"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        lost = self.draw(plan.steps + 1, generators)
-        return Effect(measure=_last_received(lost, plan.states[0]))
+    what, hook, known_as = "measurements", "measure", "loss"
 
 
 class CommandDropouts(Dropouts):
-    """Commands are lost. The actuators keep the last command that arrived; at first, the plan's first control.
+    """Commands are lost, each with the probability `loss`, or in bursts by `GilbertElliott`.
 
-    Args:
-      loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
+    The actuators keep the last command that arrived; at first, the plan's first control.
     """
 
-    what, known_as = "commands", "command_loss"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        lost = self.draw(plan.steps, generators)
-        return Effect(actuate=_last_received(lost, plan.controls[0]))
-
-
-def _last_received(lost: npt.NDArray[np.bool_], first: Array) -> Hook:
-    """A hook that repeats the last value of each trial that was not lost."""
-    last = np.tile(first, (len(lost), 1))
-
-    def receive(step: int, values: Array) -> Array:
-        last[~lost[:, step]] = values[~lost[:, step]]
-        return last.copy()
-
-    return receive
+    what, hook, known_as = "commands", "actuate", "command_loss"

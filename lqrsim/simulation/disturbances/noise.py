@@ -28,7 +28,11 @@ from lqrsim.simulation.plant import Plant
 
 
 class AddedError(GaussianDisturbance):
-    """Base class of Gaussian errors on states or controls: drawn anew at each step, or once for a whole run."""
+    """Base class of Gaussian errors on states or controls: drawn anew at each step, or once for a whole run.
+
+    Args:
+      std: of each, in its unit: one number, one per entry, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
+    """
 
     what: ClassVar[str]
     hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # the field of an `Effect`
@@ -61,21 +65,13 @@ class AddedError(GaussianDisturbance):
 
 
 class ControlNoise(AddedError):
-    """White noise on each control, redrawn each control period.
-
-    Args:
-      std: of each control, in its unit: one number, one per control, or numbers by name or unit.
-    """
+    """White noise on each control, redrawn each control period; `std` as one number, one each, or by name or unit."""
 
     what, hook, lasts, known_as = "control noise", "actuate", False, "control"
 
 
 class ControlOffset(AddedError):
-    """A constant error of each control, drawn for each trial from a normal distribution.
-
-    Args:
-      std: of each control, in its unit: one number, one per control, or numbers by name or unit.
-    """
+    """A constant error of each control, drawn for each trial; `std` as one number, one each, or by name or unit."""
 
     what, hook = "control offset", "actuate"
 
@@ -85,21 +81,13 @@ class ControlOffset(AddedError):
 
 
 class MeasurementNoise(AddedError):
-    """White noise on each measured state.
-
-    Args:
-      std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
-    """
+    """White noise on each measured state; `std` as one number, one each, or by unit: {"m": 0.01, "rad": 0.02}."""
 
     what, hook, lasts, known_as = "measurement noise", "measure", False, "measurement"
 
 
 class MeasurementBias(AddedError):
-    """A constant error of each measured state, drawn for each trial from a normal distribution.
-
-    Args:
-      std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
-    """
+    """A constant error of each measured state, drawn for each trial; `std` as of `MeasurementNoise`."""
 
     what, hook = "measurement bias", "measure"
 
@@ -109,13 +97,10 @@ class MeasurementBias(AddedError):
 
 
 class InitialStateError(AddedError):
-    """The robot begins in a state that differs from the first state of the plan.
+    """The robot begins in a state that differs from the first state of the plan; `std` as of `MeasurementNoise`.
 
     Kinematic loops of an MJCF, and other equality constraints, are closed again: each trial begins in the state that
     meets them and is nearest to the drawn one.
-
-    Args:
-      std: of each state, in its unit: one number, one per state, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
     """
 
     what, hook, known_as = "initial state off", "initial_states", "start"
@@ -148,21 +133,13 @@ class WrenchNoise(GaussianDisturbance):
 
 
 class ForceNoise(WrenchNoise):
-    """A random force at the robot's centre of mass, redrawn each control period and held over it.
-
-    Args:
-      std: standard deviation in N; one number, or three along the world's axes.
-    """
+    """A random force at the robot's centre of mass; `std` in N, one number, or three along the world's axes."""
 
     kind, unit = "force", "N"
 
 
 class TorqueNoise(WrenchNoise):
-    """A random torque on the robot, redrawn each control period and held over it.
-
-    Args:
-      std: standard deviation in N m; one number, or three about the world's axes.
-    """
+    """A random torque on the robot; `std` in N m, one number, or three about the world's axes."""
 
     kind, unit = "torque", "N m"
 
