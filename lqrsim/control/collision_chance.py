@@ -21,37 +21,23 @@ FAR = 12.0  # standard deviations of clearance; beyond, the chance of a collisio
 
 
 class Spread(NamedTuple):
-    """Distribution of the clearances to O obstacles at T+1 knots; further axes are the first.
+    """Distribution of the clearances to O obstacles at T+1 knots; further axes are the first."""
 
-    Attributes:
-      mean: mean in m, (T+1, O). std: standard deviation in m, (T+1, O). correlation: correlation of each clearance with
-        the same clearance at the previous knot, (T, O). normal: derivative of each clearance by the position, (T+1, O,
-        p).
-    """
-
-    mean: Array
+    mean: Array  # (T+1, O), in m, as the standard deviation
     std: Array
-    correlation: Array
-    normal: Array
+    correlation: Array  # (T, O), of each clearance with the same clearance at the previous knot
+    normal: Array  # (T+1, O, p), derivative of each clearance by the position
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Obstacles of a problem, as its robot sees them.
+    """Obstacles of a problem, as its robot sees them."""
 
-    Attributes:
-      kept: the costs and constraints that keep the robot away from obstacles, without repetitions.
-      shapes: for each of these, the shape of the robot among its obstacles.
-      place: the states that are the robot's position. position: the same; with balls or geoms, all states that move
-        these.
-      std: standard deviation of an obstacle's position, in m.
-    """
-
-    kept: tuple[KeepsClear, ...]
-    shapes: tuple[ShapeInWorld, ...]
-    place: tuple[int, ...]
-    position: tuple[int, ...]
-    std: float
+    kept: tuple[KeepsClear, ...]  # the costs and constraints that keep it away from obstacles, without repetitions
+    shapes: tuple[ShapeInWorld, ...]  # for each of these, the shape of the robot among its obstacles
+    place: tuple[int, ...]  # the states that are the robot's position
+    position: tuple[int, ...]  # the same; with balls or geoms, all states that move these
+    std: float  # of an obstacle's position, in m
 
     @classmethod
     def of(cls, problem: Problem, std: float) -> "Surroundings":

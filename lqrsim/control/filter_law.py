@@ -23,11 +23,7 @@ from lqrsim.results.plan import Plan
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A filter with the law that follows it, or with C laws.
-
-    Attributes:
-      laws: gain and offset of the law, as of `tracking_laws`.
-    """
+    """A filter with the law that follows it, or with C laws."""
 
     model: PlanModel
     filter: KalmanFilter
@@ -46,20 +42,15 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class FilterLaw:
-    """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
-
-    Attributes:
-      gain: (T, m, Z). offset: (T, m).
-      nominal: z in an undisturbed run, (T+1, Z).
-    """
+    """A filter and the law `u = gain z + offset` of its estimates z, about one plan."""
 
     plan: Plan
     model: PlanModel
     filter: KalmanFilter
     weights: Weights
-    gain: Array
-    offset: Array
-    nominal: Array
+    gain: Array  # (T, m, Z)
+    offset: Array  # (T, m)
+    nominal: Array  # (T+1, Z), z in an undisturbed run
 
     @classmethod
     def of(cls, plan: Plan, design: Design, granted: Array | None = None) -> "FilterLaw":

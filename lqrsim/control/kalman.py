@@ -30,23 +30,14 @@ PLAUSIBLE = 6.0
 
 
 class KalmanFilter(NamedTuple):
-    """A filter's gains and covariances.
+    """A filter's gains and covariances."""
 
-    Attributes:
-      gain: K, (T+1, Z, Y).
-      predicted: covariance of the error of z before the measurement of each knot, (T+1, Z, Z).
-      corrected: covariance of that error after the measurement, (T+1, Z, Z).
-      corrected_root: lower triangular square roots of `corrected`, with nonnegative diagonals, (T+1, Z, Z).
-      innovation: covariance of the measurement minus its prediction, (T+1, Y, Y).
-      limit: largest correction of each state of the unknowns by one measurement, (T+1, D); see `PLAUSIBLE`.
-    """
-
-    gain: Array
-    predicted: Array
-    corrected: Array
-    corrected_root: Array
-    innovation: Array
-    limit: Array
+    gain: Array  # K, (T+1, Z, Y)
+    predicted: Array  # (T+1, Z, Z), covariance of the error of z before the measurement of each knot
+    corrected: Array  # (T+1, Z, Z), the same after it
+    corrected_root: Array  # lower triangular square roots of `corrected`, with nonnegative diagonals
+    innovation: Array  # (T+1, Y, Y), covariance of the measurement minus its prediction
+    limit: Array  # (T+1, D), largest correction of each state of the unknowns by one measurement; see `PLAUSIBLE`
 
 
 def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:

@@ -24,17 +24,11 @@ from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork,
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """C laws in L systems: y' = F X + G (u - planned) + c + w with the commands K X + command + r, limited to u.
-
-    Attributes:
-      arrays: F and the others, as defined there.
-      stated: number of the first entries of y that are the system's own. With losses, the last m of these are a.
-      lost: fraction of the commands that get lost.
-    """
+    """C laws in L systems: y' = F X + G (u - planned) + c + w with the commands K X + command + r, limited to u."""
 
     arrays: LoopArrays
-    stated: int
-    lost: float = 0.0
+    stated: int  # number of the first entries of y that are the system's own; with losses, the last m of these are a
+    lost: float = 0.0  # fraction of the commands that get lost
 
     def moments(self, count: int) -> LoopMoments:
         """The moments of the first entries of y in each system under each law, (L, C, ...)."""
@@ -65,22 +59,15 @@ def kernels() -> CompiledModule:
 
 @dataclass(eq=False)
 class LinearLoop:
-    """A closed loop about a plan.
-
-    Attributes:
-      gain, offset: of a law, (T, m, Z or n) and (T, m), in deviations from the plan; or of C laws, (C, T, m, Z or n).
-      filter_gain: of a Kalman filter, (T+1, Z, Y); None for a law of the measured states.
-      assumed: the model that the filter assumes, by which Z is that of its estimates; by default that of the true
-        system.
-    """
+    """A closed loop about a plan."""
 
     model: PlanModel
-    gain: Array
-    offset: Array
-    filter_gain: Array | None
+    gain: Array  # (T, m, Z or n) of a law in deviations from the plan, or (C, T, m, Z or n) of C laws
+    offset: Array  # (T, m)
+    filter_gain: Array | None  # of a Kalman filter, (T+1, Z, Y); None for a law of the measured states
     low: Array
     high: Array
-    assumed: PlanModel | None = None
+    assumed: PlanModel | None = None  # by the filter, whose estimates have its Z; by default the true system's
 
     def moments(self, count: int | None = None) -> LoopMoments:
         """The moments of the first entries of y, or of all, from the start to the plan's end."""

@@ -48,17 +48,12 @@ Sensors = None | Sequence[str] | npt.ArrayLike | Callable[[Any, Any, Any], Any]
 
 
 class Sensor(NamedTuple):
-    """A function of the state that is measured.
+    """A function of the state that is measured."""
 
-    Attributes:
-      source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
-      data: their parameters. size: Y, the number of measured values. names: names of the values in messages.
-    """
-
-    source: Source
-    data: Array
-    size: int
-    names: tuple[str, ...]
+    source: Source  # `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`
+    data: Array  # their parameters
+    size: int  # Y, the number of measured values
+    names: tuple[str, ...]  # of the values, in messages
 
 
 def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
@@ -123,15 +118,10 @@ STEP = 1e-5  # step of a parameter for differences, relative to its value if tha
 
 @dataclass(frozen=True)
 class Lag:
-    """A first-order lag of the actuators over a control period.
+    """A first-order lag of the actuators over a control period."""
 
-    Attributes:
-      left: the remaining fraction of the distance to the command at the end of the period. mean: its average over the
-        period.
-    """
-
-    left: float
-    mean: float
+    left: float  # the remaining fraction of the distance to the command at the end of the period
+    mean: float  # its average over the period
 
     @classmethod
     def of(cls, time_constant: float, dt: float) -> "Lag":
@@ -142,25 +132,16 @@ class Lag:
 
 
 class Step(NamedTuple):
-    """The linear model of all steps.
+    """The linear model of all steps."""
 
-    Attributes:
-      F: (T, Z, Z). G: (T, Z, m). c: (T, Z).
-    """
-
-    F: Array
-    G: Array
-    c: Array
+    F: Array  # (T, Z, Z)
+    G: Array  # (T, Z, m)
+    c: Array  # (T, Z)
 
 
 @dataclass(frozen=True, eq=False)
 class PlanModel:
-    """A plan and its uncertainty, linearised.
-
-    Attributes:
-      plan: nominal states (T+1, n) and controls (T, m).
-      uncertainty: the uncertainty in a run. sensor: the measured quantities.
-    """
+    """A plan and its uncertainty, linearised."""
 
     dynamics: Dynamics
     plan: Trajectory

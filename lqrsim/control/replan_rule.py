@@ -26,14 +26,10 @@ Changes = Annotated[Callable[[float, Problem], Problem], Want("a function of the
 
 @dataclass(frozen=True, eq=False)
 class ActivePlan:
-    """A plan that is in force, or will be.
-
-    Attributes:
-      first: the control period at which it begins.
-    """
+    """A plan that is in force, or will be."""
 
     plan: Plan
-    first: int
+    first: int  # the control period at which it begins
 
     def row(self, step: int) -> int:
         """The index of the plan's law at a step; after the horizon, of the last law."""
@@ -42,17 +38,14 @@ class ActivePlan:
 
 @dataclass(frozen=True, eq=False)
 class SolveRequest:
-    """A solve to be done at a step, from a state (n,) and with a law, for a plan that begins at a later step.
-
-    `previous` (m,) is the last command before that step; None unless the problem has a `control_rate`.
-    """
+    """A solve to be done at a step, from a state (n,) and with a law, for a plan that begins at a later step."""
 
     step: int
     first: int
     state: Array
     start: Plan | InitialGuess
     problem: Problem
-    previous: Array | None = None
+    previous: Array | None = None  # (m,) the last command before that step, for a problem with a `control_rate`
 
 
 @checked

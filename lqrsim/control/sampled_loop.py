@@ -31,14 +31,10 @@ REFUTED = 0.025  # a prediction is refuted if the trials' number of collisions h
 
 
 class Counted(NamedTuple):
-    """The states in which a distance from the plan is measured: the position, or else what the goal asks for.
+    """The states in which a distance from the plan is measured: the position, or else what the goal asks for."""
 
-    Attributes:
-      states: their indices. scale: (C,) what each is divided by: 1, or its range over the plan.
-    """
-
-    states: list[int]
-    scale: Array
+    states: list[int]  # their indices
+    scale: Array  # (C,) what each is divided by: 1, or its range over the plan
 
     @classmethod
     def of(cls, solution: Solution, position: Sequence[int]) -> Self:
@@ -54,17 +50,11 @@ class Counted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SampledLoop:
-    """The result of K trials.
+    """The result of K trials."""
 
-    Attributes:
-      moments: of the states' deviations from the plan and of the commands, over the trials whose states stay finite.
-      collided: whether each trial collides at a knot, or its state is not finite, (K,).
-      farthest: largest distance of each trial from its plan, (K,), in m, or as `Counted` has it.
-    """
-
-    moments: LoopMoments
-    collided: npt.NDArray[np.bool_]
-    farthest: Array
+    moments: LoopMoments  # of the deviations from the plan and the commands, over the trials whose states stay finite
+    collided: npt.NDArray[np.bool_]  # (K,) whether each trial collides at a knot, or its state is not finite
+    farthest: Array  # (K,) largest distance of each trial from its plan, in m, or as `Counted` has it
 
     def chance(self, predicted: float) -> float:
         """The chance of collision by these trials and a prediction. 0 only if both have none."""

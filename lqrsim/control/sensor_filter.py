@@ -32,15 +32,11 @@ _WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xy
 
 
 class Estimate(NamedTuple):
-    """The estimates of K trials at a knot.
+    """The estimates of K trials at a knot."""
 
-    Attributes:
-      z: (K, Z). bias: (K, B). covariance: of the errors of both, (K, Z+B, Z+B).
-    """
-
-    z: Array
-    bias: Array
-    covariance: Array
+    z: Array  # (K, Z)
+    bias: Array  # (K, B)
+    covariance: Array  # of the errors of both, (K, Z+B, Z+B)
 
     def copy(self) -> "Estimate":
         return Estimate(*(one.copy() for one in self))
@@ -48,13 +44,9 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SensorFilter:
-    """The filter about a plan.
+    """The filter about a plan."""
 
-    Attributes:
-      model: the linear model that the filter assumes. sensors: what it reads.
-    """
-
-    model: PlanModel
+    model: PlanModel  # the linear model that the filter assumes
     sensors: RobotSensors
 
     @cached_property

@@ -40,19 +40,12 @@ AT_END = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of deviations from a plan: a deviation that is just tolerated costs 1.
+    """Weights of deviations from a plan: a deviation that is just tolerated costs 1."""
 
-    Attributes:
-      state: the diagonal of Q, (n,); or C diagonals to compare, (C, n).
-      control: diagonal of R, (m,).
-      end: the diagonal of Q_T, (n,) or (C, n).
-      emphasis: E, further weights at each knot, (T+1, n, n) or (C, T+1, n, n); None for none.
-    """
-
-    state: Array
-    control: Array
-    end: Array
-    emphasis: Array | None = None
+    state: Array  # the diagonal of Q, (n,); or C diagonals to compare, (C, n)
+    control: Array  # the diagonal of R, (m,)
+    end: Array  # the diagonal of Q_T, (n,) or (C, n)
+    emphasis: Array | None = None  # E, further weights at each knot, (T+1, n, n) or (C, T+1, n, n); None for none
 
     @classmethod
     @checked
@@ -89,14 +82,10 @@ def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Averse:
-    """Noise on the states about a plan, and the aversion to large deviations.
+    """Noise on the states about a plan, and the aversion to large deviations."""
 
-    Attributes:
-      matrices: M (T, n, k), at each step. risk: theta, for half the sum that the law minimises.
-    """
-
-    matrices: Array
-    risk: float
+    matrices: Array  # M (T, n, k), at each step
+    risk: float  # theta, for half the sum that the law minimises
 
     def worst(self, t: int, S: Array, s: Array) -> tuple[Array, Array]:
         """Hessian and gradient of the cost-to-go at t + 1 under the worst noise: S + S Y S and s + S Y s.

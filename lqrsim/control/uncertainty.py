@@ -212,19 +212,12 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
 
 
 class ShapingFilter(NamedTuple):
-    """An unknown as the output h x of x' = F x + w, with k states: 0 for white noise, else its order.
+    """An unknown as the output h x of x' = F x + w, with k states: 0 for white noise, else its order."""
 
-    Attributes:
-      transition: F, (k, k).
-      noise: a square root of the covariance of w, (k, k).
-      output: h, (k,).
-      start: a square root of the covariance of x at the start, (k, k).
-    """
-
-    transition: Array
-    noise: Array
-    output: Array
-    start: Array
+    transition: Array  # F, (k, k)
+    noise: Array  # a square root of the covariance of w, (k, k)
+    output: Array  # h, (k,)
+    start: Array  # a square root of the covariance of x at the start, (k, k)
 
 
 def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:

@@ -23,16 +23,12 @@ MakeGenerator = Annotated[
 
 
 class _ForceHook(NamedTuple):
-    """A hook for a force, a torque or a wind.
+    """A hook for a force, a torque or a wind."""
 
-    Attributes:
-      label: for messages. part: which of force, torque and wind, (9,) together, it adds to. factor: times this.
-    """
-
-    label: str
+    label: str  # for messages
     hook: Hook
-    part: slice
-    factor: float
+    part: slice  # which of force, torque and wind, (9,) together, it adds to
+    factor: float  # times this
 
 
 class Effects:

@@ -30,20 +30,14 @@ UNSTABLE = [
 
 @dataclass(eq=False)
 class Period:
-    """The result of a control period, in S parts of equal length.
+    """The result of a control period, in S parts of equal length."""
 
-    Attributes:
-      states: S arrays (K, n), at the end of each part; angles in any representative.
-      frames: S arrays (K, nq), MuJoCo's qpos at these times.
-      touching: S arrays (K, obstacles), whether MuJoCo detected a contact at the beginning of the last physics step of
-        the part; empty arrays if contacts are not sensed.
-      stable: (K,) number of parts, from the first on, in which the simulation was stable.
-    """
-
-    states: list[Array]
-    frames: list[Array]
+    states: list[Array]  # S arrays (K, n), at the end of each part; angles in any representative
+    frames: list[Array]  # S arrays (K, nq), MuJoCo's qpos at these times
+    # S arrays (K, obstacles), whether MuJoCo detected a contact at the beginning of the last physics step of the part;
+    # empty arrays if contacts are not sensed.
     touching: list[npt.NDArray[np.bool_]]
-    stable: npt.NDArray[np.int64]
+    stable: npt.NDArray[np.int64]  # (K,) number of parts, from the first on, in which the simulation was stable
 
 
 class Physics:

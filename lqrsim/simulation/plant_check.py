@@ -178,20 +178,14 @@ class _Sample(NamedTuple):
 
 
 class _Region(NamedTuple):
-    """Where samples are.
+    """Where samples are."""
 
-    Attributes:
-      states: (k, n), each the mean of some samples. spread: (n,), their standard deviation. within: (2, n), bounds.
-      controls: (k, m), means; None for controls that are equally probable in their range. control_spread: (m,).
-      control_range: (2, m).
-    """
-
-    states: Array
-    spread: Array
-    within: Array
-    controls: Array | None
-    control_spread: Array
-    control_range: Array
+    states: Array  # (k, n), each the mean of some samples
+    spread: Array  # (n,), their standard deviation
+    within: Array  # (2, n), bounds
+    controls: Array | None  # (k, m), means; None for controls that are equally probable in their range
+    control_spread: Array  # (m,)
+    control_range: Array  # (2, m)
 
     @classmethod
     def of(

@@ -37,16 +37,12 @@ ROUNDING = 1e-9  # violation that is not mentioned
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a plan does between its knots.
+    """What a plan does between its knots."""
 
-    Attributes:
-      step_error, end_error: see `BetweenKnots`.
-      worst, shares: for each constraint, the largest violation in each period, and the part of the period after which
-        it is, (T, rows). Not above 0 for what is not violated, or does not act between the knots.
-    """
-
-    step_error: float
+    step_error: float  # see `BetweenKnots`
     end_error: float
+    # For each constraint, the largest violation in each period, and the part of the period after which it is, (T, rows).
+    # Not above 0 for what is not violated, or does not act between the knots.
     worst: list[Array]
     shares: list[Array]
 

@@ -44,16 +44,11 @@ PRICES = (1e2, 1e4)  # prices of violating a constraint by its typical size, rel
 
 @dataclass(eq=False)
 class Known:
-    """Results that the runs of one search share.
+    """Results that the runs of one search share."""
 
-    Attributes:
-      evidence: plans whose violation is stationary. from_start: whether the start itself was tried.
-      rows: (R,) typical sizes of the constraint rows, in which violations are measured.
-    """
-
-    evidence: list[Evidence] = field(default_factory=list)
-    from_start: bool = False
-    rows: Array | None = None
+    evidence: list[Evidence] = field(default_factory=list)  # plans whose violation is stationary
+    from_start: bool = False  # whether the start itself was tried
+    rows: Array | None = None  # (R,) typical sizes of the constraint rows, in which violations are measured
 
 
 class Ladder:
@@ -308,13 +303,9 @@ class Ladder:
 
 
 class Attempt(NamedTuple):
-    """One of the attempts to keep the constraints.
+    """One of the attempts to keep the constraints."""
 
-    Attributes:
-      words: the plan from which the interior point begins. when: whether it is tried. make: tries it.
-    """
-
-    words: str
+    words: str  # the plan from which the interior point begins
     when: Callable[[Ladder], bool]
     make: Callable[[Ladder], RunResult | None]
 

@@ -78,19 +78,13 @@ _lending = threading.Lock()
 
 @dataclass(frozen=True)
 class Ending:
-    """The way in which iterations ended: the kernel's outcome, and its texts for users.
+    """The way in which iterations ended: the kernel's outcome, and its texts for users."""
 
-    Attributes:
-      outcome: outcome in `kernels/declarations.py`. done: total number of iterations, including earlier ones.
-      failed: the step at which a pass failed, or -1. backward: whether it was a backward pass.
-      raised: the exception of a user's function, or None.
-    """
-
-    outcome: int
-    done: int = 0
-    failed: int = -1
-    backward: bool = False
-    raised: str = ""
+    outcome: int  # in `kernels/declarations.py`
+    done: int = 0  # total number of iterations, including earlier ones
+    failed: int = -1  # the step at which a pass failed, or -1
+    backward: bool = False  # whether it was a backward pass
+    raised: str = ""  # the exception of a user's function
 
     @property
     def status(self) -> Status:
@@ -144,32 +138,22 @@ def check_finite_at_start(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunResult:
-    """Result of a run, from which `assemble` makes a `Solution`.
-
-    Attributes:
-      plan: states (T+1, n) and controls (T, m). cost: that of the plan, as in the log; infinite without a plan.
-      law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, in the form for
-        `assemble`.
-      final: whether no other start can do better.
-      stuck: whether the violation no longer falls, however large the penalty.
-      remedy: a remedy that is known already; empty for the usual one.
-      against: in words, the constraints and limits that conflict with the violated constraints, the strongest first.
-    """
+    """Result of a run, from which `assemble` makes a `Solution`."""
 
     status: Status
     plan: Motion
-    law: tuple[Array, Array]
-    cost: float = np.inf
+    law: tuple[Array, Array]  # gain (T, m, n) and offset (T, m)
+    cost: float = np.inf  # of the plan, as in the log; infinite without a plan
     violation: float = np.inf
     gap: float = np.nan
     detail: str = ""
-    values: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)  # cost-to-go, cost-to-come and inverse law, for `assemble`
     multipliers: tuple[Multipliers, ...] = ()
     certificate: Certificate | None = None
-    final: bool = False
-    stuck: bool = False
-    against: tuple[str, ...] = ()
-    remedy: str = ""
+    final: bool = False  # whether no other start can do better
+    stuck: bool = False  # whether the violation no longer falls, however large the penalty
+    against: tuple[str, ...] = ()  # in words, what conflicts with the violated constraints, the strongest first
+    remedy: str = ""  # one that is known already; empty for the usual one
 
     @property
     def states(self) -> Array:

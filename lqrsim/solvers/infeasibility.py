@@ -26,16 +26,11 @@ NAMED = 3  # largest number of constraints that a message names in addition to t
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A plan whose violation is stationary.
-
-    Attributes:
-      plan: the plan. missed: its violation, in a measure that is the same for a whole search.
-      against: the other constraints that conflict, in words, the strongest first.
-    """
+    """A plan whose violation is stationary."""
 
     plan: RunResult
-    missed: float
-    against: tuple[str, ...] = ()
+    missed: float  # its violation, in a measure that is the same for a whole search
+    against: tuple[str, ...] = ()  # the other constraints that conflict, in words, the strongest first
 
     def beside(self, worst: str) -> tuple[str, ...]:
         """The conflicting constraints other than the one that a message begins with, in words."""

@@ -91,26 +91,16 @@ StartLike = Beginning | Callable[[Problem], Beginning]
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """The initial guess of a solve, from which the first pass starts.
+    """The initial guess of a solve, from which the first pass starts."""
 
-    Attributes:
-      gain, offset: (T, m, n) and (T, m), the policy to begin with.
-      summary: its entry in the options of a solution.
-      cost_to_go: the cost-to-go, or None if unknown.
-      trajectory: the trajectory that the first pass linearises about, feasible or not; None for the policy's.
-      prior: added to the cost in the first iterations.
-      multipliers: multipliers of the constraints; empty if unknown.
-      found: a result that the interior point has already found, with the iterations in `log`; only finishing remains.
-    """
-
-    gain: Array
+    gain: Array  # (T, m, n) and (T, m), the policy to begin with
     offset: Array
-    summary: object = ""
+    summary: object = ""  # its entry in the options of a solution
     cost_to_go: Quadratic | None = None
-    trajectory: Trajectory | None = None
+    trajectory: Trajectory | None = None  # that the first pass linearises about, feasible or not; None for the policy's
     prior: InitialPrior | None = None
-    multipliers: tuple[Multipliers, ...] = ()
-    found: "Found | None" = None
+    multipliers: tuple[Multipliers, ...] = ()  # of the constraints; empty if unknown
+    found: "Found | None" = None  # a result of the interior point, with the iterations in `log`: only finishing remains
     log: tuple[Iteration, ...] = ()
 
     @property

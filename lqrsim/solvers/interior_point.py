@@ -24,20 +24,13 @@ NAME = "interior point"  # name of its iterations in the log
 
 
 class Measures(NamedTuple):
-    """Residuals of a plan.
-
-    Attributes:
-      cost: cost of the plan. stationarity: the largest slope of the Lagrangian in a control, times its range, relative
-        to the cost. violation: violation of the worst constraint, in its unit. gap: the largest gap between two steps,
-        relative to the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to
-        the cost.
-    """
+    """Residuals of a plan."""
 
     cost: float
-    stationarity: float
-    violation: float
-    gap: float
-    complementarity: float
+    stationarity: float  # largest slope of the Lagrangian in a control, times its range, relative to the cost
+    violation: float  # of the worst constraint, in its unit
+    gap: float  # the largest between two steps, relative to the states' ranges
+    complementarity: float  # the largest product of a multiplier and its margin, relative to the cost
 
     def record(self, laps: Laps, method: str = NAME, seconds: float | None = None) -> None:
         """Record the residuals as those of an iteration; by default it took all the time since the last one."""
@@ -47,25 +40,17 @@ class Measures(NamedTuple):
 
 @dataclass(kw_only=True, eq=False)
 class Found:
-    """Result of a run.
+    """Result of a run."""
 
-    Attributes:
-      plan: states and controls, feasible except for gaps. gain: (T, m, n) about it. measures: its measures.
-      multipliers: multipliers of each constraint (T+1, rows), and of the limits (T, m), positive if a control presses
-        against its upper limit. solved: whether all measures are within tolerance. flat: whether it ended because the
-        cost no longer changed, without being stationary.
-      sizes: typical sizes. scale: the cost to which measures are relative.
-    """
-
-    plan: Motion
-    gain: Array
+    plan: Motion  # feasible except for gaps
+    gain: Array  # (T, m, n) about it
     measures: Measures
-    multipliers: tuple[Array, ...]
-    pressing: Array
-    solved: bool
-    flat: bool
+    multipliers: tuple[Array, ...]  # of each constraint (T+1, rows)
+    pressing: Array  # (T, m), the same of the limits, positive if a control presses against its upper limit
+    solved: bool  # whether all measures are within tolerance
+    flat: bool  # whether it ended because the cost no longer changed, without being stationary
     sizes: Sizes
-    scale: float
+    scale: float  # the cost to which measures are relative
 
     def trajectory(self, dt: float) -> Trajectory:
         """The plan in steps of dt seconds."""
