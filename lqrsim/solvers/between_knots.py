@@ -41,8 +41,8 @@ class Look:
 
     step_error: float  # see `BetweenKnots`
     end_error: float
-    # For each constraint, the largest violation in each period, and the part of the period after which it is, (T, rows).
-    # Not above 0 for what is not violated, or does not act between the knots.
+    # For each constraint, the largest violation in each period, and the part of the period after which it is (T, rows),
+    # not above 0 for what is not violated, or does not act between the knots.
     worst: list[Array]
     shares: list[Array]
 

@@ -13,16 +13,7 @@ from lqrsim.control.plan_model import Lag
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_name, keep
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import (
-    Disturbance,
-    Effect,
-    Numbers,
-    check_numbers,
-    fit,
-    left_out,
-    times,
-    with_units,
-)
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, with_units
 from lqrsim.simulation.plant import Plant
 
 _FIXED = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
@@ -86,7 +77,7 @@ class Saturation(Disturbance):
             got = "both" if given else "neither"
             raise InputError(f"Saturation: share: got {got} share and limits, want lowest, highest or both, or a share")
         for name in given:
-            keep(self, **{name: check_numbers(self, name, getattr(self, name))})
+            keep(self, **{name: self._checked(name, getattr(self, name))})
 
     def describe(self, plant: Plant) -> str:
         space = plant.robot.dynamics.control_coordinates
@@ -95,14 +86,14 @@ class Saturation(Disturbance):
         else:
             sides = {"from": self.lowest, "to": self.highest}
             limits = " ".join(
-                f"{word} {with_units(fit(self, v, space), space)}" for word, v in sides.items() if v is not None
+                f"{word} {with_units(self._fit(v, space), space)}" for word, v in sides.items() if v is not None
             )
         return f"controls limited {'to ' if self.share is not None else ''}{limits}" + (
             f", strength {self.strength:g}" if self.strength != 1 else ""
         )
 
     def scaled(self, strength: float) -> "Saturation":
-        return replace(self, strength=times(self, self.strength, strength))
+        return replace(self, strength=self._times(self.strength, strength))
 
     def limits(self, plant: Plant) -> tuple[Array, Array]:
         """The narrowed limits, which the robot's own limits must contain."""
@@ -115,7 +106,7 @@ class Saturation(Disturbance):
             wanted = np.array([np.maximum(own[0], self.share * own[0]), np.minimum(own[1], self.share * own[1])])
         else:
             sides = zip(("lowest", "highest"), (self.lowest, self.highest), own, strict=True)
-            wanted = np.array([fit(self, o if v is None else v, space.names, name) for name, v, o in sides])
+            wanted = np.array([self._fit(o if v is None else v, space.names, name) for name, v, o in sides])
         if (wanted != np.clip(wanted, *own)).any() or (wanted[0] > wanted[1]).any():
             i = int(np.argmax((wanted != np.clip(wanted, *own)).any(axis=0) | (wanted[0] > wanted[1])))
             raise InputError(
@@ -146,7 +137,7 @@ class Saturation(Disturbance):
         space = plant.robot.dynamics.control_coordinates
         if np.array_equal(self.limits(plant), (space.low, space.high)):
             return Uncertainty()
-        return left_out(self, plant, "limits are not linear, and a law uses the robot's own")
+        return self._left_out(plant, "limits are not linear, and a law uses the robot's own")
 
 
 @checked
@@ -172,7 +163,7 @@ class ActuatorLoss(Disturbance):
 
     def scaled(self, strength: float) -> "ActuatorLoss":
         """The same with `strength` times the loss, at most a complete loss."""
-        lost = min(1.0, times(self, 1 - self.remaining, strength))
+        lost = min(1.0, self._times(1 - self.remaining, strength))
         return replace(self, remaining=self.remaining if strength == 1 else 1 - lost)
 
     def check(self, plant: Plant) -> None:
@@ -206,7 +197,7 @@ class ActuatorLoss(Disturbance):
         return Effect(alter=alter, actuate=actuate)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "it is not a small deviation, and comes once", acts=self.remaining != 1)
+        return self._left_out(plant, "it is not a small deviation, and comes once", acts=self.remaining != 1)
 
 
 def check_gains(disturbance: Disturbance, plant: Plant) -> None:

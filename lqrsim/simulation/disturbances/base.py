@@ -110,7 +110,7 @@ class Disturbance(abc.ABC):
         """The disturbance with `strength` times the effect, for sweeps: 0 has none, 1 is the disturbance itself."""
         if self._scales:
             one: Any = self
-            return replace(one, **{self._scales: times(self, getattr(self, self._scales), strength)})
+            return replace(one, **{self._scales: self._times(getattr(self, self._scales), strength)})
         raise InputError(
             f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
         )
@@ -120,11 +120,78 @@ class Disturbance(abc.ABC):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason."""
-        return left_out(self, plant, f"{type(self).__name__} does not override `uncertainty`")
+        return self._left_out(plant, f"{type(self).__name__} does not override `uncertainty`")
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         """The effect on a run of K trials, one per generator, from which alone its random numbers must come."""
+
+    # For `uncertainty`.
+
+    def _left_out(self, plant: Plant, why: str, *, acts: bool = True) -> Uncertainty:
+        """No linear model represents it: its description and the reason, if it acts."""
+        return Uncertainty(left_out=(f"{self.describe(plant)}: {why}",) if acts else ())
+
+    def _unknowns(self, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:
+        """The unknowns that are not zero. Unknowns that the robot's dynamics lack are listed as left out, by name."""
+        known, missing = possible_unknowns(plant.robot.dynamics), dict[str, None]()
+        kept = list[Unknown]()
+        for one in wanted:
+            if one.std == 0:
+                continue
+            missing |= dict.fromkeys(name for name in one.shares if name not in known)
+            shares = {name: share for name, share in one.shares.items() if name in known}
+            if shares:
+                kept.append(replace(one, of=shares))
+        why = f"the dynamics of robot {plant.robot.name} have no {', '.join(missing)}"
+        return replace(self._left_out(plant, why, acts=bool(missing)), unknowns=kept)
+
+    # Fields that are numbers: one, or one for each component; and strengths.
+
+    def _checked(self, name: str, numbers: PerEntry, *, at_least: float = -np.inf, by_name: bool = False) -> Any:
+        """A field as a number, a tuple or, if it may have them, numbers by name or unit."""
+        field, lowest = f"{type(self).__name__}: {name}", at_least if np.isfinite(at_least) else None
+        if isinstance(numbers, Mapping):
+            if not by_name:
+                raise InputError(f"{field}: got numbers by name, want one number, or one for each component in order")
+            if not numbers:
+                raise InputError(f"{field}: got no numbers, want at least one")
+            keys = [check_text(f"{field}: name", key, "a name or a unit") for key in numbers]
+            return {key: check_number(f"{field}: {key}", numbers[key], at_least=lowest) for key in keys}
+        if real(field, numbers).ndim == 0:
+            return check_number(field, numbers, at_least=lowest)
+        values = check_array(field, numbers, (None,))
+        if not len(values):
+            raise InputError(f"{field}: got no numbers, want at least one")
+        if (values < at_least).any():
+            raise InputError(f"{field}: got {values.min():g}, want numbers >= {at_least:g}")
+        return tuple(values.tolist())
+
+    def _fit(self, numbers: PerEntry, components: Coordinates | Sequence[str], field: str = "std") -> Array:
+        """A field as one number for each component."""
+        names = components.names if isinstance(components, Coordinates) else components
+        if isinstance(numbers, Mapping):
+            assert isinstance(components, Coordinates)
+            return per_entry(f"{type(self).__name__}: {field}", numbers, components)
+        values = np.asarray(numbers, dtype=np.float64)
+        if values.ndim and len(values) != len(names):
+            want = f"1 or {len(names)}: {', '.join(names)}"
+            raise InputError(f"{type(self).__name__}: {field}: got {len(values)} numbers, want {want}")
+        return np.broadcast_to(values, len(names))
+
+    def _strength(self, strength: float) -> float:
+        """The argument of `scaled`."""
+        return check_number(f"{type(self).__name__}: strength", strength, at_least=0.0)
+
+    def _times(self, numbers: PerEntry, strength: float) -> Any:
+        """Numbers times the strength, which must not be so large that they overflow."""
+        if isinstance(numbers, Mapping):
+            return {name: self._times(one, strength) for name, one in numbers.items()}
+        with np.errstate(over="ignore"):
+            product = self._strength(strength) * np.asarray(numbers, dtype=np.float64)
+        if not np.isfinite(product).all():
+            raise InputError(f"{type(self).__name__}: strength: got {strength:g}, want less: the result overflows")
+        return float(product) if product.ndim == 0 else tuple(product.tolist())
 
 
 @dataclass(frozen=True)
@@ -142,29 +209,9 @@ class GaussianDisturbance(Disturbance):
     by_name: ClassVar[bool] = False  # whether numbers may have the names or units of the components
 
     def __post_init__(self) -> None:
-        keep(self, std=check_numbers(self, "std", self.std, at_least=0.0, by_name=self.by_name))
+        keep(self, std=self._checked("std", self.std, at_least=0.0, by_name=self.by_name))
         if self.along:
-            fit(self, self.std, self.along)
-
-
-def left_out(disturbance: Disturbance, plant: Plant, why: str, *, acts: bool = True) -> Uncertainty:
-    """The Uncertainty of a disturbance that no linear model represents: its description and the reason, if it acts."""
-    return Uncertainty(left_out=(f"{disturbance.describe(plant)}: {why}",) if acts else ())
-
-
-def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:
-    """The unknowns that are not zero. Unknowns that the robot's dynamics lack are listed as left out, by name."""
-    known, missing = possible_unknowns(plant.robot.dynamics), dict[str, None]()
-    kept = list[Unknown]()
-    for one in wanted:
-        if one.std == 0:
-            continue
-        missing |= dict.fromkeys(name for name in one.shares if name not in known)
-        shares = {name: share for name, share in one.shares.items() if name in known}
-        if shares:
-            kept.append(replace(one, of=shares))
-    why = f"the dynamics of robot {plant.robot.name} have no {', '.join(missing)}"
-    return Uncertainty(unknowns=kept, left_out=left_out(disturbance, plant, why).left_out if missing else ())
+            self._fit(self.std, self.along)
 
 
 def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
@@ -178,64 +225,6 @@ def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> 
 def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
     """Uniform numbers (K, steps, size) in [0, 1). Each trial draws from its own generator."""
     return np.stack([generator.random((steps, size)) for generator in generators])
-
-
-def check_numbers(
-    disturbance: Disturbance, name: str, numbers: PerEntry, *, at_least: float = -np.inf, by_name: bool = False
-) -> Any:
-    """A field as a number, a tuple or, if it may have them, numbers by name or unit.
-
-    Raises InputError for no numbers, and for too small or infinite numbers.
-    """
-    field, lowest = f"{type(disturbance).__name__}: {name}", at_least if np.isfinite(at_least) else None
-    if isinstance(numbers, Mapping):
-        if not by_name:
-            raise InputError(f"{field}: got numbers by name, want one number, or one for each component in order")
-        if not numbers:
-            raise InputError(f"{field}: got no numbers, want at least one")
-        keys = [check_text(f"{field}: name", key, "a name or a unit") for key in numbers]
-        return {key: check_number(f"{field}: {key}", numbers[key], at_least=lowest) for key in keys}
-    if real(field, numbers).ndim == 0:
-        return check_number(field, numbers, at_least=lowest)
-    values = check_array(field, numbers, (None,))
-    if not len(values):
-        raise InputError(f"{field}: got no numbers, want at least one")
-    if (values < at_least).any():
-        raise InputError(f"{field}: got {values.min():g}, want numbers >= {at_least:g}")
-    return tuple(values.tolist())
-
-
-def check_strength(disturbance: Disturbance, strength: float) -> float:
-    """The argument of `scaled` as a number. Raises InputError if it is negative."""
-    return check_number(f"{type(disturbance).__name__}: strength", strength, at_least=0.0)
-
-
-def times(disturbance: Disturbance, numbers: PerEntry, strength: float) -> Any:
-    """Numbers times the strength. Raises InputError if the strength is negative or too large."""
-    if isinstance(numbers, Mapping):
-        return {name: times(disturbance, one, strength) for name, one in numbers.items()}
-    with np.errstate(over="ignore"):
-        product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
-    if not np.isfinite(product).all():
-        raise InputError(f"{type(disturbance).__name__}: strength: got {strength:g}, want less: the result overflows")
-    return float(product) if product.ndim == 0 else tuple(product.tolist())
-
-
-def fit(
-    disturbance: Disturbance, numbers: PerEntry, components: Coordinates | Sequence[str], field: str = "std"
-) -> Array:
-    """A field as one number for each component. Raises InputError if it has neither one number, nor one for each."""
-    names = components.names if isinstance(components, Coordinates) else components
-    if isinstance(numbers, Mapping):
-        assert isinstance(components, Coordinates)
-        return per_entry(f"{type(disturbance).__name__}: {field}", numbers, components)
-    values = np.asarray(numbers, dtype=np.float64)
-    if values.ndim and len(values) != len(names):
-        raise InputError(
-            f"{type(disturbance).__name__}: {field}: got {len(values)} numbers, want 1 or {len(names)}:"
-            f" {', '.join(names)}"
-        )
-    return np.broadcast_to(values, len(names))
 
 
 def with_units(values: Array, coordinates: Coordinates) -> str:

@@ -11,7 +11,7 @@ from lqrsim.annotations import Bounds, Index, Share, checked
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, check_strength, times, uniform
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, uniform
 from lqrsim.simulation.plant import Plant
 
 
@@ -33,7 +33,7 @@ class Late(Disturbance):
 
     def scaled(self, strength: float) -> Self:
         """The delay with `strength` times the periods, rounded to whole periods."""
-        return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
+        return replace(self, periods=int(self._times(self.periods, strength) + 0.5))
 
 
 class ControlDelay(Late):
@@ -135,7 +135,7 @@ class Dropouts(Disturbance):
 
     def scaled(self, strength: float) -> Self:
         """The link with `strength` times as many losses or bad spells; at most everything is lost."""
-        strength, loss = check_strength(self, strength), self.loss
+        strength, loss = self._strength(strength), self.loss
         if not isinstance(loss, GilbertElliott):
             return replace(self, loss=min(1.0, strength * loss))
         to_bad, lost = min(1.0, strength * loss.to_bad), min(1.0, strength * loss.lost_when_good)

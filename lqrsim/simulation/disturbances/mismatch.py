@@ -22,17 +22,7 @@ from lqrsim.errors import Array, InputError, check_name, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.simulation.disturbances.actuation import check_gains
-from lqrsim.simulation.disturbances.base import (
-    Disturbance,
-    Effect,
-    Numbers,
-    check_numbers,
-    check_strength,
-    fit,
-    left_out,
-    unknowns_of,
-    words,
-)
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, words
 from lqrsim.simulation.plant import Plant
 
 CUT = 3.0  # standard deviations at which normal numbers are truncated
@@ -62,7 +52,7 @@ class Mismatch(Disturbance):
             got = "neither of" if self.std is None else "both"
             raise InputError(f"{name}: got {got} std and factor, want one of the two")
         if self.factor is not None:
-            factor = check_numbers(self, "factor", self.factor)
+            factor = self._checked("factor", self.factor)
             if not np.min(factor) > 0:
                 raise InputError(f"{name}: factor: got {np.min(factor):g}, want numbers > 0")
             keep(self, factor=factor)
@@ -84,7 +74,7 @@ class Mismatch(Disturbance):
 
     def scaled(self, strength: float) -> "Mismatch":
         """The mismatch with `strength` times the standard deviation, or with a fixed factor raised to that power."""
-        strength = check_strength(self, strength)
+        strength = self._strength(strength)
         if self.factor is None:
             return replace(self, std=strength * (self.std or 0.0))
         factor = np.asarray(self.factor) ** strength
@@ -95,7 +85,7 @@ class Mismatch(Disturbance):
         parts = self.parts(plant)
         if self.factor is None:
             return np.full(len(parts), CUT_STD * (self.std or 0.0))
-        return np.abs(fit(self, self.factor, parts, "factor") - 1)
+        return np.abs(self._fit(self.factor, parts, "factor") - 1)
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
@@ -103,8 +93,27 @@ class Mismatch(Disturbance):
         if self.factor is None:
             factors = 1 + (self.std or 0.0) * np.array([[cut_normal(one) for _ in parts] for one in generators])
         else:
-            factors = np.tile(fit(self, self.factor, parts, "factor"), (len(generators), 1))
+            factors = np.tile(self._fit(self.factor, parts, "factor"), (len(generators), 1))
         return self.effect(plant, factors)
+
+    def _of_parameter(self, plant: Plant, name: str) -> Uncertainty:
+        """The unknown of a mismatch that multiplies a parameter of the dynamics."""
+        dynamics = plant.robot.dynamics
+        nominal = abs((dynamics.disturbances | dynamics.parameters).get(name, 1.0))
+        return self._unknowns(plant, [Unknown(name, nominal * float(self.spread(plant)[0]))])
+
+    def _of_gains(self, plant: Plant, actuators: Sequence[str | None]) -> Uncertainty:
+        """The unknowns of a mismatch that multiplies the effects of actuators, one per part."""
+        controls, wanted, lost = controls_of(plant), list[Unknown](), list[str]()
+        for part, actuator, std in zip(self.parts(plant), actuators, self.spread(plant), strict=True):
+            if actuator in controls:
+                wanted.append(Unknown(GAIN + controls[actuator], float(std)))
+            elif std > 0:
+                lost.append(part)
+        known = self._unknowns(plant, wanted)
+        if not lost:
+            return known
+        return replace(known, left_out=self._left_out(plant, f"no control drives {', '.join(lost)} alone").left_out)
 
 
 class MassMismatch(Mismatch):
@@ -116,8 +125,8 @@ class MassMismatch(Mismatch):
         dynamics, masses = plant.robot.dynamics, plant.model.body_mass
         loads = {load_of(plant, number): float(masses[number]) for number in plant.bodies if masses[number] > 0}
         if loads.keys() <= dynamics.disturbances.keys():  # true for a robot from an MJCF
-            return unknowns_of(self, plant, [Unknown(loads, float(self.spread(plant)[0]))])
-        return parameter_unknown(self, plant, "mass")
+            return self._unknowns(plant, [Unknown(loads, float(self.spread(plant)[0]))])
+        return self._of_parameter(plant, "mass")
 
 
 @checked
@@ -160,7 +169,7 @@ class Payload(Disturbance):
         load, whole = load_of(plant, self._number(plant)), "mass"
         declared = possible_unknowns(plant.robot.dynamics)
         alone = load not in declared and whole in declared and len(plant.bodies) == 1
-        return unknowns_of(self, plant, [Unknown(whole if alone else load, self.mass)])
+        return self._unknowns(plant, [Unknown(whole if alone else load, self.mass)])
 
 
 class InertiaMismatch(Mismatch):
@@ -173,7 +182,7 @@ class InertiaMismatch(Mismatch):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         why = "it scales how fast torques turn the robot, for which predictions have no unknown"
-        return left_out(self, plant, why, acts=bool(self.spread(plant).any()))
+        return self._left_out(plant, why, acts=bool(self.spread(plant).any()))
 
 
 class ThrustMismatch(Mismatch):
@@ -194,7 +203,7 @@ class ThrustMismatch(Mismatch):
         return plant.robot.actuators
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return gain_unknowns(self, plant, plant.robot.actuators)
+        return self._of_gains(plant, plant.robot.actuators)
 
 
 class WheelMismatch(Mismatch):
@@ -233,7 +242,7 @@ class WheelRadiusMismatch(WheelMismatch):
         simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * parents[:, 2]  # upward, in their axes
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return gain_unknowns(self, plant, [driven_by(plant, hub) for hub in treads(plant)[1]])
+        return self._of_gains(plant, [driven_by(plant, hub) for hub in treads(plant)[1]])
 
 
 class AxleMismatch(WheelMismatch):
@@ -247,7 +256,7 @@ class AxleMismatch(WheelMismatch):
         simulations.expand("body_pos")[:, hubs] += (factors - 1)[:, :, None] * from_middle
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return parameter_unknown(self, plant, "axle_length")
+        return self._of_parameter(plant, "axle_length")
 
 
 class FrictionMismatch(WheelMismatch):
@@ -260,33 +269,12 @@ class FrictionMismatch(WheelMismatch):
         simulations.expand("geom_friction")[:, wheels, 0] *= factors
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "the dynamics of plans have no friction", acts=bool(self.spread(plant).any()))
-
-
-def parameter_unknown(mismatch: Mismatch, plant: Plant, name: str) -> Uncertainty:
-    """The unknown of a mismatch that multiplies a parameter of the dynamics."""
-    dynamics = plant.robot.dynamics
-    nominal = abs((dynamics.disturbances | dynamics.parameters).get(name, 1.0))
-    return unknowns_of(mismatch, plant, [Unknown(name, nominal * float(mismatch.spread(plant)[0]))])
+        return self._left_out(plant, "the dynamics of plans have no friction", acts=bool(self.spread(plant).any()))
 
 
 def load_of(plant: Plant, body: int) -> str:
     """The name of a load on that body, as robots from an MJCF use it."""
     return f"{plant.model.body(body).name}_load"
-
-
-def gain_unknowns(mismatch: Mismatch, plant: Plant, actuators: Sequence[str | None]) -> Uncertainty:
-    """The unknowns of a mismatch that multiplies the effects of actuators, one per part."""
-    controls, wanted, lost = controls_of(plant), list[Unknown](), list[str]()
-    for part, actuator, std in zip(mismatch.parts(plant), actuators, mismatch.spread(plant), strict=True):
-        if actuator in controls:
-            wanted.append(Unknown(GAIN + controls[actuator], float(std)))
-        elif std > 0:
-            lost.append(part)
-    known = unknowns_of(mismatch, plant, wanted)
-    if not lost:
-        return known
-    return replace(known, left_out=left_out(mismatch, plant, f"no control drives {', '.join(lost)} alone").left_out)
 
 
 def controls_of(plant: Plant) -> dict[str | None, str]:

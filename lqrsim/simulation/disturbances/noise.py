@@ -12,18 +12,7 @@ from lqrsim.errors import Array, InputError, check_array, check_items, keep
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import (
-    Disturbance,
-    Effect,
-    GaussianDisturbance,
-    check_strength,
-    fit,
-    left_out,
-    normal,
-    unknowns_of,
-    with_units,
-    words,
-)
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, GaussianDisturbance, normal, with_units, words
 from lqrsim.simulation.plant import Plant
 
 
@@ -49,7 +38,7 @@ class AddedError(GaussianDisturbance):
         return f"{self.what}, std {with_units(self._deviations(plant), self._coordinates(plant))}"
 
     def _deviations(self, plant: Plant) -> Array:
-        return fit(self, self.std, self._coordinates(plant))
+        return self._fit(self.std, self._coordinates(plant))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std, steps = self._deviations(plant), 1 if self.lasts else plan.steps + (self.hook == "measure")
@@ -77,7 +66,7 @@ class ControlOffset(AddedError):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         controls = zip(self._coordinates(plant).names, self._deviations(plant).tolist(), strict=True)
-        return unknowns_of(self, plant, [Unknown(OFFSET + name, std) for name, std in controls])
+        return self._unknowns(plant, [Unknown(OFFSET + name, std) for name, std in controls])
 
 
 class MeasurementNoise(AddedError):
@@ -93,7 +82,7 @@ class MeasurementBias(AddedError):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         acts = bool(self._deviations(plant).any())
-        return left_out(self, plant, "measurements cannot distinguish it from the state", acts=acts)
+        return self._left_out(plant, "measurements cannot distinguish it from the state", acts=acts)
 
 
 class InitialStateError(AddedError):
@@ -123,13 +112,13 @@ class WrenchNoise(GaussianDisturbance):
         return f"{self.kind} noise, std {words(self.std)} {self.unit}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        vectors = fit(self, self.std, self.along) * normal(generators, plan.steps, 3)
+        vectors = self._fit(self.std, self.along) * normal(generators, plan.steps, 3)
         hooks: dict[str, Any] = {self.kind: lambda step, states: vectors[:, step]}
         return Effect(**hooks)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        axes = zip(self.along, fit(self, self.std, self.along).tolist(), strict=True)
-        return unknowns_of(self, plant, [Unknown(f"{self.kind}_{axis}", std, time_constant=0.0) for axis, std in axes])
+        axes = zip(self.along, self._fit(self.std, self.along).tolist(), strict=True)
+        return self._unknowns(plant, [Unknown(f"{self.kind}_{axis}", std, time_constant=0.0) for axis, std in axes])
 
 
 class ForceNoise(WrenchNoise):
@@ -165,7 +154,7 @@ class DisplacedObstacles(GaussianDisturbance):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
-        displaced = fit(self, self.std, self.along) * normal(generators, len(plant.world), 3)
+        displaced = self._fit(self.std, self.along) * normal(generators, len(plant.world), 3)
         displaced[:, [obstacle.kind == "plane" for obstacle in plant.world.obstacles]] = 0.0
         if plant.robot.dynamics.state_coordinates.from_above:
             displaced[..., 2] = 0.0
@@ -174,7 +163,7 @@ class DisplacedObstacles(GaussianDisturbance):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The root mean square of the standard deviations over the axes that matter."""
         axes = 2 if plant.robot.dynamics.state_coordinates.from_above else 3
-        return Uncertainty(obstacles=float(np.sqrt(np.mean(fit(self, self.std, self.along)[:axes] ** 2))))
+        return Uncertainty(obstacles=float(np.sqrt(np.mean(self._fit(self.std, self.along)[:axes] ** 2))))
 
 
 @dataclass(frozen=True)
@@ -190,7 +179,7 @@ class StateNoise(Disturbance):
         return f"noise on the states, {self.noise!r}"
 
     def scaled(self, strength: float) -> "StateNoise":
-        return StateNoise(self.noise.scaled(check_strength(self, strength)))
+        return StateNoise(self.noise.scaled(self._strength(strength)))
 
     def check(self, plant: Plant) -> None:
         self.noise.bind(plant.robot.dynamics)
@@ -209,7 +198,7 @@ class StateNoise(Disturbance):
         return Effect(kick=kick)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "filters and tubes have no noise that acts on the states directly")
+        return self._left_out(plant, "filters and tubes have no noise that acts on the states directly")
 
 
 def as_disturbances(given: object) -> tuple[Disturbance, ...]:
@@ -249,4 +238,4 @@ class Push(Disturbance):
         return Effect(force=lambda step, states: np.broadcast_to(forces[step], (len(states), 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "it comes once, and noise does not", acts=any(self.impulse))
+        return self._left_out(plant, "it comes once, and noise does not", acts=any(self.impulse))

@@ -13,7 +13,7 @@ from lqrsim.errors import Array, check_items, check_kind, check_name, keep
 from lqrsim.problem.belief import Belief
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import Sensor
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, left_out, normal, uniform
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, normal, uniform
 from lqrsim.simulation.plant import Plant
 
 READINGS, DEVIATIONS = "readings", "standard deviations"  # of a belief, by which `read` has them
@@ -86,7 +86,7 @@ class SensorErrors(Disturbance):
         return Effect(read=read)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "OffsetFree has them by its own sensors=", acts=self.strength > 0)
+        return self._left_out(plant, "OffsetFree has them by its own sensors=", acts=self.strength > 0)
 
 
 @checked
@@ -119,4 +119,4 @@ class ReadingErrors(Disturbance):
         return Effect(read=read)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "a BeliefFeedback has them by its belief", acts=self.strength > 0)
+        return self._left_out(plant, "a BeliefFeedback has them by its belief", acts=self.strength > 0)

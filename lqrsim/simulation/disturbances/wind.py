@@ -14,17 +14,7 @@ from lqrsim.annotations import Bounds, Finite, Positive, checked
 from lqrsim.control.uncertainty import Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import (
-    Disturbance,
-    Effect,
-    Numbers,
-    check_numbers,
-    fit,
-    normal,
-    times,
-    unknowns_of,
-    words,
-)
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, normal, words
 from lqrsim.simulation.plant import Plant
 
 FOOT = 0.3048  # m
@@ -74,7 +64,7 @@ class MeanWind(Wind):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The wind as an unknown constant of mean zero, with the wind's size as std: its direction is unknown."""
         winds = zip("xyz", self.velocity, strict=True)
-        return unknowns_of(self, plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
+        return self._unknowns(plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
 
 
 @checked
@@ -95,8 +85,8 @@ class Gusts(Wind):
     _scales = "std"
 
     def __post_init__(self) -> None:
-        keep(self, std=check_numbers(self, "std", self.std, at_least=0.0))
-        fit(self, self.std, "xyz")
+        keep(self, std=self._checked("std", self.std, at_least=0.0))
+        self._fit(self.std, "xyz")
 
     def describe(self, plant: Plant) -> str:
         return f"gusts, std {words(self.std)} m/s, time constant {self.time_constant:g} s"
@@ -104,11 +94,11 @@ class Gusts(Wind):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
         noise = normal(generators, plan.steps, 3)
-        return self.blow(plant, fit(self, self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
+        return self.blow(plant, self._fit(self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        winds = zip("xyz", fit(self, self.std, "xyz"), strict=True)
-        return unknowns_of(self, plant, [Unknown(f"wind_{axis}", std, self.time_constant) for axis, std in winds])
+        winds = zip("xyz", self._fit(self.std, "xyz"), strict=True)
+        return self._unknowns(plant, [Unknown(f"wind_{axis}", std, self.time_constant) for axis, std in winds])
 
 
 @checked
@@ -166,7 +156,7 @@ class Dryden(Wind):
         return f"{severity}Dryden turbulence at {self.altitude:g} m, wind {self.wind_at_20_ft:.3g} m/s at 20 ft"
 
     def scaled(self, strength: float) -> "Dryden":
-        return replace(self, wind=times(self, self.wind_at_20_ft, strength))
+        return replace(self, wind=self._times(self.wind_at_20_ft, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
@@ -190,7 +180,7 @@ class Dryden(Wind):
         )
         processes = (along, 1), (across, 2), ("wind_z", 2)
         parts = zip(processes, self.std, constants, strict=True)
-        return unknowns_of(self, plant, [Unknown(of, std, constant, order) for (of, order), std, constant in parts])
+        return self._unknowns(plant, [Unknown(of, std, constant, order) for (of, order), std, constant in parts])
 
 
 def first_order(noise: Array, step: float) -> Array:
