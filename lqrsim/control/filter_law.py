@@ -76,14 +76,10 @@ class FilterLaw:
 
 
 class FilterRun(ControllerRun):
-    """K trials of a run, with their estimates.
+    """K trials of a run, with their estimates z (K, Z) at the knot of the newest measurement.
 
     If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
-    commands since, to the time at which the next command acts.
-
-    Attributes:
-      first: the step at which the law's plan begins.
-      z: the current estimates, (K, Z), at the knot of the newest measurement.
+    commands since, to the time at which the next command acts. The law's plan begins at the step `first`.
     """
 
     def __init__(self, law: FilterLaw, trials: int, record: bool) -> None:

@@ -22,34 +22,32 @@ from lqrsim.kernels import loop_moments
 from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork, zeros_of
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedLoop:
-    """C laws in L systems: y' = F X + G (u - planned) + c + w with the commands K X + command + r, limited to u."""
+def moments_of(loops: LoopArrays, stated: int, count: int | None = None, lost: float = 0.0) -> LoopMoments:
+    """The moments of the first entries of y, or of all, in each of L systems under each of C laws, (L, C, ...).
 
-    arrays: LoopArrays
-    stated: int  # number of the first entries of y that are the system's own; with losses, the last m of these are a
-    lost: float = 0.0  # fraction of the commands that get lost
-
-    def moments(self, count: int) -> LoopMoments:
-        """The moments of the first entries of y in each system under each law, (L, C, ...)."""
-        loops, (steps, laws, m, width), (systems, own) = self.arrays, self.arrays.K.shape, self.arrays.F.shape[1:3]
-        rows, columns, lossy = *loops.noise.shape[2:], 0 < self.lost < 1
-        sizes = LoopSizes(
-            steps, systems, laws, own, width, m, count, self.stated, rows, columns, bool(loops.jointly.size), lossy,
-            self.lost / (1 - self.lost) if lossy else 0.0,
-        )  # fmt: skip
-        lengths = {"T": steps, "L": systems, "C": laws, "Y": own, "X": width, "R": width - own, "m": m, "N": count}
-        work, found = zeros_of(LoopWork, **lengths), zeros_of(LoopMoments, **lengths)
-        P, M = work.P, work.M
-        M[..., own:, own:] = loops.transition
-        arguments = sizes, *(type(one)(*map(np.ravel, one)) for one in (loops, work, found))
-        advance = kernels().lay_out("advance", 0, *arguments)
-        for t in range(steps + 1):
-            advance(t, *arguments)
-            if t < steps:
-                np.matmul(M[..., :own, :], P, out=work.moved)
-                np.matmul(work.moved, M.swapaxes(-1, -2), out=P[..., :own, :])
-        return LoopMoments(*(np.moveaxis(one, 0, 2) for one in found))
+    Args:
+      stated: number of the first entries of y that are the system's own; with losses, the last m of these are a.
+      lost: fraction of the commands that get lost.
+    """
+    (steps, laws, m, width), (systems, own) = loops.K.shape, loops.F.shape[1:3]
+    count = own if count is None else count
+    rows, columns, lossy = *loops.noise.shape[2:], 0 < lost < 1
+    sizes = LoopSizes(
+        steps, systems, laws, own, width, m, count, stated, rows, columns, bool(loops.jointly.size), lossy,
+        lost / (1 - lost) if lossy else 0.0,
+    )  # fmt: skip
+    lengths = {"T": steps, "L": systems, "C": laws, "Y": own, "X": width, "R": width - own, "m": m, "N": count}
+    work, found = zeros_of(LoopWork, **lengths), zeros_of(LoopMoments, **lengths)
+    P, M = work.P, work.M
+    M[..., own:, own:] = loops.transition
+    arguments = sizes, *(type(one)(*map(np.ravel, one)) for one in (loops, work, found))
+    advance = kernels().lay_out("advance", 0, *arguments)
+    for t in range(steps + 1):
+        advance(t, *arguments)
+        if t < steps:
+            np.matmul(M[..., :own, :], P, out=work.moved)
+            np.matmul(work.moved, M.swapaxes(-1, -2), out=P[..., :own, :])
+    return LoopMoments(*(np.moveaxis(one, 0, 2) for one in found))
 
 
 def kernels() -> CompiledModule:
@@ -71,12 +69,11 @@ class LinearLoop:
 
     def moments(self, count: int | None = None) -> LoopMoments:
         """The moments of the first entries of y, or of all, from the start to the plan's end."""
-        loop = self.in_systems([self.model])
-        found = loop.moments(loop.arrays.F.shape[2] if count is None else count)
+        found = self.in_systems([self.model], count)
         return LoopMoments(*(one[0, 0] if self.gain.ndim == 3 else one[0] for one in found))
 
-    def in_systems(self, models: Sequence[PlanModel]) -> ClosedLoop:
-        """The loops in several true systems, which differ in no sizes, and in neither sensors nor losses."""
+    def in_systems(self, models: Sequence[PlanModel], count: int | None = None) -> LoopMoments:
+        """The moments in several true systems, which differ in no sizes, and in neither sensors nor losses."""
         first, steps, m = models[0], self.model.plan.steps, self.model.m
         n, stated, unknown = first.n, first.n + first.lagging, len(first.transition)
         gain = self.gain.reshape(-1, *self.gain.shape[-3:]).swapaxes(0, 1)
@@ -112,4 +109,4 @@ class LinearLoop:
             F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned,
             shaking @ shaking.swapaxes(-1, -2), jointly, reached, self.low, self.high,
         )  # fmt: skip
-        return ClosedLoop(arrays, stated, first.uncertainty.command_loss)
+        return moments_of(arrays, stated, count, first.uncertainty.command_loss)

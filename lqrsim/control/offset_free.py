@@ -26,7 +26,6 @@ from lqrsim.control.tracking import (
     predictions,
     tolerances_to_try,
     with_filter,
-    worth_of,
 )
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import Uncertainty, check_seconds
@@ -275,9 +274,9 @@ def with_margin(
 
     def predicted(one: Design) -> Predictions:
         """The predictions for C laws, with the lag and without it: (2, C)."""
-        loops = LinearLoop(truths[0], *one.laws, one.filter.gain, *limits, one.model).in_systems(truths)
+        loop = LinearLoop(truths[0], *one.laws, one.filter.gain, *limits, one.model)
         with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
-            found = loops.moments(stated.n)
+            found = loop.in_systems(truths, stated.n)
             lost = np.asarray(~np.isfinite(found.covariance).all(axis=(-3, -2, -1)))
         for part in found:
             part[lost] = 0.0
@@ -285,7 +284,7 @@ def with_margin(
         return Predictions(*(np.where(lost, gone, own) for gone, own in zip(GONE, shown, strict=True)))
 
     found = predicted(design)
-    worth = worth_of(found, narrowest(stated, found.width[0]))
+    worth = found.worth(narrowest(stated, found.width[0]))
     if worth[1, 0] <= worth[0, 0] + CLIFF:
         return design
     if at_end is None:
@@ -300,7 +299,7 @@ def with_margin(
     found = [predicted(one) for one in designs]
     widths = np.array([one.width[0] for one in found])
     least = narrowest(stated, widths)
-    worth = np.array([worth_of(one, least) for one in found])
+    worth = np.array([one.worth(least) for one in found])
     worth = np.where(widths > WIDER * least, np.inf, worth[:, 0] + ABSENT * worth[:, 1])
     i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
     return designs[i].pick(int(j))

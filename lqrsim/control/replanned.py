@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
@@ -30,11 +29,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 
 
 class ReplannedRun(ControllerRun):
-    """A run in which each trial has its own law.
-
-    Args:
-      rule: the periods in which to check whether a solve is needed.
-      always: whether to solve at each of these times, wherever the law leads.
+    """A run in which each trial has its own law, which `rule` checks; with `always` it is solved anew, wherever it leads.
 
     Attributes:
       plans: plans of each trial, by the step at which they begin; without the first plan.
@@ -89,7 +84,12 @@ class ReplannedRun(ControllerRun):
         """Replace the law of a trial by a law about a new plan, if a new plan is needed and found."""
         law, model, z = run.law, run.model, run.z[0]
         n, done = model.n, step - run.first
-        granted = np.where(_constant_parameters(model), z[n + model.lagging :], 0.0)
+        # The unknowns' states that are constant to the end of the horizon and change only parameters.
+        beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
+        known = (model.output != 0).any(axis=0) & ~beyond
+        for one, own in zip(model.remembered, model.own_states, strict=True):
+            known[list(own)] &= one.constant
+        granted = np.where(known, z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ granted
         values = {
             name: float(model.dynamics.parameters[name] + change)
@@ -121,12 +121,3 @@ class ReplannedRun(ControllerRun):
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         weights = replace(law.weights, emphasis=None)  # that of another plan
         run.law, run.first = FilterLaw.of(solution, Design.of(about, kalman, weights), granted), step
-
-
-def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:
-    """Flags (D,) of the unknowns' states that are constant to the end of the horizon and change only parameters."""
-    beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
-    found = (model.output != 0).any(axis=0) & ~beyond
-    for one, own in zip(model.remembered, model.own_states, strict=True):
-        found[list(own)] &= one.constant
-    return found

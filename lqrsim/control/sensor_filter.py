@@ -73,8 +73,7 @@ class SensorFilter:
     def acting(self, z: Array, controls: Array) -> tuple[Array, Array]:
         """The controls (K, m) and the force and torque (K, 6) under which readings are taken, for estimates (K, Z).
 
-        Args:
-          controls: (K, m), the command of the period before.
+        The command of the period before was `controls` (K, m).
         """
         model, first = self.model, self.model.n + self.model.lagging
         unknown = np.vecdot(model.output, z[:, None, first:])
@@ -163,11 +162,7 @@ class SensorFilter:
     def correct(self, covariance: Array, knot: int, known: npt.NDArray[np.bool_], off: Array) -> Array:
         """Correct covariances in place by the readings that are known (K, Y), one number after the other.
 
-        Args:
-          off: readings minus their predictions, (K, Y).
-
-        Returns:
-          The corrections of (z, b), (K, Z+B).
+        By readings minus their predictions, `off` (K, Y), it returns the corrections of (z, b), (K, Z+B).
         """
         t = min(knot, self.model.plan.steps)
         moved = np.zeros(covariance.shape[:2])
@@ -240,11 +235,7 @@ def _root(covariance: Array) -> Array:
 
 
 class SensorRun(FilterRun):
-    """K trials of a run, with the estimates of a `SensorFilter`.
-
-    Attributes:
-      estimate: the estimate at the newest knot, with the readings that have arrived.
-    """
+    """K trials of a run, with the estimates of a `SensorFilter`, now with the readings that have arrived."""
 
     def __init__(self, filter_: SensorFilter, law: FilterLaw, trials: int, record: bool) -> None:
         super().__init__(law, trials, record)

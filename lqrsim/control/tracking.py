@@ -24,7 +24,7 @@ from scipy.special import ndtr
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import Feedback
 from lqrsim.control.kalman import KalmanFilter
-from lqrsim.control.linear_loop import ClosedLoop, LinearLoop
+from lqrsim.control.linear_loop import LinearLoop, moments_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import Counted, sample_loop
 from lqrsim.control.tracking_laws import AT_END, Averse, Laws, Weights, check_plan, effort_of, tracking_laws
@@ -68,6 +68,10 @@ class Predictions(NamedTuple):
     width: Array
     saturation: Array
 
+    def worth(self, least: float) -> Array:
+        """How bad each law is: its chance to fail, more with saturation and with a tube wider than `least`."""
+        return self.chance + FRAGILE * self.saturation**2 + NARROW * np.maximum(self.width / least, 1.0)
+
 
 def choose_tolerances(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
@@ -88,7 +92,7 @@ def choose_tolerances(
     found = moments((gain, offset), limits)
     told = predictions(problem, solution, uncertainty, model, found)
     least = narrowest(model, told.width)
-    worth = worth_of(told, least)
+    worth = told.worth(least)
 
     def lost(found: LoopMoments, laws: Laws, i: int) -> int:
         law = laws[0][i], laws[1][i]
@@ -124,7 +128,7 @@ def choose_tolerances(
     stressing = weights.stressing(emphasis, EMPHASIS)
     gain, offset = tracking_laws(model, stressing)
     found = moments((gain, offset), limits)
-    stressed = worth_of(predictions(problem, solution, uncertainty, model, found), least)
+    stressed = predictions(problem, solution, uncertainty, model, found).worth(least)
     i = int(np.argmin(stressed))
     better = stressed[i] < worth[best] and lost(found, (gain, offset), i) <= left[best]
     return (stressing.pick(i), (gain[i], offset[i])) if better else (weights, laws)
@@ -191,11 +195,6 @@ def narrowest(model: PlanModel, widths: Array) -> float:
     return max(float(widths.min()), 1e-3 * extent)
 
 
-def worth_of(told: Predictions, least: float) -> Array:
-    """How bad each law is: its chance to fail, more with saturation and with a tube wider than `least`."""
-    return told.chance + FRAGILE * told.saturation**2 + NARROW * np.maximum(told.width / least, 1.0)
-
-
 def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
     """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
 
@@ -233,7 +232,7 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, laws: Laws, limits: tupl
         F, G.swapaxes(-1, -2), c, noise, learned[:, own:, own:], model.transition, gain, planned[:, None] + offset,
         planned, np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
     )  # fmt: skip
-    found = LoopMoments(*(one[0] for one in ClosedLoop(arrays, own).moments(n)))
+    found = LoopMoments(*(one[0] for one in moments_of(arrays, own, n)))
     return found._replace(
         covariance=found.covariance + kalman.corrected[:, :n, :n],
         across=found.across + model.F[:, :n] @ kalman.corrected[:-1, :, :n],

@@ -119,7 +119,13 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     if lost:  # a lost command is that in force, which is a
         held[:, range(m), range(n, own)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
     undo = np.zeros((steps, len(state), m, width))
-    undo[..., own:-1] = weights.control[:, None] * _undoing(model, state).swapaxes(0, 1)
+    # M_t, (C, T, m, D), by Q.
+    B = model.jacobian[:, :, n:]
+    weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
+    curve = weighed @ B
+    least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
+    undoing = np.linalg.inv(curve + least[..., None, None] * np.eye(m)) @ (weighed @ model.E)
+    undo[..., own:-1] = weights.control[:, None] * undoing.swapaxes(0, 1)
     cost, products = np.zeros((len(state), own, width)), np.empty((len(state), own + m, width + m))
     cost[:, range(n), range(n)] = end
     emphasis = None if weights.emphasis is None else weights.emphasis.reshape(len(state), steps + 1, n, n)
@@ -140,15 +146,6 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
             cost[:, :n, :n] += emphasis[:, t]
     gain, offset = laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1]
     return (gain, offset) if weights.state.ndim == 2 else (gain[0], offset[0])
-
-
-def _undoing(model: PlanModel, state: Array) -> Array:
-    """M, (C, T, m, D): the controls that cancel the unknowns' effect in one step as far as they can, by Q, (C, n)."""
-    B = model.jacobian[:, :, model.n :]
-    weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
-    curve = weighed @ B
-    least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
-    return np.linalg.inv(curve + least[..., None, None] * np.eye(model.m)) @ (weighed @ model.E)
 
 
 def check_plan(who: str, problem: Problem, solution: Solution) -> None:

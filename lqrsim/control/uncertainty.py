@@ -187,8 +187,7 @@ def check_seconds(field: str, value: float, **bounds: float) -> float:
 def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float | None = None) -> Array:
     """One number for each entry, (len(space),). A name takes precedence over a unit; entries without a number are 0.
 
-    Args:
-      above: a bound that each must exceed; by default numbers may be 0, and names may be left out.
+    With a bound, each must be above it; by default numbers may be 0, and names may be left out.
     """
     if isinstance(numbers, Mapping):
         given = space._by_name(field, numbers, check_number)

@@ -23,7 +23,6 @@ class Collisions:
     """The first collisions of K trials.
 
     Args:
-      displaced: (K, obstacles, 3), in metres. dt: control period in s.
       passing: the robot's shape among further obstacles, which move; they are where they are at the time 0 of the run.
 
     Attributes:

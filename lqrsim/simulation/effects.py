@@ -32,11 +32,7 @@ class _ForceHook(NamedTuple):
 
 
 class Effects:
-    """The effects of disturbances on K trials, started.
-
-    Attributes:
-      displaced: (K, obstacles, 3), displacement of each obstacle in metres, along the world's axes.
-    """
+    """The effects of disturbances on K trials, started, with the obstacles' total displacements (K, obstacles, 3) in m."""
 
     def __init__(
         self,

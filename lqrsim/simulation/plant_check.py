@@ -285,10 +285,12 @@ def _sample(
     for _ in range(waiting):
         mujoco.mj_step(plant.model, data)
     before = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=state)
-    touched: set[tuple[str, str]] = set()
+    touched, model = set[tuple[str, str]](), plant.model
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]  # geoms of its kinematic tree
     for _ in range(plant.substeps(period)):
         mujoco.mj_step(plant.model, data)
-        touched |= _touching(plant, data)
+        pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
+        touched |= {(_name(model, a), _name(model, b)) for a, b in pairs if own[a] or own[b]}
     if any(data.warning[kind].number for kind in UNSTABLE):
         raise InputError(
             f"scene {plant.scene.name}: got a simulation that becomes unstable from"
@@ -337,14 +339,6 @@ def _worst_of(
     return replace(
         check, state=worst.before, control=worst.control, simulated=worst.simulated, predicted=worst.predicted
     )
-
-
-def _touching(plant: Plant, data: mujoco.MjData) -> set[tuple[str, str]]:
-    """The pairs of touching geoms, one of which belongs to the robot's kinematic tree."""
-    model = plant.model
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]
-    pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
-    return {(_name(model, a), _name(model, b)) for a, b in pairs if own[a] or own[b]}
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:

@@ -86,9 +86,7 @@ def arguments(
 ) -> ProblemModel:
     """The arguments of the passes; compiles the problem's functions if they are new.
 
-    Args:
-      multipliers: multipliers of each constraint; by default no constraint acts.
-      second_order: whether the passes need second derivatives of the dynamics.
+    Without multipliers no constraint acts. With `second_order` they have second derivatives of the dynamics.
     """
     acting = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
     space, term = problem.control_coordinates, problem.noise_term
@@ -240,14 +238,10 @@ def law_about(states: Array, controls: Array, gain: Array) -> tuple[Array, Array
 class ConstraintMultipliers:
     """A constraint's multipliers, in the memory that compiled code reads. Initially the constraint does not act.
 
-    Args:
-      margin: margin with which an inequality is to be kept. price: price of a violation, in cost per unit.
-
     Attributes:
-      term: the constraint. margin, price: as given; the margin of an equality is 0. first: the first step at which it
-        acts.
-      array: all numbers, in the layout of `kernels/augmented_lagrangian.py`. values: ((T+1) rows,) the multipliers in
-        it.
+      margin: margin with which an inequality is to be kept. price: of a violation, in cost per unit. first: the first
+        step at which it acts.
+      array: all numbers, in the layout of `kernels/augmented_lagrangian.py`; values: ((T+1) rows,) the multipliers in it.
     """
 
     def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:

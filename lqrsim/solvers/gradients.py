@@ -148,11 +148,7 @@ def _made(make: Callable[[Array], Problem], point: Array) -> Problem:
 
 
 class _Optimum:
-    """A plan with its multipliers, which are held while a problem's parameters change.
-
-    Attributes:
-      changing: see `Gradients`.
-    """
+    """A plan with its multipliers, which are held while a problem's parameters change."""
 
     def __init__(self, problem: Problem, solution: Solution) -> None:
         states, controls = map(in_c_order, (solution.trajectory.states, solution.trajectory.controls))

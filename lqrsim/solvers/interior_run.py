@@ -48,11 +48,7 @@ MUCH, LITTLE = Barrier(1.0, 0.06, near=False), Barrier(0.01, 0.01, near=True)
 
 
 class InteriorRun:
-    """The interior point for the problem of a run.
-
-    Attributes:
-      allowed: tolerance of its constraints.
-    """
+    """The interior point for the problem of a run, and the tolerance of its constraints."""
 
     def __init__(self, run: SolveRun) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget

@@ -107,17 +107,14 @@ class PreparedSolver(OneVersion):
         self._structure = compiled.structure(problem)
         self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
         # With a cost or limits of rates: the solver of the problem with the last command as a state.
-        self._wide = self._widened(problem, settings, threads)
-        if self._wide is None:
-            self._compile()
-
-    def _widened(self, problem: Problem, settings: SmootherSettings, threads: int) -> "PreparedSolver | None":
+        self._wide: PreparedSolver | None = None
         if problem.control_rate is None:
-            return None
-        wide, controls = with_last_command(problem), np.tile(problem.nominal_control, (problem.steps, 1))
-        n = len(wide.dynamics.state_coordinates)
-        feedback(problem, Trajectory(np.zeros((problem.steps + 1, n)), controls, problem.dt))  # compiles it
-        return PreparedSolver(wide, settings, threads)
+            self._compile()
+        else:
+            wide, controls = with_last_command(problem), np.tile(problem.nominal_control, (problem.steps, 1))
+            n = len(wide.dynamics.state_coordinates)
+            feedback(problem, Trajectory(np.zeros((problem.steps + 1, n)), controls, problem.dt))  # compiles it
+            self._wide = PreparedSolver(wide, settings, threads)
 
     def __repr__(self) -> str:
         return f"PreparedSolver({len(self._states)} states, {len(self._controls)} controls, {self.problem.steps} steps)"
@@ -301,9 +298,9 @@ class _Neighbour:
     """Finds the constrained optimum next to a plan, by Newton steps with its active set or by the interior point.
 
     Args:
-      run: a run with the initial law and multipliers.
+      run: a run with the initial law and multipliers. best: the plan that the law leads to.
       plan: states and controls to which the law belongs; the first state is the start.
-      best: the plan that the law leads to. closing: duration of the work after the last iteration, in s.
+      closing: duration of the work after the last iteration, in s.
 
     Attributes:
       laps: the times of its iterations; the last iteration may be an abandoned step.
@@ -400,12 +397,7 @@ class _Yielding:
     The plan hardly moves from one solve to the next, and derivatives by MuJoCo take most of the time of an iteration.
     So those about the first plan serve for all steps that need not be shortened, and are computed anew at the end.
 
-    Args:
-      plan: states and controls to start from, with the first state of the solve.
-      closing: duration of the work after the last iteration, in s.
-
-    Attributes:
-      ended: time at which the last iteration ended, on the clock of `time.perf_counter`.
+    Arguments and `ended` are as in `_Neighbour`, of whose laps it is the last time.
     """
 
     def __init__(self, run: SolveRun, plan: Motion, closing: float = 0.0) -> None:
@@ -482,10 +474,8 @@ class _Best:
     """The best plan so far, initially the plan that the solve starts from. It is called after each iteration.
 
     Attributes:
-      plan: states and controls. law: gain and offset. cost_to_go: cost-to-go of the law; None if unknown.
-      multipliers: multipliers with which it was found. cost, violation: its cost and violation. before: the cost of the
-        first plan.
-      improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
+      cost_to_go, multipliers: of the law; None if unknown, and those with which it was found. before: the cost of the
+        first plan. improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
     """
 
     def __init__(self, run: SolveRun) -> None:
@@ -533,7 +523,6 @@ class _Best:
             self.adopt(found)
 
     def adopt(self, found: RunResult) -> None:
-        """Adopt a result."""
         there = *found.plan, *found.law, *(self._work.arrays.to_go if found.values else ())
         self._keep(found.cost, found.violation, there)
         self.multipliers = found.multipliers
@@ -555,7 +544,6 @@ class _Best:
         return not cost >= than_cost - ROUNDING * abs(than_cost)
 
     def _missed(self, violation: float) -> float:
-        """A violation as it is compared."""
         return 0.0 if violation <= self._negligible else float(f"{violation:.2g}")
 
     def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
