@@ -29,7 +29,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 
 
 class ReplannedRun(ControllerRun):
-    """A run in which each trial has its own law, which `rule` checks; with `always` it is solved anew, wherever it leads.
+    """A run in which each trial has its own law, which is checked by the rule; or solved anew `always`.
 
     Attributes:
       plans: plans of each trial, by the step at which they begin; without the first plan.

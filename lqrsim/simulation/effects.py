@@ -32,7 +32,7 @@ class _ForceHook(NamedTuple):
 
 
 class Effects:
-    """The effects of disturbances on K trials, started, with the obstacles' total displacements (K, obstacles, 3) in m."""
+    """The effects of disturbances on K trials, started; `displaced` are the obstacles, by (K, obstacles, 3) m."""
 
     def __init__(
         self,

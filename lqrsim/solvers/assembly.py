@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from lqrsim.errors import Array, printable
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target, departure
-from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.rotations import AXES, quaternion, rotation_vector
@@ -50,14 +50,7 @@ def assemble(
         inverse_law = inverse_law[0].copy(), inverse_law[1].copy()
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
-
-    def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
-        return AffinePolicy(
-            gain=gain, offset=offset, nominal=nominal, dt=problem.dt,
-            state_coordinates=problem.dynamics.state_coordinates,
-            control_coordinates=problem.applied_coordinates,
-        )  # fmt: skip
-
+    policy = partial(compiled.policy_of, problem)
     unstable = unstable_step(problem, states, controls, sound=found.success)
     doubts = (_near_singular(problem, found), _fragile(problem, found)) if np.isfinite(states).all() else ()
     said = found.detail, _usable(found, options), *doubts, unstable.detail if unstable else ""

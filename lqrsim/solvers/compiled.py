@@ -39,6 +39,7 @@ from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.policy import AffinePolicy
 
 # The forms of the cost-to-come, with their kernels.
 FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
@@ -235,13 +236,21 @@ def law_about(states: Array, controls: Array, gain: Array) -> tuple[Array, Array
     return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
 
 
+def policy_of(problem: Problem, gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
+    """The policy u_t = gain_t x + offset_t for a problem's system, about nominal states (T, n)."""
+    return AffinePolicy(
+        gain=gain, offset=offset, nominal=nominal, dt=problem.dt,
+        state_coordinates=problem.dynamics.state_coordinates, control_coordinates=problem.applied_coordinates,
+    )  # fmt: skip
+
+
 class ConstraintMultipliers:
     """A constraint's multipliers, in the memory that compiled code reads. Initially the constraint does not act.
 
     Attributes:
       margin: margin with which an inequality is to be kept. price: of a violation, in cost per unit. first: the first
         step at which it acts.
-      array: all numbers, in the layout of `kernels/augmented_lagrangian.py`; values: ((T+1) rows,) the multipliers in it.
+      array: all numbers, in the layout of `kernels/augmented_lagrangian.py`. values: ((T+1) rows,) multipliers in it.
     """
 
     def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:

@@ -83,12 +83,8 @@ def feedback(
         other = problem._with(stage_cost=stage, control_rate=None)
         other = other._with(_terms=problem._terms | {"stage_cost": other._bound(stage.terms)})
         gain, cost_to_go = _gains(other, states, controls, multipliers[: len(problem.constraints)])
-    gain, offset = compiled.law_about(states, controls, gain)
-    policy = AffinePolicy(
-        gain=gain, offset=offset, nominal=states[:-1].copy(), dt=problem.dt,
-        state_coordinates=problem.dynamics.state_coordinates, control_coordinates=problem.applied_coordinates,
-    )  # fmt: skip
-    return policy, cost_to_go
+    law = compiled.law_about(states, controls, gain)
+    return compiled.policy_of(problem, *law, states[:-1].copy()), cost_to_go
 
 
 def _gains(

@@ -84,21 +84,12 @@ def ilqr_many(
     risk: float | None = None,
     **options: Any,
 ) -> list[Solution]:
-    """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
+    """Solve many problems as `ilqr` does, on several threads.
 
-    Args:
-      problems: problems of one structure or of many; each structure is compiled once.
-      threads: number of threads; by default all processors that this process may use.
-      progress: called with the number of solved problems and the number of all problems, as each solve ends.
-      noise: as in `ilqr`, for all problems.
-      risk: as in `ilqr`, for all problems.
-      options: other keyword arguments of `ilqr`, except `callback`, for all problems.
+    The arguments are as in `smooth_many`; the options are those of `ilqr`.
 
     Returns:
       One Solution per problem, in their order.
-
-    Raises:
-      InputError: a problem that is refused is named by its place in the list.
     """
     settings = settings_from(Settings, "ilqr_many", {"tolerance": TOLERANCE, **options})
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
