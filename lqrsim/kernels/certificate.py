@@ -243,12 +243,9 @@ def start_decrease(stage, S, rounding, costate):
 
 
 def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
-    """Write the Hessian (N, N) of the policy's cost-to-go at t, given the Hessian at t + 1.
+    """Write the Hessian (N, N) of the policy's cost-to-go at t, given that `ahead`, at t + 1.
 
     A control at a limit, without room on one side, does not respond.
-
-    Args:
-      jacobian: (N, W). cost: (W, W) of the stage. gain: (M, N). room: Limits of changes. ahead: (N, N) at t + 1.
     """
     closed, both, product = stack(N, N), stack(W, N), stack(W, N)
     for j in range(N):
@@ -281,11 +278,7 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
 
 
 def box_decrease(matrix, slope, lowest, highest, best):
-    """The decrease of `1/2 x'E x + e'x` at its minimiser within a box about zero; NaN unless E > 0.
-
-    Args:
-      matrix: E (M, M). slope: e (M,). lowest, highest: (M,) bounds of the box. best: (M,), the minimiser, written.
-    """
+    """The decrease of `1/2 x'E x + e'x` at its minimiser in a box about zero, to `best`; NaN unless E > 0."""
     factor = stack(M, M)
     inside = True
     for i in range(M):
@@ -367,13 +360,10 @@ def reduced_curvature(settings, plan, model, found):
 
 
 def reduce_stage(hessian, least, S):
-    """Minimise a stage's curvature over the controls: write S (N, N) of the states alone.
+    """Minimise a stage's curvature, which is overwritten, over the controls: write S (N, N) of the states alone.
 
     Lowers the least curvatures (M,) of the controls to those of the control block, each with the earlier controls at
     their best. A control whose curvature is infinite stays. Returns whether the block is positive definite.
-
-    Args:
-      hessian: (W, W) with the cost-to-go; overwritten. least: (M,), written.
     """
     block, gain, offset, none, unused = stack(M, M), stack(M, N), stack(M), zeros(W), stack(N)
     for i in range(M):

@@ -57,8 +57,7 @@ def fix_control(i, value, stage):
 def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient):
     """Minimise a stage over the control, clamped at the state x (N,); return the decrease, and whether E is definite.
 
-    Args:
-      stage: about the origin; controls at a limit are fixed in it. gain, feedforward, hessian, gradient: written.
+    Controls at a limit are fixed in the stage, which is about the origin. The rest is as in `minimize_control`.
     """
     low, high = limits.low, limits.high
     u, outward = stack(M), stack(M)

@@ -22,12 +22,6 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
 
     If c_0 has no curvature, there is no covariance. It then gets a small curvature about x, relative to each state's
     own curvature, or to the cost-to-go's. An optimum remains an optimum, and the next iteration moves x further.
-
-    Args:
-      Q, q, constant: c_0 about the origin, (N, N), (N,).
-
-    Returns:
-      The constant of the cost-to-come, and whether it exists.
     """
     S, covariance, mean = to_go.hessian[0], to_come.matrix[0], to_come.vector[0]
     factor, column, slope = stack(N, N), stack(N), stack(N)
@@ -84,14 +78,9 @@ def forward_jacobian(x, u, model, arrived, step, spare):
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """Write the moments of the cost-to-come at t + 1, given the moments at t, and the smoother's gains at t.
+    """Write the moments of the cost-to-come at t + 1, given those at t, and the smoother's gains at t.
 
-    Args:
-      step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin.
-      to_come: CostToCome. smoothing: SmootherGains, written.
-
-    Returns:
-      Whether R and the updated covariance exist.
+    The step is x_{t+1} = [A B] (x, u) + c, the stage is about the origin.
     """
     V0, x0, c, slope = to_come.matrix[t], to_come.vector[t], step.offset, stage.gradient
     V, x, updated = to_come.matrix[t + 1], to_come.vector[t + 1], smoothing.state[t]
@@ -158,7 +147,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
 
 @inline
 def eliminate_control(step, stage, reduced):
-    """Eliminate the control from a step and its stage; see EliminatedControl, which is written.
+    """Eliminate the control from a step and its stage: write an EliminatedControl.
 
     Returns whether R is positive definite, and a number that is zero if no cost couples states and controls.
     """
@@ -195,11 +184,7 @@ def eliminate_control(step, stage, reduced):
 
 @inline
 def control_response(reduced, G, updated, crossed, gain, feedforward):
-    """Write the control at t as an affine function of the costate at t + 1: gain (M, N) and feedforward (M,).
-
-    Args:
-      G: (N, N) gain of the state. updated: (N,) mean after the update. crossed: as `eliminate_control` returns it.
-    """
+    """Write the control at t as an affine function of the costate at t + 1: gain (M, N) and feedforward (M,)."""
     F, h, BT = reduced.F, reduced.h, reduced.BT
     for k in range(M):
         feedforward[k] = -h[k]

@@ -270,9 +270,6 @@ def judge(settings, settled, ending, model, work, memory, row):
     smoothing, without second-order terms. They are convex, so that the minimum of their sum is at the plan. If it is
     not, up to MORE further steps follow: in flat directions a plan may be far off although the predicted decrease is
     small.
-
-    Args:
-      settled: whether the cost has settled. ending: whether this is the last iteration in any case. row: of the log.
     """
     how = settings.descent
     if how.method == DAMPED:

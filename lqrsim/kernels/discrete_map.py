@@ -6,7 +6,7 @@ Here `rate` is the next state F(x, u). A map has no inverse: backwards in time t
 from math import nan
 
 from lqrsim.kernels.declarations import M, N, rate, rate_curvature, rate_jacobian, zeros
-from lqrsim.kernels.linear_algebra import fill
+from lqrsim.kernels.linear_algebra import copy, copy_part, fill
 
 SUPPORT = (0,)  # entries of (x, u) in which the map is nonlinear, states first
 K = 1  # their number
@@ -25,10 +25,8 @@ def step_jacobian(x, u, p, h, out, jacobian):
     fx, fu = zeros(N, N), zeros(N, M)
     rate_jacobian(x, u, p, out, fx, fu)
     for i in range(N):
-        for j in range(N):
-            jacobian[i, j] = fx[i, j]
-        for j in range(M):
-            jacobian[i, N + j] = fu[i, j]
+        copy(fx[i], N, jacobian[i])
+        copy_part(fu[i], 0, jacobian[i], N, M)
 
 
 def step_curvature(x, u, p, h, weights, out, jacobian, hessian):

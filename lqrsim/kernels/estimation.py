@@ -8,7 +8,7 @@ gain and the offset of each control (V = P + 2 M).
 from math import nan
 
 from lqrsim.kernels.declarations import M, N, call, outline, stack
-from lqrsim.kernels.linear_algebra import affine, clear, copy, fill
+from lqrsim.kernels.linear_algebra import affine, clear, copy, copy_part, fill
 from lqrsim.kernels.policy_evaluation import to_nearest
 
 LAG, D, Y = 0, 1, 1  # counts of lagging controls, states of unknowns, measured numbers
@@ -37,11 +37,7 @@ def slopes_along(steps, states, controls, dynamics, dt, arrived, jacobian):
 
 
 def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slopes):
-    """Write the derivatives (steps, N, P) of the steps of a plan in some parameters, by central differences.
-
-    Args:
-      which: (P,) indices of the parameters. changes: (P,) steps of the differences.
-    """
+    """Write the derivatives (steps, N, P) of the steps of a plan in parameters, by differences with `changes` (P,)."""
     p, q, more, less = dynamics.parameters, stack(NUMBERS), stack(N), stack(N)
     copy(p, NUMBERS, q)
     for j in range(P):
@@ -140,8 +136,7 @@ def predict_one(control, predictor, z):
         for j in range(D):
             total += predictor.transition[i, j] * z[N + LAG + j]
         fresh[i] = total
-    for i in range(D):
-        z[N + LAG + i] = fresh[i]
+    copy_part(fresh, 0, z, N + LAG, D)
 
 
 def command(count, estimates, near, policy, limits, angular, out):

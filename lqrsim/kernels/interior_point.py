@@ -33,7 +33,7 @@ from lqrsim.kernels.active_set import (
     take_step,
 )
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy, copy_matrix
+from lqrsim.kernels.linear_algebra import copy, copy_matrix, finite
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
@@ -207,7 +207,7 @@ def begin_row(at, begun, stages, work, mem):
 
 def has_slack(at, side, rows):
     """Whether a row has the slack of a side: with a price it has both, an inequality without one the lower."""
-    return rows.prices[at] < inf or (side == LOWER and rows.kinds[at] != EQUALITY)
+    return rows.live[at] != 0 and (rows.prices[at] < inf or (side == LOWER and rows.kinds[at] != EQUALITY))
 
 
 def regularised(at, rows):
@@ -385,10 +385,9 @@ def off_centre(stages, work, mem):
     """The largest difference of a product of slack and multiplier from the barrier parameter."""
     rows, slacks, largest = stages.rows, work.now.slacks, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    largest = max(largest, abs(slacks[at, side] * room_of(at, side, rows) - mem.parameter))
+        for side in range(2):
+            if has_slack(at, side, rows):
+                largest = max(largest, abs(slacks[at, side] * room_of(at, side, rows) - mem.parameter))
     return largest
 
 
@@ -489,12 +488,11 @@ def predict(least, stages, work, mem):
     primal, dual = longest(1.0, work.now.slacks, step.slacks, stages), longest_dual(1.0, step.force, stages)
     average, after = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    slack, room, force = slacks[at, side], room_of(at, side, rows), SIGNS[side] * step.force[at]
-                    average += slack * room
-                    after += (slack + primal * step.slacks[at, side]) * (room + dual * force)
+        for side in range(2):
+            if has_slack(at, side, rows):
+                slack, room, force = slacks[at, side], room_of(at, side, rows), SIGNS[side] * step.force[at]
+                average += slack * room
+                after += (slack + primal * step.slacks[at, side]) * (room + dual * force)
     average, ratio = average / mem.pairs, after / average
     mem.parameter = max(least, min(HIGHER * mem.highest, ratio * ratio * ratio * average))
     mem.filtered = 0.0
@@ -518,12 +516,11 @@ def centre(stages, work, mem):
         return
     ahead, dual_ahead = min(1.0, part + REACH), min(1.0, dual + REACH)
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    room = room_of(at, side, rows) + SIGNS[side] * (dual_ahead * step.force[at])
-                    product = (slacks[at, side] + ahead * step.slacks[at, side]) * room
-                    work.others[at, side] = corrections[at, side] - lacking(product, mem)
+        for side in range(2):
+            if has_slack(at, side, rows):
+                room = room_of(at, side, rows) + SIGNS[side] * (dual_ahead * step.force[at])
+                product = (slacks[at, side] + ahead * step.slacks[at, side]) * room
+                work.others[at, side] = corrections[at, side] - lacking(product, mem)
     if not solve(False, work.others, work.gaps, stages, work, mem):
         return
     complete(False, work.others, work.other, stages, work, mem)
@@ -552,10 +549,9 @@ def longest(share, slacks, changes, stages):
     """The largest part of the changes of slacks, at most 1, by the fraction-to-the-boundary rule."""
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows) and changes[at, side] < 0:
-                    part = min(part, -share * slacks[at, side] / changes[at, side])
+        for side in range(2):
+            if has_slack(at, side, rows) and changes[at, side] < 0:
+                part = min(part, -share * slacks[at, side] / changes[at, side])
     return part
 
 
@@ -564,11 +560,10 @@ def longest_dual(share, changes, stages):
     """The same for changes of the multipliers, and their bounds."""
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            for side in range(2):
-                change = SIGNS[side] * changes[at]
-                if has_slack(at, side, rows) and change < 0:
-                    part = min(part, -share * room_of(at, side, rows) / change)
+        for side in range(2):
+            change = SIGNS[side] * changes[at]
+            if has_slack(at, side, rows) and change < 0:
+                part = min(part, -share * room_of(at, side, rows) / change)
     return part
 
 
@@ -720,7 +715,7 @@ def take(part, stages, work, mem):
 @compact
 def go(part, about, changes, slacks, out, stages):
     """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
-    rows, steps, good = stages.rows, stages.steps, True
+    rows, steps = stages.rows, stages.steps
     for t in range(steps + 1):
         for i in range(N):
             out.plan.states[t, i] = about.plan.states[t, i] + part * changes.states[t, i]
@@ -728,9 +723,7 @@ def go(part, about, changes, slacks, out, stages):
             for i in range(M):
                 out.plan.controls[t, i] = about.plan.controls[t, i] + part * changes.controls[t, i]
     cost = trial(stages, out.plan, out.arrived)
-    for t in range(steps):
-        for i in range(N):
-            good = good and isfinite(out.arrived[t, i])
+    good = finite(out.arrived, steps, N)
     read_rows(stages, out.plan, out.numbers)
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
@@ -798,11 +791,10 @@ def slope_of_merit(stages, work, mem):
             for i in range(M):
                 slope += stages.models.gradient[t, N + i] * step.changes.controls[t, i]
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    paid = rows.prices[at] if side == UPPER or rows.kinds[at] == EQUALITY else 0.0
-                    slope += (paid - mem.parameter / slacks[at, side]) * step.slacks[at, side]
+        for side in range(2):
+            if has_slack(at, side, rows):
+                paid = rows.prices[at] if side == UPPER or rows.kinds[at] == EQUALITY else 0.0
+                slope += (paid - mem.parameter / slacks[at, side]) * step.slacks[at, side]
     return slope
 
 
@@ -958,7 +950,10 @@ def settle_rows(tolerance, violation, stages, work, mem):
         take_step(violation, stages, active, memory)
         if not isfinite(memory.cost):
             return False
-        far = farthest_from_target(rows, stages.steps)
+        far = 0.0  # the largest distance of a row that is held from its target
+        for at in range(rows.size * (stages.steps + 1)):
+            if rows.held[at] == HELD:
+                far = larger(far, abs(rows.numbers[at] - rows.targets[at]))
         if max(memory.stationarity, memory.gap) < SETTLED * tolerance and far < SETTLED * violation:
             break
     kept = mem.elastic != 0 or memory.violation <= violation
@@ -982,12 +977,3 @@ def first_state(at, rows, mem):
         if violation / size > 1 - abs(force) / price:
             return PAID
     return HELD if equality or force * size / mem.scale > number / size else FREE
-
-
-def farthest_from_target(rows, steps):
-    """The largest distance of a row that is held from its target."""
-    largest = 0.0
-    for at in range(rows.size * (steps + 1)):
-        if rows.held[at] == HELD:
-            largest = larger(largest, abs(rows.numbers[at] - rows.targets[at]))
-    return largest

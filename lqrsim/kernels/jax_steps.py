@@ -29,8 +29,6 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
 def all_steps(what, steps, states, controls, p, h, costates, arrived, jacobian, hessian):
     """Write the state after each step of a plan, or also its Jacobian, or also add its Hessian: see `STATES`.
 
-    Args:
-      costates: (T+1, N), of which the first is not used; the others are the weights.
-      arrived: (T, N). jacobian: (T, N, W). hessian: (T+1, W, W).
+    The weights of the next states are costates[1:].
     """
     call(p[STEPS], what, steps, 1, states, controls, p, h, costates, arrived, jacobian, hessian)

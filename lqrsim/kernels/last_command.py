@@ -5,7 +5,7 @@ a formula's Runge-Kutta step, a user's function, or MuJoCo's steps. `p` has the 
 """
 
 from lqrsim.kernels.declarations import M, N, W, at, call, stack, zeros
-from lqrsim.kernels.linear_algebra import clear
+from lqrsim.kernels.linear_algebra import clear, copy, copy_part
 
 ADVANCE, STEP_JACOBIAN, STEP_CURVATURE, NUMBERS = 0, 1, 2, 3  # of g's functions, and of the numbers that they call p
 
@@ -13,8 +13,7 @@ ADVANCE, STEP_JACOBIAN, STEP_CURVATURE, NUMBERS = 0, 1, 2, 3  # of g's functions
 def advance(x, u, p, h, out):
     """Write the state (N,) after `h` seconds."""
     call(p[ADVANCE], x, u, at(p[NUMBERS]), h, out)
-    for i in range(M):
-        out[N - M + i] = u[i]
+    copy_part(u, 0, out, N - M, M)
 
 
 def step_jacobian(x, u, p, h, out, jacobian):
@@ -40,10 +39,8 @@ def write_jacobian(u, own, out, jacobian):
     """Write the last M states, and the Jacobian of all, given that of the others, (N - M, N)."""
     clear(jacobian, N, W)
     for i in range(N - M):
-        for j in range(N - M):
-            jacobian[i, j] = own[i, j]
-        for j in range(M):
-            jacobian[i, N + j] = own[i, N - M + j]
+        copy(own[i], N - M, jacobian[i])
+        copy_part(own[i], N - M, jacobian[i], N, M)
     for i in range(M):
         out[N - M + i] = u[i]
         jacobian[N - M + i, N + i] = 1.0

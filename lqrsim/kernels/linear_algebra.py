@@ -17,6 +17,13 @@ def copy(a, size, out):
 
 
 @inline
+def copy_part(a, first, out, place, size):
+    """Copy numbers of a vector, from the first on, to a place in another."""
+    for i in range(size):
+        out[place + i] = a[first + i]
+
+
+@inline
 def copy_matrix(a, rows, columns, out):
     """Copy a matrix."""
     for i in range(rows):
@@ -111,11 +118,7 @@ def cholesky_solve(a, size, b):
 
 
 def about_origin(hessian, gradient, x, u, value):
-    """Turn a quadratic about (x, u) into one about the origin: its gradient, in place; return its constant. Eq. (27).
-
-    Args:
-      hessian: (W, W). gradient: (W,) at (x, u); overwritten. value: the quadratic's value at (x, u).
-    """
+    """Turn a quadratic about (x, u) into one about the origin: its gradient in place; return its constant. Eq. (27)."""
     constant = value
     for i in range(W):
         curved = 0.0
@@ -129,11 +132,7 @@ def about_origin(hessian, gradient, x, u, value):
 
 
 def step_offset(jacobian, x, u, x_next, c):
-    """Write c = x_next - A x - B u, the constant of a linearised step. Eq. (25).
-
-    Args:
-      jacobian: [A B] (N, W). x, x_next: (N,). u: (M,). c: (N,), written.
-    """
+    """Write c = x_next - A x - B u, (N,), the constant of a linearised step. Eq. (25)."""
     for i in range(N):
         total = x_next[i]
         for j in range(N):
@@ -144,11 +143,7 @@ def step_offset(jacobian, x, u, x_next, c):
 
 
 def congruence(jacobian, z, v, g, h):
-    """Add `jacobian' z jacobian` to g (W, W), and `jacobian' v` to h (W,).
-
-    Args:
-      jacobian: (N, W). z: (N, N) symmetric. v: (N,).
-    """
+    """Add `jacobian' z jacobian` to g (W, W), and `jacobian' v` to h (W,), for a symmetric z (N, N)."""
     product = stack(N, W)
     for i in range(N):
         for j in range(W):

@@ -8,14 +8,11 @@ sizes, so every array is flat. In the names below Y, X, m, ... are sizes, and th
 from math import erfc, exp, pi, sqrt
 
 from lqrsim.kernels.declarations import inline, outline
+from lqrsim.kernels.linear_algebra import copy_part
 
 
 def advance(t, sizes, loops, work, moments):
-    """Complete the moments of all loops at knot t, after the products; prepare the products of step t, unless it is T.
-
-    Args:
-      sizes: LoopSizes. loops: LoopArrays. work: LoopWork. moments: MomentArrays, of which those of t are written.
-    """
+    """Complete the moments of all loops at knot t, after the products; unless t is T, prepare those of step t."""
     for i in range(sizes.systems):
         spread(t, i, sizes, loops, work)
         for j in range(sizes.laws):
@@ -72,8 +69,7 @@ def spread(t, system, sizes, loops, work):
             if loops.transition[R * i + a] != 0.0:
                 add_row(loops.transition[R * i + a], work.given, given + R * a, work.half, R * i, R)
     for i in range(R):
-        for j in range(R):
-            work.given[given + R * i + j] = loops.fresh[noise + R * i + j]
+        copy_part(loops.fresh, noise + R * i, work.given, given + R * i, R)
         for a in range(R if t > 0 else 0):
             if loops.transition[R * i + a] != 0.0:
                 for j in range(R):
@@ -105,16 +101,14 @@ def arrive(t, system, law, sizes, loops, work, moments):
     for i in range(R):
         for j in range(Y):
             work.P[P + X * (Y + i) + j] = work.P[P + X * j + Y + i]
-        for j in range(R):
-            work.P[P + X * (Y + i) + Y + j] = work.given[R * (R * system + i) + j]
+        copy_part(work.given, R * (R * system + i), work.P, P + X * (Y + i) + Y, R)
     at = sizes.systems * sizes.laws * t + k
     last = at - sizes.systems * sizes.laws
     for i in range(count):
         moments.mean[count * at + i] = work.mean[Y * k + i]
-        for j in range(count):
-            moments.covariance[count * (count * at + i) + j] = work.P[P + X * i + j]
-        for j in range(count if t > 0 else 0):
-            moments.across[count * (count * last + i) + j] = work.moved[X * (Y * k + i) + j]
+        copy_part(work.P, P + X * i, moments.covariance, count * (count * at + i), count)
+        if t > 0:
+            copy_part(work.moved, X * (Y * k + i), moments.across, count * (count * last + i), count)
 
 
 @outline
@@ -139,16 +133,14 @@ def act(t, system, law, sizes, loops, work, moments):
             work.law[row + j] = slope * loops.K[slopes + j]
     for i in range(Y):
         row = P + X * i
-        for j in range(X):
-            work.M[row + j] = loops.F[F + X * i + j]
+        copy_part(loops.F, F + X * i, work.M, row, X)
         add_rows(m, loops.G, G + i, Y, work.law, X * own, X, work.M, row, X)
         total = loops.c[c + i] + dot(loops.F, F + X * i, work.mean, x, Y)
         for a in range(m):
             total += loops.G[G + Y * a + i] * (work.level[own + a] - loops.planned[m * t + a])
         work.ahead[i] = total
     shake(t, system, law, sizes, loops, work)
-    for i in range(Y):
-        work.mean[x + i] = work.ahead[i]
+    copy_part(work.ahead, 0, work.mean, x, Y)
 
 
 @inline

@@ -13,6 +13,7 @@ in the body's axes; `differences.py` has the derivatives.
 from math import sqrt
 
 from lqrsim.kernels.declarations import N, at, call, call_for_value, int32, outline, stack, store
+from lqrsim.kernels.linear_algebra import copy, copy_part
 from lqrsim.kernels.mjcf_dynamics import (
     AXIS,
     BALL,
@@ -130,8 +131,7 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
             write_normal(one, int(data[pair + 1]), int(data[pair + 3]), out[first + row], segments[row], normal)
             call(p[JAC], at(p[MODEL]), at(one[DATA]), moves, 0, segments[row], int32(int(data[pair + 2])))
             if data[pair + 6] > 0:
-                for i in range(3):
-                    there[i] = segments[row, 3 + i]
+                copy_part(segments[row], 3, there, 0, 3)
                 call(p[JAC], at(p[MODEL]), at(one[DATA]), others, 0, there, int32(int(data[pair + 6])))
                 for j in range(3 * nv):
                     moves[j] -= others[j]
@@ -170,8 +170,7 @@ def look(p, one, data, displaced, moved, first, out, which, segments):
             )
             if not distance >= least:
                 out[first + row], which[row] = distance, float(k)
-                for i in range(6):
-                    segments[row, i] = segment[i]
+                copy(segment, 6, segments[row])
         middles[other], middles[other + 1], middles[other + 2] = before_x, before_y, before_z
 
 

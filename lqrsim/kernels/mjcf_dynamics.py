@@ -29,7 +29,7 @@ from lqrsim.kernels.declarations import (
     store,
     zeros,
 )
-from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
+from lqrsim.kernels.linear_algebra import copy, copy_matrix, copy_part, fill
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
 # The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: flags of the slots
@@ -172,12 +172,9 @@ def publish(z, p, side, before):
     """Hand a job to the helpers: the side, the state and the control, the accelerations before, and the wrench."""
     team, job = p[TEAM], at(p[JOB])
     job[0] = side
-    for i in range(W):
-        job[1 + i] = z[i]
-    for i in range(N):
-        job[1 + W + i] = before[i]
-    for i in range(6):
-        job[1 + W + N + i] = p[WRENCH + i]
+    copy_part(z, 0, job, 1, W)
+    copy_part(before, 0, job, 1 + W, N)
+    copy_part(p, WRENCH, job, 1 + W + N, 6)
     store(team, DONE, 0)
     store(team, TICKET, JOBS * (load(team, TICKET) // JOBS + 1))
 
@@ -216,12 +213,9 @@ def help_out(p):
             continue
         if ticket // JOBS != known:
             known = ticket // JOBS
-            for i in range(W):
-                z[i] = job[1 + i]
-            for i in range(N):
-                before[i] = job[1 + W + i]
-            for i in range(6):
-                wrench[i] = job[1 + W + N + i]
+            copy_part(job, 1, z, 0, W)
+            copy_part(job, 1 + W, before, 0, N)
+            copy_part(job, 1 + W + N, wrench, 0, 6)
             linearize_here(z, p, wrench, one, before, accelerations, arrived)
         column(ticket % JOBS, z, p, job[0], one, accelerations, arrived, columns)
         fetch_add(team, DONE, 1)
@@ -250,9 +244,7 @@ def linearize_here(z, p, wrench, one, before, accelerations, arrived):
     write_loads(p, one)
     push(wrench, one)
     step_from(z, z, p, one, before, 0, arrived)
-    found = at(one[QACC])
-    for i in range(int(p[NV])):
-        accelerations[i] = found[i]
+    copy(at(one[QACC]), int(p[NV]), accelerations)
     step_from(z, z, p, one, accelerations, 2, arrived)
 
 
@@ -301,10 +293,8 @@ def write_to(z, p, one):
     nv = int(p[NV])
     qvel, act, ctrl = at(one[QVEL]), at(one[ACT]), at(one[CTRL])
     write_positions(z, p, at(one[QPOS]))
-    for i in range(nv):
-        qvel[i] = z[nv + i]
-    for i in range(int(p[NA])):
-        act[i] = z[2 * nv + i]
+    copy_part(z, nv, qvel, 0, nv)
+    copy_part(z, 2 * nv, act, 0, int(p[NA]))
     listed = int(p[ACTUATORS])
     for i in range(M):
         ctrl[int(p[listed + i])] = z[N + i]
@@ -315,8 +305,7 @@ def write_positions(x, p, qpos):
     for k in range(int(p[JOINTS])):
         kind, q, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1]), int(p[TABLE + 3 * k + 2])
         if kind == FREE:
-            for i in range(3):
-                qpos[q + i] = x[d + i]
+            copy_part(x, d, qpos, q, 3)
             write_quaternion(x, d + 3, p, qpos, q + 3)
         elif kind == BALL:
             write_quaternion(x, d, p, qpos, q)
@@ -326,9 +315,7 @@ def write_positions(x, p, qpos):
 
 def push(wrench, one):
     """Apply the wrench to the body."""
-    applied = at(one[PUSH])
-    for i in range(6):
-        applied[i] = wrench[WRENCH + i]
+    copy_part(wrench, WRENCH, at(one[PUSH]), 0, 6)
 
 
 def write_loads(p, one):
@@ -349,9 +336,7 @@ def write_loads(p, one):
 
 def start_from(p, one, guess):
     """Let the solver of the next step begin at these accelerations."""
-    warm = at(one[WARM])
-    for i in range(int(p[NV])):
-        warm[i] = guess[i]
+    copy(guess, int(p[NV]), at(one[WARM]))
 
 
 def step_from(z, near, p, one, guess, kept, out):
@@ -369,24 +354,20 @@ def read_from(near, p, one, out):
     for k in range(int(p[JOINTS])):
         kind, q, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1]), int(p[TABLE + 3 * k + 2])
         if kind == FREE:
-            for i in range(3):
-                out[d + i] = qpos[q + i]
+            copy_part(qpos, q, out, d, 3)
             rotation_near(qpos, q + 3, p, near, d + 3, out)
         elif kind == BALL:
             rotation_near(qpos, q, p, near, d, out)
         else:
             out[d] = qpos[q]
-    for i in range(nv):
-        out[nv + i] = qvel[i]
-    for i in range(na):
-        out[2 * nv + i] = act[i]
+    copy_part(qvel, 0, out, nv, nv)
+    copy_part(act, 0, out, 2 * nv, na)
     good = True
     for i in range(N):
         good = good and abs(out[i]) < LARGEST
     if not good:
         call(p[RESET], at(one[OWN_MODEL]), at(one[DATA]))  # removes all traces of the invalid state
-        for i in range(N):
-            out[i] = nan
+        fill(out, N, nan)
 
 
 @outline

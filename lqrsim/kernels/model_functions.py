@@ -68,8 +68,7 @@ def advance_all(steps, plan, model, arrived):
 def all_steps_second_order(steps, plan, model, costates, arrived, jacobian, hessian):
     """As `step_second_order`, for all steps of a plan: arrived (T, N), jacobian (T, N, W), hessian (T+1, W, W).
 
-    Args:
-      costates: (T+1, N), the weights of the state at 0, which has none, and of the next states.
+    The weights of the next states are costates[1:].
     """
     x, u, dynamics = plan.states, plan.controls, model.dynamics
     if dynamics.all_steps != 0:

@@ -62,11 +62,7 @@ def matrix_at(x, u, data, out):
 
 
 def noise_value(x, u, data, risk, ahead):
-    """The expected cost of noise at (x, u); infinite if the risk is too high.
-
-    Args:
-      data: the data for `noise_values`. risk: (2,), theta first. ahead: NextStep.
-    """
+    """The expected cost of noise at (x, u); infinite if the risk, of which theta is the first number, is too high."""
     values, mixed, slope = stack(COUNT, SIZE), stack(COUNT, SIZE), stack(COUNT)
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
     S = stack(COUNT, COUNT)
@@ -165,10 +161,8 @@ def half_trace(values, weighed):
 
 
 def add_trace_model(S, weighed, slopes, stage):
-    """Add the model of 1/2 tr M'SM: with columns m_i and their Jacobians J_i, sum J_i'S J_i and sum J_i'S m_i.
-
-    Args:
-      weighed: S M. slopes: the J_i.
+    """Add the model of 1/2 tr M'SM: of columns m_i and Jacobians J_i (slopes), with S M (weighed), sum J_i'S J_i and
+    sum J_i'S m_i.
     """
     line, curve, slope = stack(PADDED_COUNT), zeros(ACTIVE_COUNT, PADDED_COUNT), zeros(PADDED_COUNT)
     for k in range(SIZE):

@@ -123,9 +123,6 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
 
     From the minimiser of c_l, first quadratised at the guess, the dynamics run backwards with the guessed controls.
     With `guided`, the pass linearises about the guess.
-
-    Args:
-      guess: Motion. prior: Prior. policy, to_go: written.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, x, x_hat, u = stack(N), stack(N), stack(N), stack(M)
@@ -162,9 +159,6 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
 
     It includes the expected cost of noise; the prior, which is no part of the cost, but keeps the linearisations
     sensible in the first iterations; and damping, a weight on the control's distance from the plan's.
-
-    Args:
-      ahead: NextStep. convex: as in `noise_quadratic`. stage: QuadraticStage, written.
     """
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
     value = cost_of_order(x, u, t, model.stage, 0.0, hessian, gradient)

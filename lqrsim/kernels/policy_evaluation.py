@@ -32,15 +32,11 @@ def all_to_nearest(steps, count, states, nominal, angular):
 @outline
 def to_nearest(x, nominal, angular):
     """Replace a state by its representative nearest to the nominal: its angles and its rotation vectors."""
-    for k in range(angular.angle_count):
-        nearest_angle(x, nominal, int(angular.angles[k]))
+    for k in range(angular.angle_count):  # to within half a turn
+        i = int(angular.angles[k])
+        x[i] -= 2.0 * pi * floor((x[i] - nominal[i]) / (2.0 * pi) + 0.5)
     for k in range(angular.rotation_count):
         nearest_rotation(x, nominal, int(angular.rotations[k, 0]), int(angular.rotations[k, 1]))
-
-
-def nearest_angle(x, nominal, i):
-    """Replace angle i by its representative within half a turn of the nominal."""
-    x[i] -= 2.0 * pi * floor((x[i] - nominal[i]) / (2.0 * pi) + 0.5)
 
 
 def nearest_rotation(x, nominal, first, turn):

@@ -14,7 +14,7 @@ changes of controls. Both are reduced after full steps and increased after short
 from math import hypot, inf, isfinite, log
 
 from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy_matrix, fill
+from lqrsim.kernels.linear_algebra import copy_matrix, fill, finite
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
     EQUALITY,
@@ -150,7 +150,7 @@ def descend(price, stages, work, mem):
     mem.part, part = 0.0, 1.0
     while part > SHORTEST and mem.part == 0:
         closed_loop_rollout(steps, part, work.plan, stages.policy, work.limits, stages.model, work.trial)
-        if isfinite_everywhere(steps, work.trial.states):
+        if finite(work.trial.states, steps + 1, N):
             cost = trial(stages, work.trial, work.arrived)
             read_rows(stages, work.trial, work.numbers)
             merit = penalized(cost, work.numbers, price, stages, mem)
@@ -168,15 +168,6 @@ def descend(price, stages, work, mem):
         mem.damping /= TIMES
     elif part < SHORT:
         mem.damping = min(max(TIMES * mem.damping, LIGHT), HEAVY)
-    return True
-
-
-def isfinite_everywhere(steps, states):
-    """Whether all states are finite."""
-    for t in range(steps + 1):
-        for i in range(N):
-            if not isfinite(states[t, i]):
-                return False
     return True
 
 

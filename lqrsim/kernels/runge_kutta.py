@@ -25,12 +25,9 @@ def advance(x, u, p, h, out):
 
 
 def chain(fx, fu, previous, a, out):
-    """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the Jacobian of one Runge-Kutta stage in (x, u).
+    """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): a Runge-Kutta stage's Jacobian in (x, u), a seconds after x.
 
     Dynamics with known zeros have their own `chain`; see `write_chain` in `codegen/symbolic.py`.
-
-    Args:
-      fx: (N, N). fu: (N, M). previous: (N, W) of the previous stage. a: time of the stage after x, in s.
     """
     row = stack(W)  # a local array instead of out[i] stays in registers
     for i in range(N):
@@ -101,11 +98,7 @@ def state_jacobians(count, states, controls, p, slopes):
 
 
 def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
-    """Write a step and its Jacobian as above; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W).
-
-    Args:
-      weights: (N,). out: (N,). jacobian: [A B] (N, W). hessian: (W, W).
-    """
+    """Write a step and its Jacobian as above; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W)."""
     k, z2, z3, z4, curve = stack(N), stack(N), stack(N), stack(N), zeros(K, K)
     fu, fx1, fx2, fx3, fx4 = zeros(N, M), zeros(N, N), zeros(N, N), zeros(N, N), zeros(N, N)
     slope1, slope2, slope3, slope4 = stack(N, W), stack(N, W), stack(N, W), stack(N, W)

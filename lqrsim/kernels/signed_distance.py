@@ -145,13 +145,10 @@ def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, h
 
 @outline
 def hull_distance(data, row, corners, first, count, pulls) -> float:
-    """The signed distance of a convex polygon to an obstacle; negative if they overlap.
+    """The signed distance of a convex polygon, corners from `first` on, to an obstacle; negative if they overlap.
 
     Apart, it is the distance of the nearest points; for an overlap, the shortest move that ends it. Write the
     derivatives in the polygon's corners to pulls (3 count,).
-
-    Args:
-      corners: the polygon's corners, from the one numbered `first` on.
     """
     least, which = overlap(data, row, corners, first, count, pulls), -1
     if not least < 0:

@@ -6,22 +6,17 @@ One compiled function serves all sizes, so every array is flat.
 from math import copysign, sqrt
 
 from lqrsim.kernels.declarations import outline
+from lqrsim.kernels.linear_algebra import copy_part
 from lqrsim.kernels.loop_moments import add_row, dot
 
 
 def filter_along(sizes, model, roots):
-    """Write the roots of all knots, from the root before the first measurement, or after it if that was `used`.
-
-    Args:
-      sizes: FilterSizes. model: FilterModel. roots: FilterRoots.
-    """
+    """Write the roots of all knots, from the root before the first measurement, or after it if that was `used`."""
     Z = sizes.entries
     for t in range(sizes.knots):
-        for i in range(Z * Z):
-            roots.before[Z * Z * t + i] = roots.root[i]
+        copy_part(roots.root, 0, roots.before, Z * Z * t, Z * Z)
         measure(t, sizes, model, roots)
-        for i in range(Z * Z):
-            roots.after[Z * Z * t + i] = roots.root[i]
+        copy_part(roots.root, 0, roots.after, Z * Z * t, Z * Z)
         if t + 1 < sizes.knots:
             predict(t, sizes, model, roots)
 
@@ -47,14 +42,11 @@ def measure(t, sizes, model, roots):
         add_row(1.0, roots.root, Z * i, roots.work, width * (Y + i) + n + Y, Z)
     triangularize(roots.work, Y + Z, width)
     for i in range(Y):
-        for j in range(Y):
-            roots.innovation[Y * (Y * t + i) + j] = roots.work[width * i + j]
+        copy_part(roots.work, width * i, roots.innovation, Y * (Y * t + i), Y)
     if t > 0 or not sizes.used:
         for i in range(Z):
-            for j in range(Y):
-                roots.learned[Y * (Z * t + i) + j] = roots.work[width * (Y + i) + j]
-            for j in range(Z):
-                roots.root[Z * i + j] = roots.work[width * (Y + i) + Y + j]
+            copy_part(roots.work, width * (Y + i), roots.learned, Y * (Z * t + i), Y)
+            copy_part(roots.work, width * (Y + i) + Y, roots.root, Z * i, Z)
 
 
 @outline
@@ -68,12 +60,10 @@ def predict(t, sizes, model, roots):
         for j in range(Z):
             if model.F[Z * (Z * t + i) + j] != 0.0:
                 add_row(model.F[Z * (Z * t + i) + j], roots.root, Z * j, roots.work, width * i, Z)
-        for j in range(D):
-            roots.work[width * i + Z + j] = model.disturbing[D * (Z * t + i) + j]
+        copy_part(model.disturbing, D * (Z * t + i), roots.work, width * i + Z, D)
     triangularize(roots.work, Z, width)
     for i in range(Z):
-        for j in range(Z):
-            roots.root[Z * i + j] = roots.work[width * i + j]
+        copy_part(roots.work, width * i, roots.root, Z * i, Z)
 
 
 @outline

@@ -17,6 +17,7 @@ from lqrsim.kernels.linear_algebra import (
     congruence,
     copy,
     copy_matrix,
+    copy_part,
     entry,
     fill,
     set_entry,
@@ -50,11 +51,9 @@ INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
 def look(stages, plan, costates, least):
-    """Write the models of all stages at a plan, and return its cost.
+    """Write the models of all stages at a plan, with costates (T+1, N), and return its cost.
 
-    Args:
-      stages: PlanStages. costates: (T+1, N).
-      least: multipliers up to this, times the sizes of their rows, count as zero in the Hessians.
+    Multipliers up to `least`, times the sizes of their rows, count as zero in the Hessians.
     """
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
@@ -271,12 +270,9 @@ def survey(stages, plan):
 
 
 def typical_sizes(stages, plan, hessian):
-    """Write typical sizes of states, controls and rows, and return the cost of such changes.
+    """Write typical sizes of states, controls and rows; return the cost of such changes, by Hessians (T+1, W, W) of it.
 
     The size of a control without limits is the change that moves a state by its typical size.
-
-    Args:
-      hessian: (T+1, W, W) of the cost.
     """
     steps, rows, models = stages.steps, stages.rows, stages.models
     for i in range(N):
@@ -344,8 +340,7 @@ def adjoint(stages, costates, slopes):
         lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
         copy(slope, N, costates[t])
         if t < stages.steps:
-            for i in range(M):
-                slopes[t, i] = slope[N + i]
+            copy_part(slope, N, slopes[t], 0, M)
 
 
 def measure(stages, plan, numbers, gaps):
@@ -424,9 +419,7 @@ def direction(stages, plan, gaps, share, weight, base, curves, forces):
 def regularised_direction(stages, plan, gaps, weight, scale, curves, forces):
     """The first step of the ladder of regularisation that exists; return the rung, -1 if none has a minimum.
 
-    Args:
-      weight: weight on changes of the controls, which is added to those of the ladder. scale: the cost to which these
-        are relative. The others are as in `direction`.
+    The weights on changes of the controls are relative to `scale`, and added to `weight`; the rest as in `direction`.
     """
     for rung in range(len(MIXES) + len(WEIGHTS)):
         more = weight + (WEIGHTS[rung - len(MIXES)] if rung >= len(MIXES) else 0.0) * scale
@@ -482,15 +475,18 @@ def moved(t, row, stages):
 def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
     """Write gains and cost-to-go at t so that the gap closes; return whether the control block is definite.
 
-    Args:
-      stage: (W, W) and slope: (W,) of the model at the plan; overwritten. jacobian: (N, W). gap: (N,).
-      policy: its offsets are the changes of the controls for an unchanged state. to_go: of changes of the state.
+    The stage, which is overwritten, and the cost-to-go are of changes of the plan; so are the policy's offsets, for an
+    unchanged state.
     """
-    least = stack(M)
+    least, block = stack(M), stack(M, M)
     for i in range(M):
         least[i] = TINY * abs(stage[N + i, N + i])
     add_cost_to_go(t, LinearStep(jacobian, gap), QuadraticStage(stage, slope), 0.0, to_go)
-    if not control_block_definite(stage, least):
+    for i in range(M):
+        for j in range(M):
+            block[i, j] = stage[N + i, N + j]
+        block[i, i] -= least[i]
+    if not cholesky(block, M):
         return False
     return minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) >= 0
 
@@ -558,16 +554,6 @@ def start_change(free, to_go, change):
     good = cholesky(curve, N)
     cholesky_solve(curve, N, change)
     return good
-
-
-def control_block_definite(stage, least):
-    """Whether the control block of a stage (W, W) minus a diagonal (M,) is positive definite."""
-    block = stack(M, M)
-    for i in range(M):
-        for j in range(M):
-            block[i, j] = stage[N + i, N + j]
-        block[i, i] -= least[i]
-    return cholesky(block, M)
 
 
 def closed_loop_rollout(steps, part, plan, policy, limits, model, out):

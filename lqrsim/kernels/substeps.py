@@ -36,11 +36,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
 
 @compact
 def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
-    """Write a period and its Jacobian; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W).
-
-    Args:
-      weights: (N,). out: (N,). jacobian: [A B] (N, W). hessian: (W, W).
-    """
+    """Write a period and its Jacobian; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W)."""
     states, slopes = stack(PARTS + 1, N), stack((PARTS + 1) * N, W)  # at the beginning of each step, and at the end
     own, w, before = stack(N, W), stack(N), stack(N)
     copy(x, N, states[0])
@@ -79,11 +75,7 @@ def begin(slopes, first):
 
 
 def follow(own, slopes, first, then):
-    """Write the Jacobian after a step, `A slopes + [0 B]`, from row `then` on, given that before it from row `first`.
-
-    Args:
-      own: [A B] of the step.
-    """
+    """Write the Jacobian after a step [A B], `A slopes + [0 B]`, from row `then` on; that before is from `first` on."""
     after = stack(N, W)
     for i in range(N):
         for j in range(W):

@@ -5,15 +5,12 @@ so every array is flat.
 """
 
 from lqrsim.kernels.declarations import outline
+from lqrsim.kernels.linear_algebra import copy_part
 from lqrsim.kernels.loop_moments import add_row, add_rows
 
 
 def improve(t, sizes, given, work):
-    """Write the laws of step t and the costs-to-go at t of all weights.
-
-    Args:
-      sizes: PassSizes. given: PassArrays. work: PassWork; `products` are given.
-    """
+    """Write the laws of step t and the costs-to-go at t of all weights; the `products` are given."""
     for k in range(sizes.laws):
         eliminate(t, k, sizes, given, work)
         go_back(t, k, sizes, given, work)
@@ -55,8 +52,7 @@ def go_back(t, k, sizes, given, work):
     for j in range(m * width):
         work.mean[j] = (1.0 - lost) * given.laws[law + j] + lost * given.held[held + j]
     for i in range(Y):
-        for j in range(width):
-            work.cost[cost + width * i + j] = work.products[first + row * i + j]
+        copy_part(work.products, first + row * i, work.cost, cost + width * i, width)
         add_rows(m, work.products, first + row * i + width, 1, work.mean, 0, width, work.cost, cost + width * i, width)
     for a in range(m if lost > 0.0 else 0):
         own, at = first + row * (Y + a), cost + width * (force + a)
