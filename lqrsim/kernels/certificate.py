@@ -14,6 +14,7 @@ from lqrsim.kernels.model_functions import (
     augment_cost,
     cost_alone,
     cost_of_order,
+    cost_quadratic,
     noise_quadratic,
     step_jacobian,
     step_second_order,
@@ -106,7 +107,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
-        cost += cost_of_order(states[0], none, 0, model.initial, 0.0, stage.hessian, stage.gradient)
+        cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
         typical += cost_of_change(stage, sizes)
         terms = scale_of(states[0], none, stage)
         scale += terms

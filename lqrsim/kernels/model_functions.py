@@ -97,6 +97,11 @@ def cost_added(x, u, t, cost):
     return total
 
 
+def cost_quadratic(x, u, t, cost, hessian, gradient):
+    """As `cost_of_order`, of the convex model."""
+    return cost_of_order(x, u, t, cost, 0.0, hessian, gradient)
+
+
 def cost_of_order(x, u, t, cost, share, hessian, gradient):
     """Write the quadratic model of a cost and its augmented Lagrangian at (x, u); return the value.
 

@@ -30,7 +30,7 @@ from lqrsim.kernels.linear_algebra import (
     finite,
     step_offset,
 )
-from lqrsim.kernels.model_functions import advance, cost_of_order, noise_quadratic, step_jacobian
+from lqrsim.kernels.model_functions import advance, cost_quadratic, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Linearization, LinearStep, NextStep, QuadraticStage
 
 
@@ -161,7 +161,7 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
     sensible in the first iterations; and damping, a weight on the control's distance from the plan's.
     """
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
-    value = cost_of_order(x, u, t, model.stage, 0.0, hessian, gradient)
+    value = cost_quadratic(x, u, t, model.stage, hessian, gradient)
     if NOISY:
         value += noise_quadratic(x, u, t, model.noise, ahead, convex, stage)
     if t > 0:
@@ -184,7 +184,7 @@ def add_square(i, weight, error, hessian, gradient):
 def final_model(x, steps, model, to_go):
     """Write the cost-to-go at T: c_l quadratised at x, Eq. (31)."""
     hessian, gradient, none = stack(W, W), stack(W), zeros(M)
-    value = cost_of_order(x, none, steps, model.final, 0.0, hessian, gradient)
+    value = cost_quadratic(x, none, steps, model.final, hessian, gradient)
     to_go.constant[steps] = end_model(hessian, gradient, value, x, to_go.hessian[steps], to_go.gradient[steps])
 
 
@@ -199,7 +199,7 @@ def initial_model(x, fixed, model, about, to_go, to_come):
         copy(x, N, to_come.vector[0])
         to_come.constant[0] = 0.0
         return True, 0.0
-    value = cost_of_order(x, none, 0, model.initial, 0.0, hessian, gradient)
+    value = cost_quadratic(x, none, 0, model.initial, hessian, gradient)
     if about.damping > 0:
         for i in range(N):
             value += add_square(i, about.damping * hessian[i, i], x[i] - about.plan.states[0, i], hessian, gradient)

@@ -28,6 +28,7 @@ from lqrsim.kernels.model_functions import (
     advance_all,
     all_steps_second_order,
     cost_of_order,
+    cost_quadratic,
     cost_value,
     evaluate_constraints,
     slope_of_constraint,
@@ -119,10 +120,10 @@ def project(stages, plan):
         return
     gradient, none, hessian, model, convex = stack(W), zeros(M), stack(W, W), stages.model, stages.models.convex
     for t in range(stages.steps):
-        cost_of_order(plan.states[t], plan.controls[t], t, model.stage, 0.0, convex[t], gradient)
-    cost_of_order(plan.states[stages.steps], none, stages.steps, model.final, 0.0, convex[stages.steps], gradient)
+        cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, convex[t], gradient)
+    cost_quadratic(plan.states[stages.steps], none, stages.steps, model.final, convex[stages.steps], gradient)
     if stages.soft == 1:
-        cost_of_order(plan.states[0], none, 0, model.initial, 0.0, hessian, gradient)
+        cost_quadratic(plan.states[0], none, 0, model.initial, hessian, gradient)
         add_matrix(hessian, N, convex[0])
     stages.projected[0] = 1.0
 

@@ -199,7 +199,7 @@ def _flat_controls(problem: Problem, found: RunResult) -> list[str]:
     hessian, gradient = np.zeros((joint, joint)), np.zeros(joint)
     state, control = found.states[0].copy(), found.controls[0].copy()
     stage = compiled.arguments(problem).stage
-    compiled.costs_module(problem).cost_of_order(state, control, 0, stage, 0.0, hessian, gradient)
+    compiled.costs_module(problem).cost_quadratic(state, control, 0, stage, hessian, gradient)
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 

@@ -232,20 +232,20 @@ class System:
         self._linearize = dynamics.compiled.lay_out(
             "rate_jacobian", self._f, self._none, self._parameters, self._f, self._fx, self._fu
         )
-        self._quadratize = costs.lay_out("cost_of_order", self._f, self._none, 1, data.stage, 0.0, *joint)
+        self._quadratize = costs.lay_out("cost_quadratic", self._f, self._none, 1, data.stage, *joint)
 
     def _expand(self, t: float, x: Array, u: Array) -> float:
         """Expand dynamics and stage cost about (x, u), in place; returns the cost. All are per second."""
         self._linearize(x, u, self._parameters, self._f, self._fx, self._fu)
         step = min(max(int(t / self.dt), 1), self._last)
-        value = self._quadratize(x, u, step, self._data.stage, 0.0, self._hessian, self._gradient)
+        value = self._quadratize(x, u, step, self._data.stage, self._hessian, self._gradient)
         self._hessian /= self.dt
         self._gradient /= self.dt
         return value / self.dt
 
     def end_value(self, which: str, x: Array) -> float:
         """The `initial` or `final` cost; its derivatives are left in the buffers."""
-        return self._quadratize(x, self._none, 0, getattr(self._data, which), 0.0, self._hessian, self._gradient)
+        return self._quadratize(x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
 
     def end_model(self, which: str, x: Array) -> Array:
         """The `initial` or `final` cost, quadratised at x, as V. Paper: Eqs. (23), (31)."""
