@@ -179,7 +179,7 @@ def test_a_robot_with_neither_position_nor_balls_is_drawn_by_what_is_farthest_ou
             place = run.places(0)[round(knot)]
             np.testing.assert_allclose(place, data.geom("tip").xpos, rtol=0, atol=1e-6)  # frames are single floats
     assert np.ptp(run.places(0), axis=0).max() > 0.01  # and not the middle, which stays
-    still = ls.view.render_still(run, tmp_path / "still.png", size=(160, 120))
+    still = ls.render(run, tmp_path / "still.png", size=(160, 120))
     assert np.asarray(Image.open(still)).std() > 0
 
 
@@ -228,7 +228,7 @@ def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(
     problem = robot.problem(robot.at(), robot.at(turn=1.0), steps=20, dt=0.02)
     run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem, max_iterations=1))
     still = tmp_path / "still.png"
-    ls.view.render_still(run, still, size=size, every=run.times[-1] / 4, overlays=())
+    ls.render(run, still, size=size, every=run.times[-1] / 4, overlays=())
     colours = np.asarray(Image.open(still).convert("RGB")).astype(int)
     red = (colours[..., 0] > 100) & (colours[..., 1:].max(axis=2) < 60)
     blue = (colours[..., 2] > 100) & (colours[..., :2].max(axis=2) < 60)

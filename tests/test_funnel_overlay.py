@@ -176,7 +176,7 @@ def test_refused(flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: 
     whole = funnel_by_hand(quadrotor_solution, np.eye(3))
     moved = replace(whole, plan=replace(whole.plan, states=whole.plan.states + 1))
     flat = funnel_by_hand(quadrotor_solution, np.eye(2))
-    unchecked: Any = ls.view.render_still
+    unchecked: Any = ls.render
     assert "funnel" not in OVERLAYS
     for wrong, said in (
         (None, "funnel: got None with the overlay funnel"),

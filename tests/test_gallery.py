@@ -59,24 +59,19 @@ def test_what_pages_show_exists_and_is_small(page: Path) -> None:
         assert picture.stat().st_size < 2e6, picture
 
 
-def test_the_gallery_names_the_calls_behind_its_commands() -> None:
-    """With keywords that the calls have."""
-    calls = {"ls.view.render_still": ls.view.render_still, "ls.render": ls.render}
+def test_the_gallery_names_the_call_behind_its_commands() -> None:
+    """With keywords that it has."""
     text = " ".join(GALLERY.read_text(encoding="utf-8").split())
-    for name, call in calls.items():
-        (stated,) = re.findall(rf"`{re.escape(name)}\((.*?)\)`", text)
-        assert set(re.findall(r"(\w+)=", stated)) <= set(inspect.signature(call).parameters)
+    (stated,) = re.findall(r"`ls\.render\((.*?)\)`", text)
+    assert set(re.findall(r"(\w+)=", stated)) <= set(inspect.signature(ls.render).parameters)
 
 
-def test_the_gallery_says_how_arguments_of_the_calls_differ_from_options() -> None:
+def test_the_gallery_says_how_arguments_of_the_call_differ_from_options() -> None:
     options = {field.name for field in dataclasses.fields(Render)} - {"rollouts", "out"}
-    still, video = (set(inspect.signature(one).parameters) for one in (ls.view.render_still, ls.render))
     text = " ".join(GALLERY.read_text(encoding="utf-8").split())
     renamed = dict(re.findall(r"`--(\w+)` is `(\w+)=`", text))
-    assert {renamed.get(name, name) for name in options} == (still | video) - {"runs", "path", "progress"}
-    for name, only in (("render", video - still), ("render_still", still - video)):
-        (stated,) = re.findall(rf"only `{name}` has (.*?)[;.]", text, re.IGNORECASE)
-        assert set(re.findall(r"`(\w+)=`", stated)) == only - {"progress"}
+    arguments = {*inspect.signature(ls.render).parameters} - {"runs", "path", "progress"}
+    assert {renamed.get(name, name) for name in options} == arguments
 
 
 def test_the_gallery_has_every_picture_with_the_commands_that_make_it(pictures: Mapping[str, tuple[str, ...]]) -> None:

@@ -271,7 +271,7 @@ def test_pictures_are_those_of_still(quadrotor: ls.Scenario, quadrotor_solution:
     assert env.metadata["render_fps"] == 30
     assert (pictures[0] != pictures[60]).any()
     for step, picture in pictures.items():
-        path = ls.view.render_still(
+        path = ls.render(
             rollout, tmp_path / "still.png", time=step / 30, camera="top", overlays=("plan",), quality="draft",
         )  # fmt: skip
         np.testing.assert_array_equal(picture, np.asarray(Image.open(path)))

@@ -135,7 +135,7 @@ def test_a_video_and_a_picture_show_themselves(rollout: ls.Rollout, tmp_path: Pa
     options = {"size": (480, 270), "quality": "draft"}
     for path, tag, kind in (
         (ls.render(rollout, tmp_path / "run.mp4", fps=1, **options), "video", "video/mp4"),
-        (ls.view.render_still(rollout, tmp_path / "run.png", **options), "img", "image/png"),
+        (ls.render(rollout, tmp_path / "run.png", **options), "img", "image/png"),
     ):
         shown = parsed(path._repr_html_() or "")
         assert shown.tag == tag

@@ -24,7 +24,7 @@ from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay
 from lqrsim.view.overlays import DrawnTube, Overlays, Scale, colour_of, legend_entries
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.render import render, render_still
+from lqrsim.view.render import render
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
@@ -116,7 +116,7 @@ def test_obstacles_that_move_are_drawn_where_they_are(
     options: dict = {"camera": "top", "overlays": (), "size": (640, 480), "quality": "draft"}
     for time in (0.0, 5.0):
         both = [
-            pixels(render_still(one, tmp_path / "still.png", time=time, **options))
+            pixels(render(one, tmp_path / "still.png", time=time, **options))
             for one in (run, dataclasses.replace(run, moving=None))
         ]
         rows, columns = np.nonzero(np.abs(both[0] - both[1]).max(axis=2) > 3)
@@ -151,7 +151,7 @@ def test_frames_show_their_moment_at_any_rate(rollout: ls.Rollout, fps: float, t
     look: dict = {"size": SMALL, "overlays": ("plan", "ghost", "trace")}
     frames = decode(render(rollout, tmp_path / "run.mp4", fps=fps, **look))
     for number in (0, len(frames) // 2, len(frames) - 1):
-        path = render_still(rollout, tmp_path / "still.png", time=number / fps, **look)
+        path = render(rollout, tmp_path / "still.png", time=number / fps, **look)
         # Compared where they differ most, which is where the robot is; the rest is the same at any time. What
         # h264 loses there is a third or less of what one frame of motion changes.
         assert 2 * difference(frames[number], pixels(path)) < difference(frames[number - 1], pixels(path))
@@ -208,7 +208,7 @@ def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
     moved = dataclasses.replace(drive, states=states)
 
     def count(time: float) -> tuple[int, int]:
-        image = pixels(render_still(moved, tmp_path / "still.png", time=time, size=(640, 360), overlays=BARE))
+        image = pixels(render(moved, tmp_path / "still.png", time=time, size=(640, 360), overlays=BARE))
         red, green, blue = np.moveaxis(image, 2, 0)
         plan = (red > 120) & (green < 90) & (blue > 50) & (red > 1.4 * blue)
         trace = (red > 140) & (green > 120) & (blue < 0.75 * green) & (red < 1.5 * green)
@@ -226,7 +226,7 @@ def test_same_rollout_gives_the_same_pictures(rollout: ls.Rollout, tmp_path: Pat
     one, other = (decode(render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=0.4)) for name in "ab")
     assert len(one) == len(other)
     assert max(map(difference, one, other)) < 1
-    one, other = (pixels(render_still(rollout, tmp_path / f"{name}.png", every=2, size=SMALL)) for name in "ab")
+    one, other = (pixels(render(rollout, tmp_path / f"{name}.png", every=2, size=SMALL)) for name in "ab")
     assert difference(one, other) < 1
 
 
@@ -238,7 +238,7 @@ def test_many_disturbances_do_not_fill_a_small_picture(
     plant = quadrotor.plant()
     run = ls.simulate(plant, quadrotor_solution, disturbances=ls.disturbances.preset("light", plant))
     for insets in ((), ("top",)):
-        ls.view.render_still(run, tmp_path / "a.png", size=(320, 180), insets=insets)
+        ls.render(run, tmp_path / "a.png", size=(320, 180), insets=insets)
     path = render(run, tmp_path / "a.gif", quality="draft", fps=1)
     with Image.open(path) as image:
         assert image.size == (480, 270)
@@ -365,7 +365,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
 
     def shown(*overlays: Overlay) -> np.ndarray:
         options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
-        return pixels(render_still(noisy, tmp_path / "still.png", funnel=funnel, **options))
+        return pixels(render(noisy, tmp_path / "still.png", funnel=funnel, **options))
 
     bare = shown()
     for overlay in ALL_OVERLAYS:
@@ -374,11 +374,9 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
     options: dict = {"overlays": ("cost_tube",), "size": SMALL}
     with pytest.raises(ls.InputError, match="solution: got a plan other than"):
-        render_still(
-            dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options
-        )
+        render(dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options)
     with pytest.raises(ls.InputError, match="solution: got None with the overlay cost_tube"):
-        render_still(flight, tmp_path / "a.png", **options)
+        render(flight, tmp_path / "a.png", **options)
 
 
 def test_predicted_tube_has_the_half_axes_of_its_covariance(flight: ls.Rollout, drive: ls.Rollout) -> None:
@@ -490,8 +488,8 @@ def test_tube_of_the_cost_is_the_shadow_of_what_the_total_cost_allows(
 
 @draws
 def test_robot_is_shown_several_times(flight: ls.Rollout, tmp_path: Path) -> None:
-    once = pixels(render_still(flight, tmp_path / "once.png", size=(640, 360)))
-    often = pixels(render_still(flight, tmp_path / "often.png", every=1, size=(640, 360)))
+    once = pixels(render(flight, tmp_path / "once.png", size=(640, 360)))
+    often = pixels(render(flight, tmp_path / "often.png", every=1, size=(640, 360)))
     assert (np.abs(once - often).max(axis=2) > 20).sum() > 5 * 60
 
 
@@ -499,7 +497,7 @@ def test_robot_is_shown_several_times(flight: ls.Rollout, tmp_path: Path) -> Non
 def test_picture_may_exceed_the_buffer_of_the_model(drive: ls.Rollout, tmp_path: Path) -> None:
     small = drive.model.replace('offwidth="1920" offheight="1080"', 'offwidth="64" offheight="64"')
     assert small != drive.model
-    path = render_still(dataclasses.replace(drive, model=small), tmp_path / "still.png", size=SMALL)
+    path = render(dataclasses.replace(drive, model=small), tmp_path / "still.png", size=SMALL)
     assert pixels(path).shape == (180, 320, 3)
 
 
@@ -508,12 +506,12 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
     states, frames = flight.states.copy(), flight.frames.copy()
     states[:, 60:], frames[:, flight.frame_times > 2.0] = np.nan, np.nan
     broken = dataclasses.replace(flight, states=states, frames=frames, diverged_at=np.array([2.0]))
-    images = [pixels(render_still(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
+    images = [pixels(render(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
     # The captions, upper left, tell the time; the marks of the plan move on.
     assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
     lost = dataclasses.replace(broken, states=np.full_like(states, np.nan), frames=np.full_like(frames, np.nan))
     with pytest.raises(ls.InputError, match="without a finite state"):
-        render_still(lost, tmp_path / "still.png", size=SMALL)
+        render(lost, tmp_path / "still.png", size=SMALL)
 
 
 @draws
@@ -534,7 +532,7 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
         ({"speed": 0}, "speed: got 0, want"),
         ({"trial": 1}, "trial: got 1, want one of 0 to 0"),
         ({"fps": 0}, "fps: got 0, want"),
-        ({"path": "run.avi"}, "path: got .*run.avi', want a name that ends in .mp4 or .gif"),
+        ({"path": "run.avi"}, "path: got .*run.avi', want a name that ends in .mp4, .gif, .png"),
         ({"path": "file/run.mp4"}, "want a file that can be written"),
     ],
 )
@@ -553,12 +551,12 @@ def test_bad_input_gets_one_line(options: dict, message: str, drive: ls.Rollout,
     [
         ({"time": 26.0}, "time: got 26.0, want a finite number >= 0 and <= 25"),
         ({"every": 0}, "every: got 0, want a finite number >= 0.5"),
-        ({"path": "still.jpg"}, "want a name that ends in .png"),
+        ({"path": "still.gif", "time": 1.0}, "time, every: got 'still.gif', want FILE.png: they belong to stills"),
     ],
 )
 def test_bad_input_for_a_still(options: dict, message: str, drive: ls.Rollout, tmp_path: Path) -> None:
     with pytest.raises(ls.InputError, match=message):
-        render_still(drive, tmp_path / options.pop("path", "still.png"), **{"size": SMALL, **options})
+        render(drive, tmp_path / options.pop("path", "still.png"), **{"size": SMALL, **options})
 
 
 @pytest.mark.parametrize("model", ["<mujoco><worldbody>", "<mujoco/>"])

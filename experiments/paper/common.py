@@ -30,14 +30,14 @@ def figure(config: FolderSettings, result: Result, name: str, size: tuple[float,
 
 
 def render_still(config: FolderSettings, result: Result, name: str, rollout: ls.Rollout, **options: Any) -> None:
-    """A picture by `lqrsim.view.render_still`, noted in the result; without OpenGL, why there is none."""
+    """A picture by `lqrsim.render`, noted in the result; without OpenGL, why there is none."""
     try:
         gl.bind()
     except ls.InputError as error:
         result.setdefault("not drawn", {})[name] = str(error)
         return
     size = (320, 180) if config.quick else (1280, 720)
-    ls.view.render_still(rollout, config.out / FIGURES / f"{name}.png", size=size, **options)
+    ls.render(rollout, config.out / FIGURES / f"{name}.png", size=size, **options)
     result["figures"].append(f"{name}.png")
 
 

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("view/render.py", "render", camera="NAME", size="WIDTH HEIGHT", fps="RATE", speed="FLOAT")
+@options_of(
+    "view/render.py", "render", camera="NAME", size="WIDTH HEIGHT", fps="RATE", speed="FLOAT", time="SECONDS",
+    every="SECONDS",
+)  # fmt: skip
 class Render:
     """Render a run as a video or a still.
 
@@ -61,10 +64,6 @@ class Render:
     """Funnel about the plan of the runs, one for all or one each, from `lqrsim funnel`."""
     quality: Quality = "standard"
     """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
-    time: Annotated[float | None, optional("SECONDS")] = None
-    """The moment of a still. By default the end."""
-    every: Annotated[float | None, optional("SECONDS")] = None
-    """In a still, show the robot also where it was at each multiple of this."""
 
     def run(self) -> int:
         from lqrsim.results.funnel import Funnel
@@ -83,16 +82,14 @@ class Render:
         funnel = _one_or_all([ls.load(path, Funnel) for path in self.funnel])
         drawn, rows = _one_or_all(runs), 0 if self.trial is None else _one_or_all(self.trial)
         content = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
-        look = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
         match out.suffix.lower():
             case ".html":
                 html_file.render_html(drawn, out, trial=self.trial, **content)
             case ".rrd":
                 rerun_file.write(drawn, out, trial=rows, funnel=funnel)
-            case ".png":
-                ls.view.render_still(drawn, out, **stated(self, ls.view.render_still, **look))
             case _:
                 with console.progress("rendering", "frame") as progress:
+                    look = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
                     ls.render(drawn, out, **stated(self, ls.render, **look, progress=progress))
         console.wrote(out)
         return 0
@@ -100,8 +97,6 @@ class Render:
     def _check_options(self, out: Path) -> None:
         """Raise InputError for another kind of file, or for options that do not belong to its kind."""
         kind = out.suffix.lower()
-        if kind in (".mp4", ".gif") and (self.time is not None or self.every is not None):
-            raise ls.InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
         if kind in (".mp4", ".gif", ".png"):
             return
         if kind not in (".html", ".rrd"):

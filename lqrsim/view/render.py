@@ -135,9 +135,11 @@ def render(
     size: tuple[int, int] | None = None,
     fps: float | None = None,
     speed: Annotated[float, Bounds(at_least=1e-3, at_most=1000)] = 1.0,
+    time: float | None = None,
+    every: float | None = None,
     progress: Progress | None = None,
 ) -> PictureFile:
-    """Write a video of a run, or of several runs side by side: mp4 (h264) or GIF, by the suffix.
+    """Write a video of a run, or of several runs side by side, mp4 (h264) or GIF; or a still of them, png.
 
     Obstacles between a camera and the robot fade. A trial that diverged stands still from then on. The file is complete
     or absent, even after an error or Ctrl-C. The same runs give bit-identical frames. The metadata of an
@@ -156,13 +158,20 @@ def render(
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
       fps: frames per second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run per second of the video.
+      time: of a still, seconds after the start; by default the end.
+      every: of a still, seconds; the robot is also drawn at each multiple of it, as in the paper's figures.
       progress: called after each frame with the number of finished frames and the number of all frames.
 
     Returns:
-      The path. A notebook shows the video if the call is a cell's last expression.
+      The path. A notebook shows the video or the still if the call is a cell's last expression.
     """
-    path = _checked_path(path, ".mp4", ".gif")
-    animated = path.suffix.lower() == ".gif"
+    path = check_path("path", path)
+    kind = path.suffix.lower()
+    if kind not in MEDIA_TYPES:
+        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {', '.join(MEDIA_TYPES)}")
+    still, animated = kind == ".png", kind == ".gif"
+    if not still and (time is not None or every is not None):
+        raise InputError(f"time, every: got {excerpt(path.name)}, want FILE.png: they belong to stills")
     fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)
     if animated and size is None:
@@ -170,9 +179,16 @@ def render(
         size = max(width, SMALLEST_GIF[0]), max(height, SMALLEST_GIF[1])
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
-        funnel=funnel, quality=quality, size=size, speed=speed,
+        funnel=funnel, quality=quality, size=size, speed=1.0 if still else speed,
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
+        if still:
+            time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
+            earlier = list[float]()
+            if every is not None:  # no more robots than can be told apart
+                earlier = np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
+            Image.fromarray(drawn.draw(time, earlier=earlier)).save(unfinished)
+            return PictureFile(path)
         count = int(drawn.end / speed * rate + 1e-9) + 1
         if count > MOST_FRAMES:
             frames = f"{count} frames, want at most {MOST_FRAMES}"
@@ -193,54 +209,3 @@ def render(
                 if progress:
                     progress(number + 1, count)
     return PictureFile(path)
-
-
-def render_still(
-    runs: Rollout | Sequence[Rollout],
-    path: str | os.PathLike[str],
-    *,
-    time: float | None = None,
-    every: float | None = None,
-    trial: int | Sequence[int] = 0,
-    camera: str = "overview",
-    insets: Sequence[str] = (),
-    titles: Sequence[str] = (),
-    overlays: Sequence[Overlay] = OVERLAYS,
-    solution: Solution | Sequence[Solution | None] | None = None,
-    funnel: Funnel | Sequence[Funnel | None] | None = None,
-    quality: Quality = "standard",
-    size: tuple[int, int] | None = None,
-) -> PictureFile:
-    """Write a picture (png) of one moment.
-
-    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures.
-
-    The other arguments are as in `render`.
-
-    Args:
-      time: seconds after the start; by default the end.
-      every: seconds; the robot is also drawn at each multiple of it.
-
-    Returns:
-      The path. A notebook shows the picture if the call is a cell's last expression.
-    """
-    path = _checked_path(path, ".png")
-    options = PictureOptions(
-        trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
-        funnel=funnel, quality=quality, size=size,
-    )  # fmt: skip
-    with replacing(path) as unfinished, open_picture(runs, options) as drawn:
-        time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
-        earlier = list[float]()
-        if every is not None:  # no more robots than can be told apart
-            earlier = np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
-        Image.fromarray(drawn.draw(time, earlier=earlier)).save(unfinished)
-    return PictureFile(path)
-
-
-def _checked_path(path: str | os.PathLike[str], *suffixes: str) -> Path:
-    path = check_path("path", path)
-    if path.suffix.lower() not in suffixes:
-        other = "; view.render_still makes pictures" if ".png" not in suffixes else ""
-        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {' or '.join(suffixes)}{other}")
-    return path

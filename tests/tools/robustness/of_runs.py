@@ -315,9 +315,9 @@ def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
     shown = ls.verify_run(rollout)
     return made | {
         "render": (options | {
-            "path": video.with_name("v.gif"), "fps": 5.0, "speed": 1.0, "progress": print_nothing
-        }, 0.1),
-        "render_still": (options | {"path": place.folder / "still.png", "time": 0.1, "every": 0.2}, 0.15),
+            "path": place.folder / "still.png", "fps": 5.0, "speed": 1.0, "time": 0.1, "every": 0.2,
+            "progress": print_nothing,
+        }, 0.15),
         "render_html": ({
             "rollout": rollout, "path": place.folder / "run.html", "trial": 0, "overlays": ("plan",),
             "solution": solution, "funnel": None,
