@@ -1,5 +1,4 @@
 from .campaign import run_campaign as run_campaign
-from .comparison import compare as compare
 from .design_point import smallest_failure as smallest_failure
 from .failure_search import FailureCertificate as FailureCertificate
 from .failure_search import ReliabilityProblem as ReliabilityProblem
@@ -12,6 +11,7 @@ from .multilevel_splitting import failure_probability as failure_probability
 from .outcome_table import Outcomes as Outcomes
 from .outcome_table import outcomes as outcomes
 from .results import Results as Results
+from .results import compare as compare
 from .results import replay as replay
 from .safest import ComparedPlan as ComparedPlan
 from .safest import SafestPlan as SafestPlan

@@ -138,11 +138,12 @@ def failure_probability(
     check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
     tell = progress or (lambda done, total, text: None)
     counted = CountedScore(score)
+    splitting = _Splitting(counted, size, particles, moves)
     first, *rest = np.random.SeedSequence(seed).spawn(repetitions + 1)
     levels, step_sizes, batches = np.zeros(1), np.zeros(0), [1]
     if keep:
         rng = np.random.default_rng(first)
-        levels, step_sizes, batches = _pilot_run(counted, size, particles, keep, moves, most_levels, rng, level)
+        levels, step_sizes, batches = splitting.pilot_run(keep, most_levels, rng, level or (lambda level: None))
     done: list[tuple[Array, Array, Array]] = []
 
     def so_far() -> SplittingResult | None:
@@ -160,7 +161,7 @@ def failure_probability(
             estimates = [shares.prod() for shares, _, _ in done]
             tell(number, repetitions, f"{np.mean(estimates):.2g}" if estimates else "")
             rng = np.random.default_rng(key)
-            done.append(_repetition(counted, size, particles, moves, levels, step_sizes, batches, rng))
+            done.append(splitting.repetition(levels, step_sizes, batches, rng))
     result = so_far()
     tell(repetitions, repetitions, f"{0.0 if result is None else result.probability.value:.2g}")
     if result is None:
@@ -210,119 +211,111 @@ class CountedScore:
         return scores
 
 
-def _pilot_run(
-    score: Score,
-    size: int,
-    particles: int,
-    keep: float,
-    moves: int,
-    most_levels: int,
-    rng: np.random.Generator,
-    on_level: OnLevel | None,
-) -> tuple[Array, Array, list[int]]:
-    """Find the levels, the last of which is 0; the step size at all levels except the last; the batches at each."""
-    vectors = rng.standard_normal((particles, size))
-    scores = score(vectors)
-    levels: list[float] = []
-    step_sizes: list[float] = []
-    batches: list[int] = []
-    b = 0.5
+@dataclass(frozen=True)
+class _Splitting:
+    """What the pilot run and the repetitions do with vectors (k, d) and their scores (k,).
 
-    def another_batch(vectors: Array, scores: Array) -> tuple[Array, Array]:
-        """As many vectors again, from the distribution above the last level."""
-        if not levels:
-            drawn = rng.standard_normal((particles, size))
-            return drawn, score(drawn)
-        for _ in range(moves):
-            vectors, scores, _ = _crank_nicolson_step(score, vectors, scores, levels[-1], b, rng)
+    Attributes:
+      particles: N. moves: number of moves of each particle at a level.
+    """
+
+    score: Score
+    size: int
+    particles: int
+    moves: int
+
+    def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        """N vectors with their scores."""
+        vectors = rng.standard_normal((self.particles, self.size))
+        return vectors, self.score(vectors)
+
+    def resample(self, vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """N copies of the vectors above the level, equally often, with a random choice for the remainder."""
+        above = np.flatnonzero(scores > level)
+        times, left = divmod(self.particles, len(above))
+        chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
+        return vectors[chosen], scores[chosen]
+
+    def step(
+        self, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
+    ) -> tuple[Array, Array, float]:
+        """Move each vector if it stays above the level. Returns vectors, scores and the fraction of accepted moves."""
+        proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
+        proposed_scores = self.score(proposed)
+        accepted = proposed_scores > level
+        vectors, scores = np.where(accepted[:, None], proposed, vectors), np.where(accepted, proposed_scores, scores)
+        return vectors, scores, float(accepted.mean())
+
+    def move(
+        self, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """The vectors after all their moves at the level."""
+        for _ in range(self.moves):
+            vectors, scores, _ = self.step(vectors, scores, level, b, rng)
         return vectors, scores
 
-    while len(levels) < most_levels:
-        level, drawn = min(float(np.quantile(scores, 1 - keep, method="inverted_cdf")), 0.0), 1
-        if on_level is not None:
+    def pilot_run(
+        self, keep: float, most_levels: int, rng: np.random.Generator, on_level: OnLevel
+    ) -> tuple[Array, Array, list[int]]:
+        """Find the levels, the last of which is 0; the step size at all levels except the last; the batches at each."""
+        vectors, scores = self.draw(rng)
+        levels, step_sizes, batches = list[float](), list[float](), list[int]()
+        b, enough = 0.5, min(ABOVE, int(keep * self.particles))
+        while len(levels) < most_levels:
+            level, drawn = min(float(np.quantile(scores, 1 - keep, method="inverted_cdf")), 0.0), 1
             on_level(level)
-        above, enough = scores > level, min(ABOVE, int(keep * particles))
-        # Later vectors are copies, a few of which may always tie.
-        tie = not levels and np.sum(scores == level) > 1 and above.sum() < enough
-        if tie or not above.any():
-            kept = [(vectors[above], scores[above])]
-            while sum(len(some) for _, some in kept) < enough and drawn < MOST_BATCHES:
-                if on_level is not None:
+            above = scores > level
+            # Later vectors are copies, a few of which may always tie.
+            tie = not levels and np.sum(scores == level) > 1 and above.sum() < enough
+            if tie or not above.any():
+                kept = [(vectors[above], scores[above])]
+                while sum(len(some) for _, some in kept) < enough and drawn < MOST_BATCHES:
                     on_level(level)
-                vectors, scores = another_batch(vectors, scores)
-                above, drawn = scores > level, drawn + 1
-                kept.append((vectors[above], scores[above]))
+                    # As many vectors again, from the distribution above the last level.
+                    vectors, scores = self.move(vectors, scores, levels[-1], b, rng) if levels else self.draw(rng)
+                    above, drawn = scores > level, drawn + 1
+                    kept.append((vectors[above], scores[above]))
+                vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+            if not len(scores):
+                tied = drawn * self.particles
+                raise NoFailure(
+                    f"score: got scores that tie at {level:g} after {len(levels)} levels, and none of {tied:,} above"
+                    " it: the score does not tell which vectors are nearer to failing",
+                    0 if levels else tied,
+                )
+            batches.append(drawn)
+            if level == 0:
+                return np.array([*levels, 0.0]), np.array(step_sizes), batches
+            vectors, scores = self.resample(vectors, scores, level, rng)
+            for _ in range(self.moves):
+                vectors, scores, accepted = self.step(vectors, scores, level, b, rng)
+                # Larger if more are accepted than wanted.
+                b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
+            levels.append(level)
+            step_sizes.append(b)
+        raise NoFailure(
+            f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none"
+            " exist"
+        )
+
+    def repetition(
+        self, levels: Array, step_sizes: Array, batches: Sequence[int], rng: np.random.Generator
+    ) -> tuple[Array, Array, Array]:
+        """The fraction above each level, 0 once no vector is left; and the failures with their scores."""
+        vectors, scores, shares = np.zeros((0, self.size)), np.zeros(0), np.zeros(len(levels))
+        for number, level in enumerate(levels):
+            kept: list[tuple[Array, Array]] = []
+            for _ in range(batches[number]):
+                if number == 0:
+                    moved, moved_scores = self.draw(rng)
+                else:
+                    last = levels[number - 1]
+                    moved, moved_scores = self.resample(vectors, scores, last, rng)
+                    moved, moved_scores = self.move(moved, moved_scores, last, step_sizes[number - 1], rng)
+                above = moved_scores > level
+                kept.append((moved[above], moved_scores[above]))
             vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
-        if not len(scores):
-            tied = drawn * particles
-            raise NoFailure(
-                f"score: got scores that tie at {level:g} after {len(levels)} levels, and none of {tied:,} above it:"
-                " the score does not tell which vectors are nearer to failing",
-                0 if levels else tied,
-            )
-        batches.append(drawn)
-        if level == 0:
-            return np.array([*levels, 0.0]), np.array(step_sizes), batches
-        vectors, scores = _resample(vectors, scores, level, particles, rng)
-        for _ in range(moves):
-            vectors, scores, accepted = _crank_nicolson_step(score, vectors, scores, level, b, rng)
-            b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))  # larger if more are accepted than wanted
-        levels.append(level)
-        step_sizes.append(b)
-    raise NoFailure(
-        f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none exist"
-    )
-
-
-def _repetition(
-    score: Score,
-    size: int,
-    particles: int,
-    moves: int,
-    levels: Array,
-    step_sizes: Array,
-    batches: Sequence[int],
-    rng: np.random.Generator,
-) -> tuple[Array, Array, Array]:
-    """One repetition: the fraction above each level, 0 once no vector is left; and the failures with their scores."""
-    vectors, scores, shares = np.zeros((0, size)), np.zeros(0), np.zeros(len(levels))
-    for number, level in enumerate(levels):
-        kept: list[tuple[Array, Array]] = []
-        for _ in range(batches[number]):
-            if number == 0:
-                moved = rng.standard_normal((particles, size))
-                moved_scores = score(moved)
-            else:
-                last, b = levels[number - 1], step_sizes[number - 1]
-                moved, moved_scores = _resample(vectors, scores, last, particles, rng)
-                for _ in range(moves):
-                    moved, moved_scores, _ = _crank_nicolson_step(score, moved, moved_scores, last, b, rng)
-            above = moved_scores > level
-            kept.append((moved[above], moved_scores[above]))
-        vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
-        shares[number] = len(scores) / (particles * batches[number])
-        if shares[number] == 0:
-            break
-    return shares, vectors, scores
-
-
-def _resample(vectors: Array, scores: Array, level: float, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """As many copies of the vectors above the level, equally often, with a random choice for the remainder."""
-    above = np.flatnonzero(scores > level)
-    times, left = divmod(count, len(above))
-    chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
-    return vectors[chosen], scores[chosen]
-
-
-def _crank_nicolson_step(
-    score: Score, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
-) -> tuple[Array, Array, float]:
-    """Move each vector if it stays above the level. Returns vectors, scores and the fraction of accepted moves."""
-    proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
-    proposed_scores = score(proposed)
-    accepted = proposed_scores > level
-    return (
-        np.where(accepted[:, None], proposed, vectors),
-        np.where(accepted, proposed_scores, scores),
-        float(accepted.mean()),
-    )
+            shares[number] = len(scores) / (self.particles * batches[number])
+            if shares[number] == 0:
+                break
+        return shares, vectors, scores
