@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import Json, optional
+from lqrsim.commands.options import Json, optional, options_of
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
@@ -64,6 +64,7 @@ class New:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("results/export_c.py", "export_c", interpolate="", name="NAME")
 class Export:
     """Write a policy as C99, or runs as a data set of Minari.
 
@@ -89,10 +90,6 @@ class Export:
     """Type of the numbers in C, except the time, which is a double."""
     gains: Literal["full", "int16"] = "full"
     """int16: matrices in C take 16 bits an entry. The largest change of the commands is printed and in the header."""
-    interpolate: bool = False
-    """In C, blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
-    name: str = "policy"
-    """Name of the C files and functions: lower-case letters, digits and underscores."""
     minari: Annotated[str | None, optional("NAMESPACE/NAME-vVERSION")] = None
     """Name of the data set, which must be new."""
     actions: Literal["normalized", "controls"] = "normalized"

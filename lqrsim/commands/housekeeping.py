@@ -1,4 +1,4 @@
-"""Commands that run the demo and the paper's experiments, and that manage the cache."""
+"""Commands that run the demo, and that manage the cache."""
 
 import itertools
 import math
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 import lqrsim as ls
 from lqrsim.commands import as_json, console
@@ -121,36 +121,6 @@ def _row(reference: str, run: str, solution: "ls.Solution", rollout: "ls.Rollout
         f" {rollout.least_clearance()[0]:>12.3f} {math.sqrt((error**2).mean()):>9.2e} {error.max():>9.2e} {final:>9.2e}"
         f" {away if rollout.target.unit == 'm' else math.nan:>9.2e} {rollout.outcome[0]:>9}"
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reproduce:
-    """Reproduce the paper's results and check its statements.
-
-    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes some hours,
-    the longest being robust_policies and solver_league. Includes other solvers and controllers with the extra
-    bench, other simulators with rotorpy and crazyflow, and an emulated board with arm-none-eabi-gcc and
-    qemu-system-arm. Programs that are not installed are skipped, and named.
-
-    Exits with 1 if an experiment failed, whether or not the paper's statements hold.
-    """
-
-    results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
-    """Results: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
-    robust_policies, noise_aware, belief_space, funnels, solver_league, race, other_simulators, adaptive_quad_bench,
-    export_c. By default all."""
-    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
-    """Output folder."""
-    quick: bool = False
-    """Run a small part of each, for a first look."""
-    keep: bool = False
-    """Keep the other results of an earlier run in the folder, and write the page with all of them."""
-    json: Json = False
-
-    def run(self) -> int:
-        from lqrsim.commands.reproduce import reproduce
-
-        return reproduce(self.results, out=self.out, quick=self.quick, keep=self.keep)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ def _value_or_default(info: PrimitiveTypeInfo) -> Any:
     )
 
 
-def options_of(file: str, name: str, **metavars: str) -> Callable[[type[Command]], type[Command]]:
+def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Command]], type[Command]]:
     """Give a command options of a function or a record of the API, with its types, defaults and help.
 
     They are read from its source: to import it would take a second, for `--help` too.

@@ -1,4 +1,4 @@
-"""Reproduction of the paper: one script per result, run one after the other, and a page with a summary."""
+"""The command that reproduces the paper: one script per result, run one after the other, and a page with a summary."""
 
 import json
 import os
@@ -8,14 +8,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import jinja2
+from tyro.conf import Positional, arg
 
+import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.errors import InputError, check_name
-from lqrsim.machine import description
-from lqrsim.results.archive import replacing
+from lqrsim.commands.options import Json, optional
 
 # In the wheel, experiments/ is inside the package; in the repository, next to it.
 _PACKAGED = [Path(__file__).parents[1] / "experiments", Path(__file__).parents[2] / "experiments"]
@@ -23,24 +22,10 @@ EXPERIMENTS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGE
 
 # In the order of the page. With --json each script prints its result, its report in Markdown, and its statements.
 SCRIPTS = (
-    "figure_2",
-    "figure_3",
-    "table_1",
-    "convergence",
-    "state_dimension",
-    "state_of_the_art",
-    "feedback",
-    "stress_test",
-    "robust_policies",
-    "noise_aware",
-    "belief_space",
-    "funnels",
-    "solver_league",
-    "race",
-    "other_simulators",
-    "adaptive_quad_bench",
-    "export_c",
-)
+    "figure_2", "figure_3", "table_1", "convergence", "state_dimension", "state_of_the_art", "feedback", "stress_test",
+    "robust_policies", "noise_aware", "belief_space", "funnels", "solver_league", "race", "other_simulators",
+    "adaptive_quad_bench", "export_c",
+)  # fmt: skip
 
 TIDYING = 20.0  # s, time for a stopped script to remove unfinished files
 VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}
@@ -59,52 +44,70 @@ class Failure:
     code: int
 
 
-def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = False) -> int:
-    """Run the scripts, write `results.md`, `results.json` and the figures, and print which statements hold.
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Reproduce the paper's results and check its statements.
 
-    Args:
-      keep: whether results of other scripts in `results.json` stay.
+    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes some hours,
+    the longest being robust_policies and solver_league. Includes other solvers and controllers with the extra
+    bench, other simulators with rotorpy and crazyflow, and an emulated board with arm-none-eabi-gcc and
+    qemu-system-arm. Programs that are not installed are skipped, and named.
 
-    Returns:
-      1 if a script failed, else 0, whether or not the paper's statements hold.
+    Exits with 1 if an experiment failed, whether or not the paper's statements hold.
     """
-    named = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
-    chosen = [name for name in SCRIPTS if name in named]
-    console.check_output("--out", out)
-    kept = _kept(out / "results.json", quick=quick) if keep else {"machine": description(), "results": {}}
-    results: dict[str, ScriptResult] = {}
-    failures: list[Failure] = []
-    begun = time.monotonic()
-    with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
-        for name in chosen:
-            bar.set_postfix_str(name)
-            clock = time.monotonic()
-            outcome = _run(name, out, quick=quick)
-            seconds = time.monotonic() - clock
-            if isinstance(outcome, Failure):
-                failures.append(outcome)
-                console.say(f"{name}: FAILED with exit code {outcome.code} after {seconds:.0f} s; see above")
-            else:
-                results[name] = outcome | {"seconds": round(seconds), "machine": description()}
-                console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
-            bar.update()
-    if results:
-        together = kept["results"] | results
-        ordered = {name: together[name] for name in SCRIPTS if name in together}
-        saved = {"machine": kept["machine"], "quick": quick, "results": ordered}
-        with replacing(out / "results.json") as unfinished:
-            unfinished.write_text(json.dumps(saved, allow_nan=False) + "\n", encoding="utf-8")
-        with replacing(out / "results.md") as unfinished:
-            unfinished.write_text(results_page(saved), encoding="utf-8")
-        console.say("\n" + "\n".join(verdicts(results, out)))
-        console.say(f"\ntook {time.monotonic() - begun:.0f} s")
-        console.wrote(out / "results.md")
-        console.wrote(out / "results.json")
-        console.result(**saved)
-    for failure in failures:
-        console.say(f"FAILED {failure.script}: exit code {failure.code}")
-    console.result(failures=failures)
-    return 1 if failures else 0
+
+    results: Annotated[
+        Positional[tuple[str, ...]], optional("RESULT ...", f"{', '.join(SCRIPTS)}. By default all.")
+    ] = ()
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
+    """Output folder."""
+    quick: bool = False
+    """Run a small part of each, for a first look."""
+    keep: bool = False
+    """Keep the other results of an earlier run in the folder, and write the page with all of them."""
+    json: Json = False
+
+    def run(self) -> int:
+        from lqrsim.errors import check_name
+        from lqrsim.machine import description
+        from lqrsim.results.archive import replacing
+
+        named = {check_name("results", name, SCRIPTS) for name in self.results} or set(SCRIPTS)
+        chosen = [name for name in SCRIPTS if name in named]
+        out = self.out
+        console.check_output("--out", out)
+        kept = _kept(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
+        results, failures, begun = dict[str, ScriptResult](), list[Failure](), time.monotonic()
+        with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
+            for name in chosen:
+                bar.set_postfix_str(name)
+                clock = time.monotonic()
+                outcome = _run(name, out, quick=self.quick)
+                seconds = time.monotonic() - clock
+                if isinstance(outcome, Failure):
+                    failures.append(outcome)
+                    console.say(f"{name}: FAILED with exit code {outcome.code} after {seconds:.0f} s; see above")
+                else:
+                    results[name] = outcome | {"seconds": round(seconds), "machine": description()}
+                    console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
+                bar.update()
+        if results:
+            together = kept["results"] | results
+            ordered = {name: together[name] for name in SCRIPTS if name in together}
+            saved = {"machine": kept["machine"], "quick": self.quick, "results": ordered}
+            with replacing(out / "results.json") as unfinished:
+                unfinished.write_text(json.dumps(saved, allow_nan=False) + "\n", encoding="utf-8")
+            with replacing(out / "results.md") as unfinished:
+                unfinished.write_text(results_page(saved), encoding="utf-8")
+            console.say("\n" + "\n".join(verdicts(results, out)))
+            console.say(f"\ntook {time.monotonic() - begun:.0f} s")
+            console.wrote(out / "results.md")
+            console.wrote(out / "results.json")
+            console.result(**saved)
+        for failure in failures:
+            console.say(f"FAILED {failure.script}: exit code {failure.code}")
+        console.result(failures=failures)
+        return 1 if failures else 0
 
 
 def _kept(file: Path, *, quick: bool) -> dict[str, Any]:
@@ -113,9 +116,11 @@ def _kept(file: Path, *, quick: bool) -> dict[str, Any]:
         saved = json.loads(file.read_text(encoding="utf-8"))
         other = saved["quick"] is not quick
     except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
+        raise ls.InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
     if other:
-        raise InputError(f"--keep: got {file}, written {'without' if quick else 'with'} --quick, want the same option")
+        raise ls.InputError(
+            f"--keep: got {file}, written {'without' if quick else 'with'} --quick, want the same option"
+        )
     return saved
 
 
@@ -148,6 +153,8 @@ def _end(running: subprocess.Popen[str]) -> None:
 
 def results_page(saved: Mapping[str, Any]) -> str:
     """All results in Markdown: verdicts on the paper's statements, the runs, and the report of each script."""
+    import jinja2
+
     results: dict[str, ScriptResult] = saved["results"]
     statements = [statement for result in results.values() for statement in result["statements"]]
     versions = next(iter(results.values()))["result"]["versions"]

@@ -44,6 +44,7 @@ class List:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("solvers/smoother.py", "smooth", tolerance="SHARE", time_limit="SECONDS", starts="INT")
 class Solve:
     """Compute a feedback policy for a scenario.
 
@@ -62,18 +63,10 @@ class Solve:
     """smooth: iterated LQR smoothing. ilqr: the baseline with line search, from the scenario's exact start."""
     stop: Literal["optimal", "cost"] = "optimal"
     """cost: stop when the cost has settled, as in the paper. optimal: also require gap and first-order optimality."""
-    tolerance: Annotated[float | None, optional("SHARE")] = None
-    """Relative tolerance of the cost and of the optimality. By default 1e-8, and 1e-4 without Newton's method."""
     finish: Literal["newton", "none"] = "newton"
     """newton: smooth leaves the last iterations to Newton's method. none: the paper's method does them all."""
     max_iterations: Annotated[int | None, optional("INT")] = None
     """Stop after this many iterations. By default the solver's own limit."""
-    time_limit: Annotated[float | None, optional("SECONDS")] = None
-    """Stop after this time with the best plan so far. Compiling, which comes first for a new kind of problem, does not
-    count; a line says how long it took. By default there is no limit."""
-    starts: Annotated[int | None, optional("INT")] = None
-    """Number of starting paths that smooth tries for a few iterations; the best continues. By default 7,
-    if there is no start."""
     start: Annotated[Path | None, optional("FILE.npz")] = None
     """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with the
     same number of steps. By default the scenario's own start, or a search."""
