@@ -286,7 +286,6 @@ def test_own_scenario_in_a_module(own: Path, tmp_path: Path, monkeypatch: pytest
         ("simulate {solved} --push 1 0 0 99", ["Push: at: got 99"]),
         ("render {solved}", ["holds a 'lqrsim solution'", "want a 'lqrsim rollout'"]),
         ("render {solved} --out x.avi", ["--out: got x.avi", ".mp4, .gif, .png, .html or .rrd"]),
-        ("render {solved} --time 1", ["time, every: got ", "want FILE.png"]),
         ("render", ["ROLLOUT: got none"]),
         ("demo --robots quadrotor hexapod --out {tmp}", ["scenario: got 'hexapod'"]),
         ("demo --out {own}", ["--out: got", "a folder that can be written"]),

@@ -26,7 +26,6 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.stress import analysis
-from lqrsim.stress.analysis import Success
 from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results, replay
 from lqrsim.stress.statistics import Estimate
@@ -41,58 +40,50 @@ LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)), (0, (
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
-def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLike[str]) -> Path:
-    """Write a figure (png, pdf or svg) of each policy's success over strength, with a band; returns its path."""
+Curves = Mapping[str, Mapping[float, Array]]  # policy -> strength -> low, middle and high
+
+
+def plot_success(curves: Curves, path: Path) -> Path:
+    """Write a figure of each policy's success in percent over strength, with a band; returns its path."""
     with _over_strength(curves, path, "trials that reached their goal (%)") as axes:
-        for number, (policy, points) in enumerate(curves.items()):
-            band = 100 * np.array([(point.band.low, point.band.value, point.band.high) for point in points]).T
-            _draw(axes, number, policy, [point.cell.strength for point in points], band)
         axes.set(ylim=(-3, 103), yticks=np.linspace(0, 100, 6))
-    return Path(path)
+    return path
 
 
-def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.PathLike[str], *, label: str) -> Path:
-    """Write a figure of three quantiles over strength for each policy; logarithmic if they span decades.
-
-    Args:
-      curves: policy -> strength -> low, middle and high.
-    """
+def plot_errors(curves: Curves, path: Path, *, label: str) -> Path:
+    """Write a figure of three quantiles over strength for each policy; logarithmic if they span decades."""
+    disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
+    known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
+    decades = len(known) > 0 and known.max() > 100 * known.min()
+    if decades:  # undisturbed errors are tiny, and would take up most of a logarithmic axis
+        curves = {name: {at: band for at, band in of.items() if at > 0} for name, of in curves.items()}
     with _over_strength(curves, path, label) as axes:
-        disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
-        known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
-        decades = len(known) > 0 and known.max() > 100 * known.min()
-        for number, (policy, of_strength) in enumerate(curves.items()):
-            # Undisturbed errors are tiny, and would take up most of a logarithmic axis.
-            shown = {strength: band for strength, band in of_strength.items() if strength > 0 or not decades}
-            if shown:
-                _draw(axes, number, policy, list(shown), np.array(list(shown.values())).T)
         if decades:
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
-    return Path(path)
-
-
-def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: Array) -> None:
-    low, value, high = band
-    colour = COLOURS[number % len(COLOURS)]
-    axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
-    # Curves may coincide, so lower curves are wider, with larger markers.
-    wide = max(4 - number, 1)
-    axes.plot(
-        strengths, value, linestyle=LINES[number % len(LINES)], color=colour, marker=MARKERS[number % len(MARKERS)],
-        markersize=3 + 1.3 * wide, linewidth=0.8 + 0.4 * wide, markerfacecolor="white", label=name, clip_on=False,
-    )  # fmt: skip
+    return path
 
 
 @contextlib.contextmanager
-def _over_strength(curves: Mapping[str, object], path: str | os.PathLike[str], label: str) -> Iterator[Axes]:
-    """Axes of curves of policies over strength, which get ticks and a legend when the block ends."""
+def _over_strength(curves: Curves, path: Path, label: str) -> Iterator[Axes]:
+    """A figure of curves of policies over strength, which get ticks and a legend when the block ends."""
     with style.figure(path, size=SIZE) as figure:
         axes = figure.add_subplot()
         axes.set(xlabel="strength", ylabel=label)
+        for number, (policy, of_strength) in enumerate(curves.items()):
+            if not of_strength:
+                continue
+            strengths, (low, value, high) = list(of_strength), np.array(list(of_strength.values())).T
+            colour, line, marker = (styles[number % len(styles)] for styles in (COLOURS, LINES, MARKERS))
+            axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
+            wide = max(4 - number, 1)  # curves may coincide, so lower curves are wider, with larger markers
+            axes.plot(
+                strengths, value, linestyle=line, color=colour, marker=marker, markersize=3 + 1.3 * wide,
+                linewidth=0.8 + 0.4 * wide, markerfacecolor="white", label=policy, clip_on=False,
+            )  # fmt: skip
         yield axes
-        ticks = sorted({round(float(x), 12) for line in axes.lines for x in np.asarray(line.get_xdata())})
+        ticks = sorted({round(float(x), 12) for of_strength in curves.values() for x in of_strength})
         if len(ticks) <= 8:
             axes.set_xticks(ticks)
         axes.margins(x=0.02)
@@ -291,32 +282,31 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
     policies = list(dict.fromkeys(cell.policy for cell in table if cell.sweep == name))
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     curves = {policy: analysis.degradation(table, policy, name) for policy in policies}
-    errors = {
-        policy: {point.cell.strength: analysis.quantiles(table[point.cell], "rms") for point in points}
-        for policy, points in curves.items()
-    }
-    shares = "; ".join(
-        f"{policy}: {', '.join(f'{100 * point.band.value:.0f} % at {point.cell.strength:g}' for point in points)}"
-        for policy, points in curves.items()
-    )
-    medians = "; ".join(
-        f"{policy}: {', '.join(f'{values[1]:.2g} at {strength:g}' for strength, values in of_strength.items())}"
-        for policy, of_strength in errors.items()
-    )
+    shares, errors = dict[str, dict[float, Array]](), dict[str, dict[float, Array]]()
+    for policy, points in curves.items():
+        bands = [(point.cell.strength, point.band) for point in points]
+        shares[policy] = {at: 100 * np.array([band.low, band.value, band.high]) for at, band in bands}
+        errors[policy] = {point.cell.strength: analysis.quantiles(table[point.cell], "rms") for point in points}
+
+    def told(curves: Curves, spec: str, unit: str = "") -> str:
+        """The middles of curves, in words."""
+        each = {name: [f"{of[at][1]:{spec}}{unit} at {at:g}" for at in of] for name, of in curves.items()}
+        return "; ".join(f"{name}: {', '.join(middles)}" for name, middles in each.items())
+
     return {
         "name": name,
         "words": _describe(campaign.sweeps[name], scenario),
         "figures": [
             _picture(
-                plot_success(curves, folder / "success.png"),
+                plot_success(shares, folder / "success.png"),
                 caption="Trials that reached their goal over the strength of the disturbances, 95 % bands.",
-                alt=f"Success over strength. {shares}.",
+                alt=f"Success over strength. {told(shares, '.0f', ' %')}.",
             ),
             _picture(
                 plot_errors(errors, folder / "errors.png", label=f"tracking error, rms ({unit})"),
                 caption="Root mean square of a trial's distance from the plan, until it ends or collides: median, and"
                 " from 5 to 95 % of the trials.",
-                alt=f"Median tracking error ({unit}) over strength. {medians}.",
+                alt=f"Median tracking error ({unit}) over strength. {told(errors, '.2g')}.",
             ),
         ],
         "success": success_table(name, curves),
