@@ -25,7 +25,7 @@ from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.geoms import RIM
 from lqrsim.view.recorded_trial import model_of, place_in, robot_body
-from lqrsim.view.video_metadata import Pane, VideoMetadata
+from lqrsim.view.video_metadata import Pane
 
 
 def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
@@ -380,9 +380,15 @@ def verify_video(
     drawn, _ = frames_at_states(rollout, trial)
     moved = frame_positions(rollout, trial, model, drawn) - state_positions(rollout, trial, drawn)
     worst, most = np.linalg.norm(moved, axis=1).max(), RECORD_BOUND * rollout.radius
+    shows = f"the video shows {', '.join(metadata.runs)}, this run is {digest}"
+    timed = len(measured) == metadata.frames and off < 1 / float(metadata.rate) / 4
+    counted = f"got {len(measured)}, want the {metadata.frames} that were written"
+    marked = f"{min(areas):.0f} pixels in the pane where it is smallest, want {FEWEST_PIXELS} or more"
     said = f"frames and states at most {1e3 * worst:.2f} mm apart, want {1e3 * most:.2f} at most"
     others = (
-        *_check_file(metadata, digest, len(measured), off, min(areas)),
+        Criterion("run", digest in metadata.runs, shows),
+        Criterion("frames", timed, f"{counted}; at most {1e3 * off:.1f} ms from their times"),
+        Criterion("mark", min(areas) >= FEWEST_PIXELS, marked),
         Criterion("record", bool(worst <= most), said),
         check_plan(rollout, solution),
     )
@@ -398,28 +404,6 @@ def verify_video(
         bound=VIDEO_BOUND * rollout.radius,
         interval=metadata.speed * (1 / float(metadata.rate)),
         others=others,
-    )
-
-
-def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, area: float) -> tuple[Criterion, ...]:
-    """Whether the video shows the run of that digest, with frames at their times and marks large enough.
-
-    Args:
-      off: largest error of the time of a frame, in seconds.
-      area: area of the smallest mark, in pixels.
-    """
-    return (
-        Criterion("run", digest in metadata.runs, f"the video shows {', '.join(metadata.runs)}, this run is {digest}"),
-        Criterion(
-            "frames",
-            frames == metadata.frames and off < 1 / float(metadata.rate) / 4,
-            f"got {frames}, want the {metadata.frames} that were written; at most {1e3 * off:.1f} ms from their times",
-        ),
-        Criterion(
-            "mark",
-            area >= FEWEST_PIXELS,
-            f"{area:.0f} pixels in the pane where it is smallest, want {FEWEST_PIXELS} or more",
-        ),
     )
 
 

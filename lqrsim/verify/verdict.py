@@ -1,5 +1,6 @@
 """The result of a verification: positions from pixels, tests of their errors against bounds, and a diagnosis."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -198,46 +199,32 @@ def compare(
       interval: seconds between two frames; the shift must be less than a quarter of it.
     """
     good = np.asarray(np.isfinite(seen).all(axis=1))
-    visible = Criterion(
-        "seen",
-        bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2,
-        f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them",
-    )
-    if good.sum() < 3:
-        return Verification(
-            subject, method, times, seen, actual, planned, np.nan, np.nan, np.nan, np.nan,
-            (*others, visible), "the robot is not in the pictures, or too small",
-        )  # fmt: skip
-    error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
-    distance = np.linalg.norm(error, axis=1)
-    (shift, shift_error), (scale, scale_error) = _fit(error, velocity, actual[good])
-    # A robot that hardly moves determines neither shift nor scale; the bound is then the uncertainty of the fit.
-    most, stretch = max(interval / 4, 4 * shift_error), max(SCALE, 4 * scale_error)
-    number = int(np.flatnonzero(good)[distance.argmax()])
-    most_apart, agreement = float(apart[good].max()), ()
-    if most_apart > 0:  # a single view cannot disagree
-        detail = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
-        agreement = (Criterion("views agree", most_apart <= bound, detail),)
-    tests = (
-        *others,
-        visible,
-        Criterion(
-            "position",
-            bool(distance.max() <= bound),
-            f"at worst {1e3 * distance.max():.1f} mm off, at {times[number]:.2f} s, want {1e3 * bound:.1f} at most",
-        ),
-        *agreement,
-        Criterion("time", abs(shift) <= most, f"{1e3 * shift:+.1f} ms ahead, want {1e3 * most:.1f} at most either way"),
-        Criterion("scale", abs(scale) <= stretch, f"{1 + scale:.4f}, want 1 within {stretch:.4f}"),
-    )
+    told = f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them"
+    tests = [*others, Criterion("seen", bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2, told)]
+    rms, worst, shift, scale, likely = np.nan, np.nan, np.nan, np.nan, "the robot is not in the pictures, or too small"
+    if good.sum() > 2:
+        error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
+        distance = np.linalg.norm(error, axis=1)
+        (shift, shift_error), (stretch, stretch_error) = _fit(error, velocity, actual[good])
+        # A robot that hardly moves determines neither shift nor scale; the bound is then the uncertainty of the fit.
+        late, wide = max(interval / 4, 4 * shift_error), max(SCALE, 4 * stretch_error)
+        rms, worst, scale, when = _rms(distance), float(distance.max()), 1 + stretch, times[good][distance.argmax()]
+        told = f"at worst {1e3 * worst:.1f} mm off, at {when:.2f} s, want {1e3 * bound:.1f} at most"
+        tests.append(Criterion("position", worst <= bound, told))
+        if (most := float(apart[good].max())) > 0:  # a single view cannot disagree
+            told = f"at worst {1e3 * most:.1f} mm apart, want {1e3 * bound:.1f} at most"
+            tests.append(Criterion("views agree", most <= bound, told))
+        told = f"{1e3 * shift:+.1f} ms ahead, want {1e3 * late:.1f} at most either way"
+        tests.append(Criterion("time", abs(shift) <= late, told))
+        tests.append(Criterion("scale", abs(stretch) <= wide, f"{scale:.4f}, want 1 within {wide:.4f}"))
+        likely = _likely_cause(tests, times, seen, actual, bound, interval)
     return Verification(
-        subject, method, times, seen, actual, planned, _rms(distance), float(distance.max()), shift,
-        1 + scale, tests, _likely_cause(tests, times, seen, actual, bound, interval),
+        subject, method, times, seen, actual, planned, rms, worst, shift, scale, tuple(tests), likely
     )  # fmt: skip
 
 
 def _likely_cause(
-    tests: tuple[Criterion, ...], times: Array, seen: Array, actual: Array, bound: float, interval: float
+    tests: Sequence[Criterion], times: Array, seen: Array, actual: Array, bound: float, interval: float
 ) -> str:
     """The likely cause of a failure, as a line; empty if no test failed."""
     failed = {test.name for test in tests if test.passed is False}
