@@ -169,10 +169,10 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
     """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
     with (
         open_picture(rollout, PictureOptions(size=(640, 360), overlays=BARE)) as drawn,
-        mujoco.Renderer(drawn.parts[0].renderer.model, 360, 640) as segmenter,
+        mujoco.Renderer(drawn.parts[0].model, 360, 640) as segmenter,
     ):
         segmenter.enable_segmentation_rendering()
-        renderer = drawn.parts[0].renderer
+        renderer = drawn.parts[0]
         model = renderer.model
         robot = np.isin(model.geom_group, (0, 1, 2)) & (model.body_weldid[model.geom_bodyid] != 0)
         painted, material = model.geom_rgba.copy(), model.geom_matid.copy()
@@ -316,12 +316,12 @@ def test_runs_side_by_side_have_one_zoom(camera: str, quadrotor: ls.Scenario, fl
     far = dataclasses.replace(flight, states=flight.states + np.r_[[3.0, 0, 0], np.zeros(flight.states.shape[2] - 3)])
     with open_picture([flight, far], PictureOptions(camera=camera, size=(640, 360))) as drawn:
         drawn.draw(0.0)
-        seen = [part.renderer.scene.camera[0] for part in drawn.parts]
+        seen = [part.scene.camera[0] for part in drawn.parts]
         for name in ("pos", "forward", "frustum_top", "orthographic"):
             np.testing.assert_allclose(*(getattr(one, name) for one in seen), rtol=1e-6, atol=0)
     with open_picture(flight, PictureOptions(camera=camera, size=(320, 360))) as alone:
         alone.draw(0.0)
-        before = alone.parts[0].renderer.scene.camera[0]
+        before = alone.parts[0].scene.camera[0]
         assert before.frustum_top != seen[0].frustum_top or not np.allclose(before.pos, seen[0].pos)
 
 

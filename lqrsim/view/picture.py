@@ -29,26 +29,31 @@ DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups t
 
 
 class SceneRenderer:
-    """Draws views of a trial, in panes of a picture; to be used with `with`, as it holds an OpenGL context.
+    """Draws views of a trial, in panes of its part of a picture; to be used with `with`, as it holds an OpenGL context.
 
     MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
+
+    Args:
+      views: with their boxes in the part. box: the part.
     """
 
-    def __init__(self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]) -> None:
-        self.overlays, self.views = overlays, views
+    def __init__(
+        self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], box: Box, caption: Caption | None
+    ) -> None:
+        self.overlays, self.views, self.box, self.caption = overlays, views, box, caption
         self.recorded, self.model = overlays.recorded, overlays.recorded.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
         most = 1000 + (MOST_ROBOTS + 1) * self.model.ngeom + len(overlays.drawables)
         self.scene = mujoco.MjvScene(self.model, maxgeom=most)
         self.emission = 0.0 if self.recorded.planar else geoms.GLOW
         self.visual_options = mujoco.MjvOption(), mujoco.MjvPerturb()
-        self.pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        self.pixels = np.empty((box.height, box.width, 3), dtype=np.uint8)
         # A plane is transparent from behind anyway, and hides nothing from the front.
         solid = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
         self.can_occlude = solid & (self.model.body_weldid[self.model.geom_bodyid] == 0)
         self.faded = np.zeros((len(views), self.model.ngeom))
         # A larger buffer costs as much as a larger picture, and a smaller one is refused.
-        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
+        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = box.width, box.height
 
     def __enter__(self) -> "SceneRenderer":
         height, width = self.pixels.shape[:2]
@@ -205,17 +210,6 @@ class PictureOptions:
         return self.settings.size if self.size is None else self.size
 
 
-@dataclass(frozen=True)
-class RunPart:
-    """A run's part of the picture: its caption, and panes with boxes relative to the part."""
-
-    recorded: RecordedTrial
-    box: Box
-    views: list[tuple[Box, CameraView]]
-    renderer: SceneRenderer
-    caption: Caption | None
-
-
 @contextlib.contextmanager
 def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> Iterator["Picture"]:
     """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts."""
@@ -243,7 +237,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
             f"size: got {width} x {height}, which captions would fill, want it larger, or overlays without caption"
         )
     with contextlib.ExitStack() as stack:
-        parts: list[RunPart] = []
+        parts: list[SceneRenderer] = []
         panes: list[Pane] = []
         for recorded, drawn, box, caption, (run, row) in zip(recordings, overlays, boxes, captions, shown, strict=True):
             quality, settings = recorded.model.vis.quality, options.settings
@@ -253,8 +247,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
             areas = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
             named = zip((camera, *insets), areas, strict=True)
             views = [(area, camera_view(name, recorded, area.aspect, beside=recordings)) for name, area in named]
-            renderer = stack.enter_context(SceneRenderer(drawn, views, (box.width, box.height)))
-            parts.append(RunPart(recorded, box, views, renderer, caption))
+            parts.append(stack.enter_context(SceneRenderer(drawn, views, box, caption)))
             panes += [
                 Pane(box.left + area.left, box.top + area.top, area.width, area.height, run, row, view.camera)
                 for area, view in views
@@ -267,7 +260,7 @@ class Picture:
     """A picture of all runs at any time."""
 
     runs: Sequence[Rollout]
-    parts: Sequence[RunPart]
+    parts: Sequence[SceneRenderer]
     panes: tuple[Pane, ...]
     size: tuple[int, int]
     legend: Legend | None
@@ -294,7 +287,7 @@ class Picture:
         for part in self.parts:
             box, now = part.box, min(time, part.recorded.end)
             area = image[box.top : box.top + box.height, box.left : box.left + box.width]
-            area[:] = part.renderer.draw(now, fade=fade, earlier=earlier)
+            area[:] = part.draw(now, fade=fade, earlier=earlier)
             area[: part.views[0][0].top] = BLANK
             for pane, _ in part.views[1:]:
                 _draw_edge(area, pane)
