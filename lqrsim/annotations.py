@@ -104,9 +104,7 @@ class Declared(NamedTuple):
       dtype: type of an array, float64 or int64; None if it is no array.
       letters: the shape of an array, or the length of something else; empty if not given.
       longest: characters of a text that is one printable line; None for any text.
-      want: the end of messages; empty for the name of the type.
       names: the texts that it may be; empty for any.
-      optional: whether the value may be None.
     """
 
     kinds: tuple[Any, ...]

@@ -51,10 +51,8 @@ class Bridged:
     """The record of a controller's run, up to the safe command.
 
     Attributes:
-      completed: whether all periods were run.
       reason: one line that says why not; empty if all were run.
       commands: (T, m), as published.
-      held: number of periods that had to use the state of an earlier period.
       refused: number of messages that were not used because of their content, and the last reason.
       response: (T,) time in s until each period's command was published, from the beginning of the period; in lockstep,
         from the arrival of its state.

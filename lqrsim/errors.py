@@ -301,9 +301,6 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
     """`value` as a symmetric positive-semidefinite (or definite) matrix; a vector is read as its diagonal.
 
     Three axes are matrices (K, n, n), one for each knot.
-
-    Raises:
-      InputError: wrong shape, NaN or infinite entries, not symmetric, or an eigenvalue of the wrong sign.
     """
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 3 and len(raw):

@@ -34,14 +34,10 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
     The folder is that of Minari, `MINARI_DATASETS_PATH`. The data set is written as a whole or not at all.
 
     Args:
-      name: NAMESPACE/NAME-vVERSION.
       env: an `Environment` with the solution that was run; wrappers do not matter. Rewards are by the costs of its
         scenario, actions in its units. If text describes its arguments, `dataset.recover_environment()` makes it.
       rollouts: runs of that solution's plan, by any controller.
       about: more arguments of `minari.create_dataset_from_buffers`, such as author, description, data_format.
-
-    Returns:
-      The `minari.MinariDataset`.
     """
     try:
         import minari

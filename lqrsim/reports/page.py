@@ -157,12 +157,7 @@ def report(
     """Write a campaign as one self-contained HTML page; returns its path.
 
     Args:
-      out: FILE.html.
       videos: number of the worst trials to repeat and render. Without OpenGL the page has no videos, and says so.
-
-    Raises:
-      InputError: no trial has been run yet; a file is damaged; `results` lacks a scenario that is your own function; or
-        the page cannot be written.
     """
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()

@@ -199,9 +199,6 @@ def opened(path: Path, kind: str | None, versions: Mapping[str, tuple[int, ...]]
     """Open a file of this kind, or of any in `versions`, in one of its versions there.
 
     Exceptions in the block are reported as faults of the file.
-
-    Raises:
-      InputError: the file does not exist, has another kind or version, or is damaged.
     """
     field = kind or "path"
     with blamed(path, field), path.open("rb") as file, zipfile.ZipFile(file) as archive:
@@ -253,9 +250,6 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary file to write to, which replaces `path` when the block ends and is removed if the block fails.
 
     Files that a killed process has left in the same folder are removed once they are a day old.
-
-    Raises:
-      InputError: the folder or the file cannot be written, the disk is full, or `path` is no regular file.
     """
     check_path("output", path)
     try:

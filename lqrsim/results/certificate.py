@@ -15,11 +15,8 @@ class FailureCertificate:
     """The probability that a policy fails, as measured by multilevel splitting, and a description of the measurement.
 
     Attributes:
-      scenario: reference to the scenario, as in `ReliabilityProblem`.
       model: hash of the simulated MJCF.
-      policy_digest: hash of everything that the controls depend on.
       repetitions: the estimate of each repetition, (R,).
-      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       keep: fraction of the trials that exceeds the next level; 0 if failures were counted.
     """
 

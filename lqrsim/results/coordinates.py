@@ -213,11 +213,7 @@ class Coordinates:
         return out
 
     def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
-        """The difference `vector - near`, with angles and rotation vectors in the representative nearest to `near`.
-
-        Args:
-          near: (..., n); leading dimensions broadcast.
-        """
+        """The difference `vector - near`, with angles and rotation vectors in the representative nearest to `near`."""
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
     def _by_name(

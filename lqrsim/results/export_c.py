@@ -95,9 +95,6 @@ def export_c(
       interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
       name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter;
         not that of a header of C, such as math.
-
-    Raises:
-      InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
     """
     folder = check_path("folder", folder, "the path of a folder")
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):

@@ -36,15 +36,10 @@ class Funnel:
       shape: (T+1, d, d), the ellipsoids of level 1, in the units of these states.
       family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
         deviation; "tube", the predicted covariance, so that levels are standard deviations; or "given".
-      knots: (k,), in order.
       levels: (k,), the level at each knot; 0 if none was certified.
       trials: (k,) fresh trials that certify the level; 0 if the level is 0.
       successes: (k,), successes of these trials. They must show the rate with the confidence.
       reasons: (k) why a level is 0, or why no larger level was tried; otherwise empty.
-      rate: required fraction of runs that succeed.
-      confidence: required confidence that all levels are right.
-      goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
-      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
     """
 
     _want = "a Funnel, such as funnel(...) returns"
@@ -138,9 +133,6 @@ class Funnel:
         """Whether states (..., n) are in the funnel `t` seconds after the start of the plan, (...).
 
         If the level is 0, no state is in the funnel.
-
-        Args:
-          about: (n,), the centre of the ellipsoid, in place of the plan's state.
         """
         level = self.level(t)
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
@@ -165,11 +157,7 @@ class Funnel:
 
     @property
     def position_covariance(self) -> Array:
-        """Matrices (T+1, p, p) in m^2 whose one-sigma ellipsoids are the funnel's projection onto the position.
-
-        Raises:
-          InputError: the robot has no position, or not all of it is among `states`.
-        """
+        """Matrices (T+1, p, p) in m^2 whose one-sigma ellipsoids are the funnel's projection onto the position."""
         place = self.state_coordinates.position
         names = [self.state_coordinates.names[i] for i in place]
         if not place or not set(names) <= set(self.states):

@@ -247,7 +247,6 @@ class Target:
         Empty for a target with a position, and for a state that is at the target.
 
         Args:
-          state: (n,), finite.
           radius: the scaled error within which the target counts as reached; None if it is not known.
         """
         return "" if self.places else worst_of(self.space, self._off(state), self.scale, radius)
@@ -262,7 +261,6 @@ def endings(
       collided_at, diverged_at, failed_at: (K,) seconds, infinite for events that did not happen. If events happen at
         the same time, the event named first counts.
       distance: (K,) distance from the target at the end. radius: distance within which the target counts as reached.
-      horizon: in seconds.
 
     Returns:
       one of OUTCOMES for each trial, (K,), and the time in seconds at which it ended, (K,).

@@ -75,9 +75,6 @@ class Plan:
 
         A "moving" horizon keeps its length: the last law, value function, multipliers and control are repeated at the
         end. A "shrinking" horizon has fewer steps. Status, log, cost and digest still describe the whole plan.
-
-        Args:
-          steps: steps that are over, fewer than the plan has.
         """
         if steps >= self.trajectory.steps:
             raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the plan")

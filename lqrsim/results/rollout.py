@@ -97,7 +97,6 @@ class Rollout:
     equal processors.
 
     Attributes:
-      model: the MJCF that was run, as text.
       goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan. If a
         `Replanner` had a goal that moved, the last one.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: in metres, or a scaled
@@ -123,8 +122,6 @@ class Rollout:
       reasons: (K) why the controller failed or its filter diverged; empty otherwise.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each disturbance, and whether the goal moved.
-      first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
-      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
         in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
       collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
@@ -254,11 +251,7 @@ class Rollout:
 
     @checked
     def places(self, trial: Index) -> Array:
-        """Places of the robot in a trial: its position, or the position of its last ball.
-
-        Returns:
-          (T+1, 2 or 3), in metres.
-        """
+        """Places (T+1, 2 or 3) of the robot in a trial, in metres: its position, or the position of its last ball."""
         if not trial < self.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {self.trials - 1}")
         if self.state_coordinates.position or self.balls is None:
@@ -273,11 +266,7 @@ class Rollout:
         return self.balls.planned[:, -1]
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
-        """Points (..., 3) in the world of places (..., 2 or 3), in metres.
-
-        Args:
-          height: height in metres of places in a horizontal plane without a height.
-        """
+        """Points (..., 3) in the world of places (..., 2 or 3), in metres."""
         space = self.state_coordinates
         if space.position or self.balls is None:
             return space.in_world(places, height=height)

@@ -67,9 +67,6 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     """Write a solution, a rollout, a policy, a funnel or a certificate, all or nothing. Returns its path.
 
     If the path is a link, the file that it points to changes. Only regular files are replaced.
-
-    Args:
-      path: FILE.npz.
     """
     path = check_path("output", path)
     write(path, *_content(result))
@@ -108,7 +105,6 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         solution = ls.load("plan.npz", ls.Solution)
 
     Args:
-      path: path of a file that `save` wrote.
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.types.OutputFeedbackPolicy`,
         `ls.types.Funnel` or `ls.stress.FailureCertificate`. By default, any.
     """

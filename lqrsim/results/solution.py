@@ -35,9 +35,7 @@ class Solution(Plan):
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
       gap: gap of the plan; see `Iteration.gap`. NaN if it is not defined.
       options: the settings of the solver; with noise, also a description of the noise, and the risk.
-      problem_digest: hash of everything that defines the problem.
       problem_parts: what the problem asks for, by part, as `print(problem)` says it; empty in older files.
-      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       remedy: a remedy to try in this case; empty for a success, unless its goal is one that no control comes nearer to,
         or its Runge-Kutta steps are unstable.
       scenario: the scenario that the command line solved; empty if a program called the solver.

@@ -115,12 +115,7 @@ class Moments:
 @checked
 @dataclass(frozen=True, eq=False)
 class TotalCost:
-    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, for each knot. Paper: Eq. (20).
-
-    Attributes:
-      cost_to_go: the least cost from a state to the end.
-      cost_to_come: the least cost from the start to a state.
-    """
+    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, for each knot. Paper: Eq. (20)."""
 
     cost_to_go: Quadratic
     cost_to_come: Quadratic | Moments

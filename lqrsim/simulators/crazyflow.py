@@ -30,9 +30,7 @@ class Crazyflow(Simulator):
     in double precision, one after the other, because the bits of crazyflow's batches depend on their size.
 
     Args:
-      drone: name of crazyflow's drone: "cf21B_500", "cf2x_L250", "cf2x_P250" or "cf2x_T350".
       timestep: timestep of the physics in s; 1 / timestep has to be a whole number.
-      integrator: "rk4", "euler" or "symplectic_euler".
     """
 
     drone: Annotated[str, OneOf(DRONES)] = "cf21B_500"

@@ -79,8 +79,6 @@ def run_campaign(
       workers: number of processes on this machine; by default one per processor. 0 runs everything in this process.
       batch: number of trials that a worker simulates together; affects only time and memory.
       scheduler: address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786.
-      progress: called with the number of finished trials and the number of all trials, at the start and after each
-        shard.
 
     Raises:
       InputError: the campaign, its solution or the folder's contents do not fit; another process writes the folder; the

@@ -38,11 +38,7 @@ _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the l
 
 @contextlib.contextmanager
 def sole_writer(folder: Path) -> Iterator[None]:
-    """Make the folder if it does not exist, and lock it during the block.
-
-    Raises:
-      InputError: another process has locked it, or the folder cannot be written or locked.
-    """
+    """Make the folder if it does not exist, and lock it during the block."""
     path = folder / "campaign.lock"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -73,14 +73,11 @@ def smallest_failure(
     """Search for the failure that is nearest to the origin.
 
     Args:
-      score: a function of vectors (K, size) that returns (K,); positive is failure.
-      size: length of a vector.
       failures: (k, size), failures to begin with; by default the failures of a small splitting.
       rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than 1 % of the
         distance, and five rounds together gain less than a tenth of that.
       pairs: number of pairs in each round; by default half the size, and at least 250. With fewer pairs the gradient is
         mostly noise.
-      progress: called with the number of finished rounds, the number of all rounds, and the distance so far as text.
 
     Raises:
       NoFailure: no failure was given, and none was found.

@@ -47,9 +47,6 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
 
     If a process dies, another one runs its shard again. The trials of a shard count as failed if its process dies three
     times, or if it exceeds the time limit.
-
-    Raises:
-      InputError: processes cannot be started.
     """
     queue, attempts, failed_starts = deque(shards), Counter[Shard](), 0
     busy: list[_Worker] = []

@@ -105,8 +105,6 @@ class ReliabilityProblem(Study):
             levels, and failures are counted.
           seed: seed of all random numbers; by default that of the study.
           report: called with the summary, and with a line for each level that the pilot run finds.
-          progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so
-            far as text.
 
         Raises:
           NoFailure: no failure was found.
@@ -137,8 +135,6 @@ class ReliabilityProblem(Study):
           particles: number of trials at each level of the splitting that finds first failures.
           seed: seed of all random numbers; by default that of the study.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
-          progress: called with the number of finished rounds, the number of all rounds, and the distance so far as
-            text.
 
         Raises:
           NoFailure: none was found.
@@ -332,7 +328,6 @@ def certify(
     """Repeat the measurement of a certificate, in whole or in part.
 
     Args:
-      certificate: from `RareFailures.certificate`, or `ls.load`.
       repetitions: number of its repetitions to run, at least 2; by default all.
       seed: another seed, for fresh random numbers: then intervals are compared. By default the certificate's.
       scenario: reference to the scenario if it is your own function: files never choose code to run.

@@ -77,7 +77,6 @@ def funnel(
         a covariance (n, n), or one per knot, (T+1, n, n). The certificate holds for any shape, but levels depend on it.
       largest: largest level that is tried; by default the level at which an angle is off by half a turn.
       failures: number of trials of a test that may fail. With more, tests take more trials, and levels are larger.
-      progress: called with the number of finished knots, the number of all knots, and a text on the current trial.
 
     Raises:
       KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
@@ -202,7 +201,6 @@ def check_funnel(
     a level. The other arguments are as for `funnel`.
 
     Args:
-      trials: number of trials at each knot.
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
       seed: seed of all random numbers; it must differ from the funnel's, because the trials must be new.
     """

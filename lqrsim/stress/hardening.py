@@ -58,7 +58,6 @@ class HardeningRound:
     """A plan, and how its runs fail.
 
     Attributes:
-      cost: its cost in the scenario's problem.
       rare: its failures; None if none was found.
       unfailing: number of independent trials that were run if none was found; none of them failed.
       hit: fraction of the failing runs that return to the plan, but hit an obstacle before, by the obstacle's name.
@@ -185,8 +184,6 @@ def harden(
       repetitions: number of independent estimates, whose spread gives the interval.
       seed: seed of the first measurement, by default that of the problem; the others have the seeds after it.
       report: called with a description of the run, and with a line for each plan.
-      progress: called with the number of finished repetitions, the largest possible number, and the result so far as
-        text.
 
     Returns:
       The HardenedPlan: the first plan that is safe enough in two measurements, the second with fresh random numbers; or

@@ -118,16 +118,12 @@ def failure_probability(
 
     Args:
       score: a function of vectors (K, size) that returns (K,); positive is failure.
-      size: length of a vector.
-      particles: number of vectors N in each repetition.
       keep: fraction of the vectors that exceeds the next level, at least 2 / `particles`. With 0 there are no levels,
         and failures are counted.
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds, and again for each batch that it draws where scores tie.
-      progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so far
-        as text.
 
     Raises:
       NoFailure: no failure was found.

@@ -95,7 +95,6 @@ def solve(
     "smooth".
 
     Args:
-      design: the disturbances for which "track" and "offset_free" are designed.
       given: a solution from `solutions.given`, in place of the result of its solver.
       remark: whether to warn of plans that have not converged, or are of another problem.
     """
@@ -162,7 +161,6 @@ def make_controller(
     Args:
       name: one of CONTROLLERS. "feedback" is the solution's policy; "track" and "offset_free" are `lqrsim.track` and
         `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
-      design: the disturbances for which "track" and "offset_free" are designed.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
     """
     problem = scenario.settled(solution).problem

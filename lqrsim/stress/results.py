@@ -36,7 +36,6 @@ class Results:
     """The folder of a campaign, finished or not.
 
     Args:
-      folder: written by `run_campaign`.
       scenario: the campaign's reference, needed if the scenario is your own function: files never choose code to run.
     """
 
@@ -289,11 +288,7 @@ class Results:
 
     @checked
     def command_of(self, command: Literal["report", "replay"], *options: str) -> str:
-        """The command line of `lqrsim report` or `lqrsim replay` for this campaign. It runs in any working directory.
-
-        Args:
-          *options: further words of the command line.
-        """
+        """The command line of `lqrsim report` or `lqrsim replay` for this campaign. It runs in any working directory."""
         reference = self.manifest["campaign"]["scenario"]
         code = ["--scenario", reference] if names_code(reference) else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *code])
@@ -314,8 +309,6 @@ def replay(
     It needs the kind of processor and the versions in `results.manifest["versions"]`.
 
     Args:
-      results: the campaign, or its folder.
-      trial: number of the first trial, from 0.
       frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
     """
@@ -367,7 +360,6 @@ def compare(
     Fisher's exact test. Where nothing is drawn each cell is one run: the difference has no interval and no p.
 
     Args:
-      first: a campaign, or its folder.
       second: another campaign, whose sweeps of the same names have the same disturbances, and whose goals have the same
         options; by default the first.
       policies: the policy of the first and the policy of the second; by default each policy with that of the same name.

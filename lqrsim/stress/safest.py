@@ -88,10 +88,6 @@ def smooth_safest(
 
     Args:
       trials: number of trials of each plan, and of fresh trials of the chosen plan.
-      threads: number of threads of the search and of the simulations.
-
-    Raises:
-      InputError: as `smooth` and `simulate`, or no candidate converges.
     """
     first = smooth(problem, starts=starts, threads=threads)
     plans: list[tuple[str, Solution]] = []

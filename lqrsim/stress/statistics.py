@@ -48,7 +48,6 @@ class Pairs:
     """A comparison of two policies on the same trials, with the exact McNemar test.
 
     Attributes:
-      only_first, only_second: number of trials in which only this policy succeeded.
       p_value: probability of a split that is at least as uneven, if both policies were equally good.
     """
 
@@ -111,13 +110,10 @@ def paired_difference(
 
 
 def independent_difference(first: tuple[int, int], second: tuple[int, int]) -> tuple[Estimate, float]:
-    """The difference of two success rates, of trials that have nothing in common, and Fisher's exact test of it.
+    """The difference of two success rates, (successes, trials), of trials apart, and Fisher's exact test of it.
 
     The interval is Newcombe's hybrid score (Statistics in Medicine 17, 1998, method 10): how far the rates can be off
     by their Wilson intervals, added as independent errors are.
-
-    Args:
-      first, second: number of successes and of trials.
 
     Returns:
       The rate of the first minus that of the second, and the p-value.

@@ -46,13 +46,7 @@ Disturbances = Annotated[tuple[Disturbance, ...], Want("a tuple of disturbances,
 @checked
 @dataclass(frozen=True)
 class Cell:
-    """A combination of policy, disturbances and strength. All cells use the same random numbers.
-
-    Attributes:
-      policy: name of the policy; see `Campaign`.
-      sweep: the name of the disturbances.
-      strength: factor by which they are scaled, 0 or more.
-    """
+    """A combination of policy, disturbances and strength. All cells use the same random numbers."""
 
     policy: Name
     sweep: Name

@@ -20,8 +20,6 @@ def diagnose(
 
     Args:
       numbers: (k,) numbers of the frames in which the robot is seen.
-      times, seen, actual: times and positions for all frames.
-      bound: bound on the error, in metres.
     """
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
     error = where - truth
@@ -193,9 +191,7 @@ def compare(
     """Compare positions (N, d) from pixels with the actual ones.
 
     Args:
-      times, seen, actual, planned: as in a `Verification`.
       apart: (N,) disagreement of the views, in metres.
-      bound: bound on the distance between seen and actual positions in any frame, in metres.
       interval: seconds between two frames; the shift must be less than a quarter of it.
     """
     good = np.asarray(np.isfinite(seen).all(axis=1))

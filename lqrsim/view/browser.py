@@ -219,9 +219,6 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
       (Access-Control-Allow-Origin).
     - `web_viewer._print_url_banner`: it prints an address in the network, where nothing answers, and warns that others
       can connect.
-
-    Args:
-      sockets: a list to which the listening socket is appended.
     """
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
 

@@ -68,7 +68,6 @@ class Views:
 
     Attributes:
       title: of each view; where there are two, with its direction.
-      radius: of the robot, in metres.
       places: (k, 2 or 3), which the views contain.
       planes: of each view, the axes of the places that it shows.
       certified: ellipsoids with a thick outline.

@@ -18,11 +18,7 @@ INSTALL = "sudo apt-get install -y libegl1 libgl1-mesa-dri libopengl0"
 
 @functools.cache
 def bind() -> None:
-    """Make sure that MuJoCo can draw without a display; a choice in MUJOCO_GL is kept.
-
-    Raises:
-      InputError: there is no OpenGL library, or it does not work; the message says how to install one.
-    """
+    """Make sure that MuJoCo can draw without a display; a choice in MUJOCO_GL is kept."""
     if sys.platform != "linux":
         return
     choice = os.environ.get("MUJOCO_GL", "").strip().lower()

@@ -65,9 +65,6 @@ def render_html(
     Args:
       trial: row of the rollout, or several rows; by default all trials that have a finite state.
       overlays: as in `render`, except that there is always a caption.
-
-    Raises:
-      InputError: an overlay lacks its solution or funnel, or nothing of a trial can be drawn.
     """
     path = check_path("path", path)
     if path.suffix.lower() != ".html":

@@ -127,12 +127,7 @@ class Arrow(Drawable):
 
 @dataclass(frozen=True)
 class Scale:
-    """The meaning of colours and lengths, the same for all runs in a picture.
-
-    Attributes:
-      error: error at the end of the trace's colours, in metres.
-      force: force of the longest arrow, in N.
-    """
+    """The error in m at the end of a trace's colours, and the force in N of the longest arrow, in all runs of a picture."""
 
     error: float
     force: float
@@ -158,10 +153,6 @@ def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 class Overlays:
     """The overlays of one trial that have something to draw.
-
-    Args:
-      solution: the solution that was run, for the tube of its cost.
-      funnel: a funnel about the plan of the run.
 
     Attributes:
       drawables: in the order of the legend.

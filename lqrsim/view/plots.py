@@ -279,10 +279,6 @@ def plot_policy(
       radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle
         are grey. 0 leaves the grey out, which would be wrong for a robot of several balls.
       tube: of the solution, from `predict_tube`.
-      style: as in `plot_run`.
-
-    Raises:
-      InputError: the solution has no policy, or the tube is of another plan or has no position.
     """
     world = World() if world is None else world
     if solution.cost_to_go is None:
@@ -415,9 +411,6 @@ def plot_funnel(
     Outlines are dark at certified knots and pale between them, where the level is interpolated. The ellipsoids of all
     states are projected onto the position: whether a run may begin at a place also depends on the other states. A robot
     in space is seen from above and from the side.
-
-    Args:
-      funnel: a funnel with the position among its states.
     """
     views = funnel_views(funnel, world, radius)
     with styles.figure(path, style=style) as figure:

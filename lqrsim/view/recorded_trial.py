@@ -151,11 +151,7 @@ def interpolated(points: Array, times: Array, at: Array | float) -> Array:
 
 @checked
 def model_of(rollout: Rollout, trial: Index) -> mujoco.MjModel:
-    """Compile the model that was run, with the obstacles where they were in the trial.
-
-    Raises:
-      InputError: there is no such trial, the robot has no place, or the model lacks a part that was recorded.
-    """
+    """Compile the model that was run, with the obstacles where they were in the trial."""
     if not 0 <= trial < rollout.trials:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
     if not rollout.plane:

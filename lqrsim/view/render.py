@@ -150,7 +150,6 @@ def render(
         each.
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another camera of the model.
       insets: more cameras, in panes next to the first. In panes of `top` and `side` robots have a green mark.
-      titles: titles of the runs, in the place of robot and scene.
       overlays: what is drawn over the scene, of `view.OVERLAY_KINDS`.
       solution: the solution that was run, for `cost_tube`; one for all runs, or one for each.
       funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
@@ -160,7 +159,6 @@ def render(
       speed: seconds of the run per second of the video.
       time: of a still, seconds after the start; by default the end.
       every: of a still, seconds; the robot is also drawn at each multiple of it, as in the paper's figures.
-      progress: called after each frame with the number of finished frames and the number of all frames.
 
     Returns:
       The path. A notebook shows the video or the still if the call is a cell's last expression.

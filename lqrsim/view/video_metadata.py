@@ -49,7 +49,6 @@ class VideoMetadata:
       runs: digests of the rollouts.
       markers: radius in metres of each robot's mark in panes with a camera; see `geoms.py`.
       rate: frames per second, `frames` in all.
-      speed: seconds of the run per second of the video.
     """
 
     runs: tuple[Line, ...]

@@ -316,7 +316,6 @@ def live(
       planner: makes a live re-planner for each run, in place of a controller: `replanner.live`. A run then continues
         after the plan's horizon, for at most ten minutes.
       goal: a goal that the person moves, with a planner and a viewer that shows it.
-      ended: called with a line on each run that has ended.
     """
 
     def watch(time: float, qpos: Array, unstable: np.ndarray) -> None:
