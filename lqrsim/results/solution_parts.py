@@ -62,34 +62,70 @@ class Trajectory:
 
 
 class Status(enum.StrEnum):
-    """The way in which a solve ended. `meaning` explains it; `remedy` says what to try."""
+    """The way in which a solve ended.
 
-    CONVERGED = "converged"
-    COST_CONVERGED = "cost converged"
-    MAX_ITERATIONS = "max iterations"
-    STALLED = "stalled"
-    TIME_LIMIT = "time limit"
-    INTERRUPTED = "interrupted"
-    INFEASIBLE = "infeasible"
-    DIVERGED = "diverged"
-    NOT_FINITE = "not finite"
-    NOT_POSITIVE_DEFINITE = "not positive definite"
-    RISK_TOO_HIGH = "risk too high"
-    NOT_CERTIFIED = "not certified"
+    Attributes:
+      remedy: what to try; empty for a success.
+    """
+
+    meaning: str
+    remedy: str
+
+    def __new__(cls, value: str, meaning: str, remedy: str = "") -> "Status":
+        member = str.__new__(cls, value)
+        member._value_, member.meaning, member.remedy = value, meaning, remedy
+        return member
+
+    CONVERGED = "converged", "optimality and, with a cost-to-come, the gap are within tolerance"
+    COST_CONVERGED = (
+        "cost converged", "the change of cost is within tolerance; gap and optimality were not tested",
+        'check the gap, or solve with stop="optimal"',
+    )  # fmt: skip
+    MAX_ITERATIONS = (
+        "max iterations", "the iteration limit was reached",
+        "raise max_iterations while the improvements shrink; otherwise try another start",
+    )  # fmt: skip
+    STALLED = (
+        "stalled", "no step makes the plan better, though it is not within tolerance",
+        "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
+    )  # fmt: skip
+    TIME_LIMIT = (
+        "time limit", "the time limit was reached; the plan is the best so far",
+        "raise time_limit, or start nearer: start=solution of a similar problem",
+    )  # fmt: skip
+    INTERRUPTED = (
+        "interrupted", "the callback raised an exception, or Ctrl-C was pressed; the plan is the best so far",
+        "solve again, from start=solution",
+    )  # fmt: skip
+    INFEASIBLE = (
+        "infeasible", "the constraints cannot be met, at least near the plan with the least violation",
+        "relax the constraint that is named, allow more time, or try another start",
+    )  # fmt: skip
+    DIVERGED = (
+        "diverged", "the cost of the policy grew beyond all bounds",
+        "try a start nearer to a solution or an InitialPrior, shorten dt, or try the other solver",
+    )  # fmt: skip
+    NOT_FINITE = (
+        "not finite", "a NaN or an infinity appeared",
+        "check the dynamics and the cost at the step that is named; try another start; shorten dt",
+    )  # fmt: skip
+    NOT_POSITIVE_DEFINITE = (
+        "not positive definite", "a matrix that must be inverted was not positive definite",
+        "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
+    )  # fmt: skip
+    RISK_TOO_HIGH = (
+        "risk too high", "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
+        "lower the risk below the largest that is named, or lower the noise; or start from a solution of a lower risk",
+    )  # fmt: skip
+    NOT_CERTIFIED = (
+        "not certified", "the method converged, but a check of its plan against the problem failed",
+        "try another start or form, and please report it: this is a bug in lqrsim",
+    )  # fmt: skip
 
     @property
     def success(self) -> bool:
         """True for CONVERGED, and for COST_CONVERGED, for which only the cost was tested."""
         return self in (Status.CONVERGED, Status.COST_CONVERGED)
-
-    @property
-    def meaning(self) -> str:
-        return _STATUS_TEXT[self][0]
-
-    @property
-    def remedy(self) -> str:
-        """The remedy to try; empty for a success."""
-        return _STATUS_TEXT[self][1]
 
 
 class Curvature(enum.StrEnum):
@@ -104,55 +140,6 @@ class Curvature(enum.StrEnum):
     SINGULAR = "singular"
     SADDLE = "saddle"
     NOT_CHECKED = "not checked"
-
-
-_STATUS_TEXT = {
-    Status.CONVERGED: ("optimality and, with a cost-to-come, the gap are within tolerance", ""),
-    Status.COST_CONVERGED: (
-        "the change of cost is within tolerance; gap and optimality were not tested",
-        'check the gap, or solve with stop="optimal"',
-    ),
-    Status.MAX_ITERATIONS: (
-        "the iteration limit was reached",
-        "raise max_iterations while the improvements shrink; otherwise try another start",
-    ),
-    Status.STALLED: (
-        "no step makes the plan better, though it is not within tolerance",
-        "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
-    ),
-    Status.TIME_LIMIT: (
-        "the time limit was reached; the plan is the best so far",
-        "raise time_limit, or start nearer: start=solution of a similar problem",
-    ),
-    Status.INTERRUPTED: (
-        "the callback raised an exception, or Ctrl-C was pressed; the plan is the best so far",
-        "solve again, from start=solution",
-    ),
-    Status.INFEASIBLE: (
-        "the constraints cannot be met, at least near the plan with the least violation",
-        "relax the constraint that is named, allow more time, or try another start",
-    ),
-    Status.DIVERGED: (
-        "the cost of the policy grew beyond all bounds",
-        "try a start nearer to a solution or an InitialPrior, shorten dt, or try the other solver",
-    ),
-    Status.NOT_FINITE: (
-        "a NaN or an infinity appeared",
-        "check the dynamics and the cost at the step that is named; try another start; shorten dt",
-    ),
-    Status.NOT_POSITIVE_DEFINITE: (
-        "a matrix that must be inverted was not positive definite",
-        "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
-    ),
-    Status.RISK_TOO_HIGH: (
-        "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
-        "lower the risk below the largest that is named, or lower the noise; or start from a solution of a lower risk",
-    ),
-    Status.NOT_CERTIFIED: (
-        "the method converged, but a check of its plan against the problem failed",
-        "try another start or form, and please report it: this is a bug in lqrsim",
-    ),
-}
 
 
 @checked

@@ -288,7 +288,7 @@ class Results:
 
     @checked
     def command_of(self, command: Literal["report", "replay"], *options: str) -> str:
-        """The command line of `lqrsim report` or `lqrsim replay` for this campaign. It runs in any working directory."""
+        """The command line of `lqrsim report` or `lqrsim replay` for this campaign, in any working directory."""
         reference = self.manifest["campaign"]["scenario"]
         code = ["--scenario", reference] if names_code(reference) else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *code])

@@ -127,7 +127,7 @@ class Arrow(Drawable):
 
 @dataclass(frozen=True)
 class Scale:
-    """The error in m at the end of a trace's colours, and the force in N of the longest arrow, in all runs of a picture."""
+    """The error in m at the end of a trace's colours, and the force in N of the longest arrow, in all runs."""
 
     error: float
     force: float
