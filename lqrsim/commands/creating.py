@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import Json, optional, options_of
+from lqrsim.commands.options import Json, optional, options_of, stated
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
@@ -117,9 +117,7 @@ class Export:
     def _to_c(self, folder: Path) -> None:
         console.check_output("--c", folder)
         policy: Any = ls.load(self.source)  # `export_c` refuses anything that cannot be exported
-        found = ls.export_c(
-            policy, folder, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
-        )
+        found = ls.export_c(policy, folder, **stated(self, ls.export_c))
         for path in found.files:
             console.wrote(path)
         console.say(found.summary())

@@ -44,7 +44,7 @@ class List:
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("solvers/smoother.py", "smooth", tolerance="SHARE", time_limit="SECONDS", starts="INT")
+@options_of("solvers/smoother.py", "smooth", tolerance="SHARE", time_limit="SECONDS")
 class Solve:
     """Compute a feedback policy for a scenario.
 
@@ -67,6 +67,9 @@ class Solve:
     """newton: smooth leaves the last iterations to Newton's method. none: the paper's method does them all."""
     max_iterations: Annotated[int | None, optional("INT")] = None
     """Stop after this many iterations. By default the solver's own limit."""
+    starts: Annotated[int | None, optional("INT")] = None
+    """Number of starting paths that smooth tries for a few iterations; the best continues. By default 7,
+    if there is no start."""
     start: Annotated[Path | None, optional("FILE.npz")] = None
     """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with the
     same number of steps. By default the scenario's own start, or a search."""
