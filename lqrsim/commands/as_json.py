@@ -84,11 +84,6 @@ def of_rollout(rollout: "ls.Rollout", problem: "ls.Problem | None" = None) -> Ob
     }
 
 
-def of_verification(found: "ls.types.Verification") -> Object:
-    """All fields of a verification, including the positions in every frame."""
-    return {**{one.name: getattr(found, one.name) for one in dataclasses.fields(found)}, "passed": found.passed}
-
-
 def of_campaign(results: "ls.stress.Results") -> Object:
     """The outcomes of each cell of a campaign so far."""
     from lqrsim.results.goal import OUTCOMES

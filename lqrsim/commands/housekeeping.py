@@ -39,10 +39,16 @@ class Demo:
     def run(self) -> int:
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
         from lqrsim.simulation.uncertainty_of import tube_under
+        from lqrsim.view import cameras, gl
 
         console.check_output("--out", self.out)
-        scenarios = {reference: resolve(reference) for reference in self.robots}
-        video = self.video and self._can_render()
+        scenarios, video = {reference: resolve(reference) for reference in self.robots}, self.video
+        if video:
+            try:
+                gl.bind()
+            except ls.InputError as error:
+                console.say(f"No videos, everything else works: {error}")
+                video = False
         rows, failures, misses = [TABLE], list[str](), list[str]()
         results = list[as_json.Object]()
         for reference, scenario in scenarios.items():
@@ -75,8 +81,11 @@ class Demo:
                 failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
             console.wrote(ls.view.plot_run(solution, runs, folder / "figure.png", world=world))
             misses += [f"{reference}: {line}" for line in undisturbed.target.of_plan(undisturbed.goal_radius)[1:]]
-            if video:
-                self._render(runs["disturbed"], folder / "video.mp4")
+            if video:  # with the calibrated panes that show the robot's position
+                run, (quality, fps) = runs["disturbed"], ("draft", 5) if self.quick else ("standard", 30)
+                options = {"insets": cameras.measuring(run.plane), "quality": quality, "fps": fps}
+                with console.progress("rendering", "frame") as progress:
+                    console.wrote(ls.render(run, folder / "video.mp4", progress=progress, **options))
             if console.wants_result():
                 shown = {name: as_json.of_rollout(run, scenario.problem) for name, run in runs.items()}
                 results.append({"solution": as_json.of_solution(solution), "runs": shown})
@@ -85,26 +94,6 @@ class Demo:
             console.say(line)
         console.result(scenarios=results, misses=misses, failures=failures)
         return 1 if failures else 0
-
-    @staticmethod
-    def _can_render() -> bool:
-        from lqrsim.view import gl
-
-        try:
-            gl.bind()
-        except ls.InputError as error:
-            console.say(f"No videos, everything else works: {error}")
-            return False
-        return True
-
-    def _render(self, rollout: "ls.Rollout", path: Path) -> None:
-        """Render a video with the calibrated panes that show the robot's position."""
-        from lqrsim.view import cameras
-
-        quality, fps = ("draft", 5) if self.quick else ("standard", 30)
-        with console.progress("rendering", "frame") as progress:
-            options = {"insets": cameras.measuring(rollout.plane), "quality": quality, "fps": fps}
-            console.wrote(ls.render(rollout, path, progress=progress, **options))
 
 
 TABLE = (

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import lqrsim as ls
-from lqrsim.commands import as_json, console
+from lqrsim.commands import console
 from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional, options_of, stated
 from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
@@ -293,5 +293,5 @@ class Verify:
                     self.file, rollout, trial=self.trial, solution=solution, progress=progress
                 )
         console.say(verification.summary())
-        console.result(verification=as_json.of_verification(verification))
+        console.result(verification={**vars(verification), "passed": verification.passed})
         return 0 if verification.passed else 1

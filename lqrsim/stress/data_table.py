@@ -29,14 +29,14 @@ from lqrsim.results.archive import replacing
 Entry = str | int | float | None
 _LONGEST = 10_000  # characters of an entry or a note; a reference to a scenario may have as many
 
-_LATEX = {
+_LATEX = str.maketrans({
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
     "|": r"\textbar{}", "[": "{[}", "*": "{*}",  # a row that begins with one of the last two would be an option of \\
-}  # fmt: skip
+})  # fmt: skip
 # An underscore within a word is only that. Not all renderers know a backslash before the others.
 _MARKDOWN = re.compile(r"[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])")
-_ENTITIES = {letter: f"&#{ord(letter)};" for letter in "&<>~$"}
+_ENTITIES = str.maketrans({letter: f"&#{ord(letter)};" for letter in "&<>~$"})
 
 
 @checked
@@ -89,7 +89,9 @@ class DataTable:
 
     def latex(self) -> str:
         r"""The table as a `tabular` of LaTeX with the rules of the package booktabs, for `\input` in a `table`."""
-        head, *rows = (" & ".join(row) + r" \\" for row in self._rows(_latex_text, _latex_number))
+        head, *rows = (
+            " & ".join(row) + r" \\" for row in self._rows(lambda text: text.translate(_LATEX), _latex_number)
+        )
         return _lines(
             r"% needs \usepackage{booktabs}", *(f"% {note}" for note in self.notes),
             rf"\begin{{tabular}}{{{''.join('l' if text else 'r' for text in self._texts)}}}",
@@ -172,10 +174,6 @@ def _lines(*lines: str) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _latex_text(text: str) -> str:
-    return "".join(_LATEX.get(letter, letter) for letter in text)
-
-
 def _latex_number(text: str) -> str:
     """In math, in which a minus sign is none of hyphens; 1e-05 as a power of ten."""
     digits, _, exponent = text.partition("e")
@@ -183,4 +181,4 @@ def _latex_number(text: str) -> str:
 
 
 def _markdown_text(text: str) -> str:
-    return _MARKDOWN.sub(r"\\\g<0>", text).translate(str.maketrans(_ENTITIES))
+    return _MARKDOWN.sub(r"\\\g<0>", text).translate(_ENTITIES)

@@ -234,16 +234,7 @@ class TrialScore:
         return self._simulate(len(vectors), draws_of, frames=frames)
 
     def _simulate(self, trials: int, generators: Callable[[int, int], PrescribedDraws], *, frames: bool) -> Rollout:
-        return simulate(
-            self.plant,
-            self.solution,
-            disturbances=self.disturbances,
-            controller=self.controller,
-            trials=trials,
-            goal_radius=self.goal_radius,
-            goal_tolerance=self.goal_tolerance,
-            frames=frames,
-            contacts=self.contacts,
-            threads=self.threads,
-            generators=cast(Callable[[int, int], np.random.Generator], generators),
-        )
+        named = ("disturbances", "controller", "goal_radius", "goal_tolerance", "contacts", "threads")
+        options = {name: getattr(self, name) for name in named} | {"trials": trials, "frames": frames}
+        drawn = cast(Callable[[int, int], np.random.Generator], generators)
+        return simulate(self.plant, self.solution, generators=drawn, **options)

@@ -240,7 +240,12 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
             return process_request(connection, request)
 
         def answer(connection: Any, request: Any, response: Any) -> Any:
-            return _with_private_headers(process_response(connection, request, response) or response)
+            response = process_response(connection, request, response) or response
+            for name in (SHARING_HEADER, *PRIVATE_HEADERS):
+                if name in response.headers:
+                    del response.headers[name]
+            response.headers.update(PRIVATE_HEADERS)
+            return response
 
         return serve(handler, process_request=admit, process_response=answer, **options)
 
@@ -262,15 +267,6 @@ def _refusal(request: Any, port: int) -> str:
     if origins and origins != [f"http://{hosts[0]}"]:
         return "only pages of this server are admitted"
     return "uploads are refused" if request.path.split("?")[0] == "/drop" else ""
-
-
-def _with_private_headers(response: Any) -> Any:
-    """The response with headers that keep other pages from using it."""
-    for name in (SHARING_HEADER, *PRIVATE_HEADERS):
-        if name in response.headers:
-            del response.headers[name]
-    response.headers.update(PRIVATE_HEADERS)
-    return response
 
 
 def _check_private(port: int) -> None:
