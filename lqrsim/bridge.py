@@ -33,9 +33,8 @@ from lqrsim.control.controllers import Controller, Feedback, FunctionController,
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
-from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 
 LATE = 3  # control periods without a state after which the controller stops
 SLICE = 0.05  # s, the interval at which a wait checks for signals

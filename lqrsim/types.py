@@ -14,8 +14,8 @@ from lqrsim.problem.derivative_check import DerivativeCheck
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.export_c import ExportedC
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Replan
+from lqrsim.results.policy import OutputFeedbackPolicy
 from lqrsim.results.solution_parts import (
     BetweenKnots,
     Candidate,

@@ -17,8 +17,8 @@ from lqrsim.errors import Array
 from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Measurements, Policy
 from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
+from lqrsim.results.policy import OutputFeedbackPolicy
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,8 @@ from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, PerEntry
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
+from lqrsim.results.policy import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
 from lqrsim.robots.sensors import RobotSensors
 

@@ -19,8 +19,7 @@ from lqrsim.annotations import Line, OneOf, Want, checked
 from lqrsim.errors import Array, InputError, check_path, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
-from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.save_load import hash_of
 from lqrsim.results.solution import Solution
 

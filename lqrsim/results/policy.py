@@ -1,6 +1,6 @@
-"""The feedback law in the form that a robot runs. NumPy only.
+"""Feedback laws in the form that a robot runs, with and without a filter. NumPy only.
 
-`kernels/policy_evaluation.py` implements the same law in compiled code, for simulations of many trials. There a trial
+`kernels/policy_evaluation.py` implements `AffinePolicy` in compiled code, for simulations of many trials. There a trial
 gets the same bits whatever other trials run with it, which NumPy's matrix products do not guarantee.
 `tests/test_policy.py` compares the two.
 """
@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import NonNegative, Positive, checked, repr_of
+from lqrsim.annotations import Bounds, NonNegative, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
@@ -91,3 +91,97 @@ class AffinePolicy:
             nominal = (1 - weight) * nominal + weight * self.nominal[step + 1]
         control = self.state_coordinates.nearest(state, nominal) @ gain.T + offset
         return self.control_coordinates.clip(control)
+
+
+@checked
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OutputFeedbackPolicy:
+    """Output feedback about a plan, from measurements to controls. Its entire state is one vector z.
+
+    `OffsetFree` predicts with the compiled nonlinear dynamics. Here the dynamics are linear about the plan, so that
+    products of small matrices suffice. `tests/test_policy_files.py` compares the two.
+
+    In each control period t, with x the first n numbers of z and y the measurement,
+
+        z = z + correction_t (y - sensor_t x - sensor_offset_t)
+        u = clip(gain_t z + offset_t)
+        z = transition_t z + input_t u + drift_t
+
+    Before that, angles of x are replaced by the representatives nearest to the nominal angles, and angles of y by those
+    nearest to the expected angles. z begins as nominal_0.
+
+    Attributes:
+      gain: (T, m, Z); u = clip(gain z + offset).
+      correction: the filter's gain, (T, Z, Y).
+      sensor: (T, Y, n); the measurement of a state x is sensor x + sensor_offset.
+      transition: (T, Z, Z), to the next control period: z = transition z + input u + drift.
+      nominal: (T, Z), z in an undisturbed run: the state, the actuator outputs if they lag, the states of the
+        disturbances, and the pending commands if commands or measurements are late.
+      measured_coordinates: names and units of the measured numbers, and which of them wrap.
+    """
+
+    gain: Annotated[Array, "T m Z", Bounds()]
+    offset: Annotated[Array, "T m", Bounds()]
+    correction: Annotated[Array, "T Z Y", Bounds()]
+    sensor: Annotated[Array, "T Y n", Bounds()]
+    sensor_offset: Annotated[Array, "T Y", Bounds()]
+    transition: Annotated[Array, "T Z Z", Bounds()]
+    input: Annotated[Array, "T Z m", Bounds()]
+    drift: Annotated[Array, "T Z", Bounds()]
+    nominal: Annotated[Array, "T Z", Bounds()]
+    dt: Positive
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    measured_coordinates: Annotated[Coordinates, "Y"]
+
+    __repr__ = repr_of
+
+    def __post_init__(self) -> None:
+        states = len(self.state_coordinates)
+        if not self.steps or self.nominal.shape[1] < states:
+            raise InputError(
+                f"OutputFeedbackPolicy: nominal: got shape {self.nominal.shape}, want at least one row, of"
+                f" {states} states or more"
+            )
+
+    @property
+    def steps(self) -> int:
+        """T, the number of control periods."""
+        return len(self.gain)
+
+    @property
+    def digest(self) -> str:
+        """Hash of everything that the controls depend on, 16 hexadecimal digits."""
+        recursions = (value for value in vars(self).values() if isinstance(value, np.ndarray))
+        spaces = self.state_coordinates, self.control_coordinates, self.measured_coordinates
+        # The names say which states are measured.
+        rules = (f"{one.names} {one.rules}" for one in spaces)
+        return sha256(*recursions, np.float64(self.dt), *rules)[:16]
+
+    def start(self) -> Array:
+        """The state of the filter before the first measurement, (Z,)."""
+        return self.nominal[0].copy()
+
+    @checked
+    def step(self, z: npt.ArrayLike, measurement: npt.ArrayLike | None, t: NonNegative) -> tuple[Array, Array]:
+        """The controls (..., m) of this control period, and z (..., Z) for the next. Call it once in each period.
+
+        After the horizon the last recursion holds.
+
+        Args:
+          z: (..., Z), from `start` or the previous call; it is not changed.
+          measurement: (..., Y), angles in any representative; None if it was lost: z is then only predicted.
+        """
+        z = vectors_of("z", z, self.nominal.shape[1])
+        k, n = int(min(t / self.dt + 1e-9, self.steps - 1)), len(self.state_coordinates)
+        if not np.isfinite(z).all():
+            raise InputError(f"z: got {excerpt(z)}, want finite numbers")
+        z = np.concatenate([self.state_coordinates.nearest(z[..., :n], self.nominal[k, :n]), z[..., n:]], axis=-1)
+        if measurement is not None:
+            y = vectors_of("measurement", measurement, len(self.measured_coordinates))
+            if not np.isfinite(y).all():
+                raise InputError(f"measurement: got {excerpt(y)}, want finite numbers, or None if it was lost")
+            expected = z[..., :n] @ self.sensor[k].T + self.sensor_offset[k]
+            z = z + self.measured_coordinates.difference(y, expected) @ self.correction[k].T
+        control = self.control_coordinates.clip(z @ self.gain[k].T + self.offset[k])
+        return control, z @ self.transition[k].T + control @ self.input[k].T + self.drift[k]

@@ -29,8 +29,7 @@ from lqrsim.results.archive import (
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
-from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Certificate

@@ -12,8 +12,7 @@ from lqrsim.errors import InputError, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
-from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.save_load import load
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory

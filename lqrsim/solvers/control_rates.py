@@ -22,9 +22,8 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
-from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan, Replan
-from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.results.value_functions import Quadratic
