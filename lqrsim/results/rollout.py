@@ -251,7 +251,7 @@ class Rollout:
 
     @checked
     def places(self, trial: Index) -> Array:
-        """Places (T+1, 2 or 3) of the robot in a trial, in metres: its position, or the position of its last ball."""
+        """The robot's places (T+1, 2 or 3) in a trial, in metres: its position, or the position of its last ball."""
         if not trial < self.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {self.trials - 1}")
         if self.state_coordinates.position or self.balls is None:
