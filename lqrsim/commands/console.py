@@ -150,9 +150,7 @@ def load_with_scenario(path: Path, named: str | None) -> "tuple[ls.Solution, ls.
 
     solution = ls.load(path, ls.Solution)
     if not named and not solution.scenario:
-        raise ls.InputError(
-            "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
-        )
+        raise ls.InputError("--scenario: got none, and the solution names none, want the one with robot and scene")
     return solution, resolve(named or solution.scenario, registered_only=not named).settled(solution)
 
 

@@ -160,9 +160,7 @@ def check_robot_name(name: str) -> None:
         raise ls.InputError(f"name: got {excerpt(name)}, want {wanted}")
     reserved = TAKEN | {one.lower() for one in (*dir(builtins), *keyword.kwlist)}
     if name in reserved:
-        raise ls.InputError(
-            f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another name"
-        )
+        raise ls.InputError(f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another")
     found = importlib.util.find_spec(name)
     if found is not None and found.origin is not None:  # a folder without modules has no origin
         raise ls.InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")

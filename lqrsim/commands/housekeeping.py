@@ -135,9 +135,7 @@ class Cache:
                 console.say(f"removed {removed} items from {disk_cache.folder()}")
                 console.result(removed=removed, folder=disk_cache.folder())
             except OSError as error:
-                raise ls.InputError(
-                    f"--clear: got {disk_cache.folder()}, want files that can be removed ({error})"
-                ) from None
+                raise ls.InputError(f"--clear: got {disk_cache.folder()}, want removable files ({error})") from None
             return 0
         items = disk_cache.items()
         together = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)

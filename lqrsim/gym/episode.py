@@ -75,9 +75,7 @@ class Task:
         self.low, self.high = np.array(space.low), np.array(space.high)
         for name, low, high in zip(space.names, space.low, space.high, strict=True):
             if not np.isfinite(high - low):
-                raise InputError(
-                    f"scenario: got control {name} within {low:g} to {high:g}, want finite limits, for the actions"
-                )
+                raise InputError(f"scenario: got control {name} within {low:g} to {high:g}, want finite limits")
         self._disturbances = self.disturbances_of(disturbances, strength)
         if scenario.problem.duration is not None:  # the control period is part of the solution
             self.scenario = scenario.settled(self.solution)

@@ -102,9 +102,7 @@ class Coordinates:
                 )
         plane = self._plane()
         if len(plane) != 2 and self.offset is not None:
-            raise InputError(
-                f"offset: got {excerpt(self.offset)} without a plane, want it with a position of two entries"
-            )
+            raise InputError(f"offset: got {excerpt(self.offset)} without a plane, want it with a planar position")
         offset = 0.0 if self.offset is None and len(plane) == 2 and plane not in _FROM_ABOVE else self.offset
         low = check_array("low", self.low or (-np.inf,) * size, (size,), infinite=True)
         high = check_array("high", self.high or (np.inf,) * size, (size,), infinite=True)

@@ -246,9 +246,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
         if specification[field] != manifest[field]:
             older = other_lqrsim(manifest["versions"])
             older = f", or with the hashes of {older}" if older else ""
-            raise InputError(
-                f"scenario: got a {what} other than the one {folder} was begun with{older}, want another folder"
-            )
+            raise InputError(f"scenario: got a {what} other than the one {folder} was begun with{older}, want another")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / GIVEN

@@ -220,9 +220,7 @@ def connected(address: str) -> Iterator[Any]:
     try:
         import distributed
     except ImportError:
-        raise InputError(
-            "scheduler: got an address without dask, want dask installed: pip install 'lqrsim[distributed]'"
-        ) from None
+        raise InputError("scheduler: got an address, want dask installed: pip install 'lqrsim[distributed]'") from None
     try:
         client = distributed.Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

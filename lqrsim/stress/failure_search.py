@@ -57,9 +57,7 @@ class ReliabilityProblem(Study):
         """The score of trials as a function of their random numbers. Raises InputError if no such failure can occur."""
         disturbances = self.disturbances  # checked before the scenario is solved
         if self.failure == "collision" and not len(self.resolved.plant().world):
-            raise InputError(
-                f"failure: got 'collision' for {self.scenario}, which has no obstacles with a distance, want 'miss'"
-            )
+            raise InputError(f"failure: got 'collision' for {self.scenario}, which has no obstacles, want 'miss'")
         score = TrialScore(**self.closed_loop, disturbances=disturbances, failure=FAILURES[self.failure])
         if score.size == 0:
             raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want a random disturbance")

@@ -91,9 +91,7 @@ def funnel(
     shapes = _shapes(solution, shape, chosen)
     for knot in starts:
         if flat(shapes[knot]):
-            raise InputError(
-                f"shape: got an ellipsoid that is flat at knot {knot}, want other knots or states, or another shape"
-            )
+            raise InputError(f"shape: got an ellipsoid that is flat at knot {knot}, want other knots, states or shape")
     none = np.zeros(len(starts), dtype=np.int64)
     family = "cost_to_go" if shape is None else "tube" if isinstance(shape, Tube) else "given"
     blank = Funnel(

@@ -190,9 +190,7 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
         if best is None or (rank, geom) < best:
             best = rank, geom
     if best is None:
-        raise InputError(
-            "rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box of the robot"
-        )
+        raise InputError("rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box")
     return best[1]
 
 

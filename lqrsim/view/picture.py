@@ -233,9 +233,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
         captions = [Caption(*run, options.speed) for run in zip(overlays, boxes, titles, strict=True)]
     strip = max(0 if caption is None else caption.height for caption in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
-        raise InputError(
-            f"size: got {width} x {height}, which captions would fill, want it larger, or overlays without caption"
-        )
+        raise InputError(f"size: got {width} x {height}, which captions would fill, want it larger, or no caption")
     with contextlib.ExitStack() as stack:
         parts: list[SceneRenderer] = []
         panes: list[Pane] = []

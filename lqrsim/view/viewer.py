@@ -55,16 +55,12 @@ class MovableGoal:
             raise InputError("goal: got a robot without a position, want one with a position to move its goal")
         held = [space.names[i] for i in goals_of(problem.constraints, problem.dynamics) if i in self._position]
         if held:
-            raise InputError(
-                f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost, whose goal can be moved"
-            )
+            raise InputError(f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost")
         self._dynamics, self._cost = problem.dynamics, problem.final_cost
         references = references_of(self._cost, self._dynamics)
         of_position = [(term, reference) for term, reference in references if reference.weight[self._position].any()]
         if len(of_position) != 1:
-            raise InputError(
-                f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one to move its goal"
-            )
+            raise InputError(f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one")
         ((self._drawing, self._reference),) = of_position
         self.place = self._reference.about[self._position]
 
