@@ -67,7 +67,6 @@ class Bridged:
     late: Array
 
     def summary(self) -> str:
-        """A summary of the run in a few lines."""
         lines = [f"{len(self.commands)} periods, {self.held} with the state held"]
         lines += [f"stopped: {self.reason}"] if self.reason else []
         lines += [f"{self.refused[0]} messages not used; the last: {self.refused[1]}"] if self.refused[0] else []
@@ -211,7 +210,6 @@ class SimulatedRobot:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Leave the domain."""
         self._outlets, self._inlet, self._node = {}, None, None
 
     def __call__(self, state: npt.ArrayLike, t: float) -> Array:
@@ -235,7 +233,6 @@ class SimulatedRobot:
         return check_array("command", message.data, (len(self._controls),))
 
     def summary(self) -> str:
-        """The times that commands took, in one line."""
         return f"state to command and back: {_quantiles(self.round_trips)}" if self.round_trips else "no command"
 
 
@@ -283,7 +280,6 @@ def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
 
 
 def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str, ...]:
-    """The names of the states in messages."""
     given = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
     if unknown := set(given) - set(states.names):
         raise InputError(f"names: got {excerpt(sorted(unknown))}, want some of {', '.join(states.names)}")
@@ -336,11 +332,9 @@ class _Inlet:
                 pass
 
     def matched(self) -> bool:
-        """Whether each topic has a writer."""
         return all(reader.writers() for reader in self._readers.values())
 
     def complete(self) -> bool:
-        """Whether each state that is needed has arrived."""
         self.take()
         return not self._lacking
 
@@ -485,7 +479,6 @@ class _Reader:
         return self._reader.take(N=1)
 
     def writers(self) -> list[Any]:
-        """The writers of the topic."""
         return self._reader.get_matched_publications()
 
 

@@ -111,12 +111,10 @@ def of_table(table: "ls.types.DataTable") -> list[Object]:
 
 
 def _fields(record: object, names: str) -> Object:
-    """These attributes of a record."""
     return {name: getattr(record, name) for name in names.split()}
 
 
 def _rows(columns: Mapping[str, Any]) -> list[Object]:
-    """Columns of equal length as a list of rows."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 

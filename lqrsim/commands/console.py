@@ -199,7 +199,6 @@ class Progress:
         say(line + (f"; {found}" if found else ""))
 
     def close(self) -> None:
-        """Remove the bar."""
         if self._bar is not None:
             self._bar.close()
 

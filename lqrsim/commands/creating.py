@@ -178,5 +178,4 @@ def next_commands(name: str, folder: Path) -> list[list[str]]:
 
 
 def _named(text: str, name: str) -> str:
-    """Replace the names in the text of a template."""
     return text.replace(TEMPLATE, name).replace(CLASS, "".join(part.capitalize() for part in name.split("_")))

@@ -278,7 +278,6 @@ class Bridge:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim import bridge
 
         pairs = [pair.partition("=") for pair in self.names]

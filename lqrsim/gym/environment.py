@@ -85,7 +85,6 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         return episode.observations[0], self._info(episode)
 
     def step(self, action: npt.ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Run one control period."""
         episode = self._current()
         if episode.ended[0]:
             raise InputError("step: the episode has ended, call reset() first")

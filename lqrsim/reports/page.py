@@ -195,7 +195,6 @@ def report(
 def _text_and_tables(
     results: Results, table: analysis.Table, worst: Sequence[Trials], scenario: Scenario
 ) -> dict[str, Any]:
-    """The whole page except pictures."""
     campaign, unit = results.campaign, tracking_unit(scenario.problem.dynamics.state_coordinates)
     whole = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
     erred = sum(int((outcomes.outcome == "error").sum()) for outcomes in table.values())
@@ -273,7 +272,6 @@ def _describe(disturbances: Sequence[Disturbance], scenario: Scenario) -> str:
 
 
 def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campaign, folder: Path) -> dict[str, Any]:
-    """The figures and the table of one sweep."""
     policies = list(dict.fromkeys(cell.policy for cell in table if cell.sweep == name))
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     curves = {policy: analysis.degradation(table, policy, name) for policy in policies}

@@ -241,7 +241,6 @@ class Rollout:
 
     @property
     def target(self) -> Target:
-        """The goal of the trials."""
         return Target(self.state_coordinates, self.goal, self.plan.states)
 
     @property

@@ -189,7 +189,6 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
 
 
 def _is_own(kind: type[Disturbance]) -> bool:
-    """Whether a class of disturbances is lqrsim's own."""
     return kind.__module__.partition(".")[0] == "lqrsim"
 
 

@@ -126,7 +126,6 @@ class DataTable:
 
     @property
     def _texts(self) -> list[bool]:
-        """Whether each column has text."""
         return [any(isinstance(entry, str) for entry in column) for column in self.columns.values()]
 
     def _rows(self, text: Callable[[str], str], number: Callable[[str], str]) -> Iterator[list[str]]:

@@ -115,7 +115,6 @@ class _Worker:
         self.deadline = time.monotonic() + _START_TIMEOUT
 
     def take(self, shard: Shard, time_limit: float) -> None:
-        """Assign a shard."""
         self.shard = shard
         if self.ready:
             self.deadline = time.monotonic() + time_limit
@@ -151,7 +150,6 @@ class _Worker:
 
 
 def _serve(connection: Connection) -> None:
-    """The main function of a worker."""
     global _serving
     _serving = True
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -210,7 +210,6 @@ class RareFailures:
 
     @property
     def probability(self) -> Estimate:
-        """The probability of failure, with its interval."""
         return self.splitting.probability
 
     @property

@@ -110,7 +110,6 @@ class HardenedPlan:
 
     @property
     def solution(self) -> Solution:
-        """The plan."""
         return self.rounds[self.chosen].solution
 
     @property
@@ -249,7 +248,6 @@ class _Search:
         self.ended = ""  # why there is no next plan
 
     def law(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
-        """The law that runs a plan."""
         name = self.asked.policy if self.asked.policy in DESIGNED else "feedback"
         law = make_controller(name, self.scenario, solution, design=self.asked.design_disturbances)
         assert isinstance(law, OffsetFree | AffinePolicy)
@@ -276,7 +274,6 @@ class _Search:
         return None
 
     def first(self) -> Solution:
-        """The plan that has the requested chance by prediction."""
         plan = smooth_chance_constrained(self.stated, self.uncertainty, chance=self.chance, controller=self.law)
         if not plan.solution.success:
             got = plan.solution.status.name

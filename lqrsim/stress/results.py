@@ -79,7 +79,6 @@ class Results:
 
     @property
     def complete(self) -> bool:
-        """Whether all trials have been run."""
         return not self.missing
 
     @property
@@ -242,7 +241,6 @@ class Results:
                 yield Shard(number, first, min(size, trials - first))
 
     def shards_on_disk(self) -> set[Shard]:
-        """The shards that have a file."""
         folder = self.folder / "shards"
         names = set(os.listdir(folder)) if os.path.isdir(folder) else set()
         return {shard for shard in self.shards() if shard.file in names}
@@ -257,7 +255,6 @@ class Results:
 
     @checked
     def path(self, shard: Shard) -> Path:
-        """The path of a shard's file."""
         if shard.cell >= len(self.cells):
             raise InputError(f"shard: cell: got {shard.cell}, want a whole number from 0 to {len(self.cells) - 1}")
         return self.folder / "shards" / shard.file
@@ -270,7 +267,6 @@ class Results:
                 yield self.table(shard)
 
     def table(self, shard: Shard) -> Table:
-        """The rows of a shard."""
         path = self.path(shard)
         if not path.is_file():
             trials = f"{shard.first} to {shard.first + shard.count - 1}"

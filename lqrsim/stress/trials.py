@@ -30,7 +30,6 @@ class Trials:
         self._controllers: dict[str | tuple[str, str, float], Controller | AffinePolicy] = {}
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
-        """Run `count` trials of a cell, starting with number `first`."""
         return simulate(
             self.plant,
             self.solutions[cell.policy],

@@ -151,7 +151,6 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether no test failed."""
         return all(test.passed is not False for test in self.tests)
 
     @property

@@ -54,7 +54,6 @@ class Caption:
         return tile
 
     def draw(self, area: Pixels, time: float) -> None:
-        """Draw the caption into the run's part of the picture, in place."""
         blend(area, self.header, left=0, top=0)
         readings = self._readings_tile(time)
         if self.place[0]:
@@ -87,7 +86,6 @@ class Legend:
         self.height = 0 if self.tile is None else self.tile.shape[0] + self.tile.shape[0] % 2
 
     def draw(self, image: Pixels) -> None:
-        """Draw the legend into the picture, in place."""
         if self.tile is not None:
             image[-self.height :] = 255
             blend(image, self.tile, left=0, bottom=0)

@@ -185,7 +185,6 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
 
 
 def _half_sizes(obstacle: Obstacle) -> Array:
-    """Half sizes (3,) of an obstacle along its own axes."""
     radius, half, _ = obstacle.size
     kinds = {"sphere": (radius,) * 3, "cylinder": (radius, radius, half), "capsule": (radius, radius, half + radius)}
     return np.array(kinds.get(obstacle.kind, obstacle.size))

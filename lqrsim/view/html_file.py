@@ -91,7 +91,6 @@ def render_html(
 
 
 def _rows(rollout: Rollout, trial: int | Sequence[int] | None) -> list[Any]:
-    """The rows that are shown."""
     if trial is None:
         states, frames = (np.any(np.isfinite(part).all(axis=2), axis=1) for part in (rollout.states, rollout.frames))
         rows = np.flatnonzero(states & frames).tolist()
@@ -142,7 +141,6 @@ class _Arrays:
 
 
 def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
-    """What all trials share."""
     recorded = overlays.recorded
     run = recorded.rollout
     page: dict[str, Any] = {
@@ -187,7 +185,6 @@ def _of_line(arrays: _Arrays, line: Line) -> dict[str, Any]:
 
 
 def _of_geom(arrays: _Arrays, geom: DrawnGeom) -> dict[str, Any]:
-    """A geom's shape."""
     shape = {"kind": geom.kind, "size": geom.size.tolist(), "colour": geom.colour.tolist(), "moves": geom.moves}
     if geom.triangles is None:
         return shape

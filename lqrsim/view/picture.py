@@ -201,7 +201,6 @@ class PictureOptions:
 
     @property
     def settings(self) -> QualitySettings:
-        """The settings of the quality."""
         return QUALITIES[self.quality]
 
     @property
@@ -265,7 +264,6 @@ class Picture:
 
     @property
     def end(self) -> float:
-        """The end of the last run, in seconds."""
         return max(part.recorded.end for part in self.parts)
 
     @property
@@ -323,7 +321,6 @@ class LivePicture:
         return self._picture.draw(time)
 
     def close(self) -> None:
-        """Free the OpenGL context."""
         self._picture = None
         self._stack.close()
 

@@ -110,7 +110,6 @@ def _strip_panel(rows: int, style: Style, *, wide: bool = False) -> Panel:
 
 
 def _grid(figure: Figure, place: SubplotSpec, count: int, across: int) -> list[Axes]:
-    """Axes of strips, in this many columns."""
     rows = -(-count // across)
     grid = place.subgridspec(rows, across)
     return [figure.add_subplot(grid[number]) for number in range(count)]
@@ -177,7 +176,6 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
 
 
 def _paler(colour: str, white: float) -> str:
-    """A colour with this share of white."""
     red, green, blue = (white + (1 - white) * part for part in to_rgb(colour))
     return to_hex((red, green, blue))
 
@@ -347,7 +345,6 @@ def _drawn_together(solution: Solution) -> list[list[int]]:
 
 
 def _states(strips: list[Axes], together: list[list[int]], solution: Solution) -> None:
-    """The planned states over time, in strips."""
     space, plan = solution.policy.state_coordinates, solution.trajectory
     for axes, drawn in zip(strips, together, strict=True):
         for i in drawn:

@@ -80,7 +80,6 @@ class _Recording:
                 self._log(entity, self.rerun.Transform3D(translation=places[0][i], quaternion=turns[0][i]))
 
     def _shape(self, kind: str, size: Array, colour: npt.ArrayLike, triangles: Triangles | None = None) -> Any:
-        """Rerun's shape for a geom, in the geom's own axes."""
         rerun, colours = self.rerun, [_bytes(colour)]
         solid = {"colors": colours, "fill_mode": "solid"}
         if kind == "plane":

@@ -134,7 +134,6 @@ class Viewer(abc.ABC):
         return self.space.of_world(self.data.mocap_pos[self.model.body_mocapid[self.goal_body]])
 
     def move_goal(self, place: Array) -> None:
-        """Move the goal to a place (2 or 3,)."""
         number = self.model.body_mocapid[self.goal_body]
         self.data.mocap_pos[number], self.data.mocap_quat[number] = self._on_floor(place), (1.0, 0.0, 0.0, 0.0)
 
@@ -176,7 +175,6 @@ class Viewer(abc.ABC):
         self.wrench = wrench
 
     def request_restart(self) -> None:
-        """Start the run again."""
         self._restart = True
 
     def take_wrench(self, dt: float) -> Array:
