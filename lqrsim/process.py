@@ -29,8 +29,6 @@ class _Signals:
 
     Attributes:
       handled: number of signals that were handled.
-      deferring: whether signals have to wait.
-      deferred: number of the signal that waits, 0 for none.
       stopped_by: number of the signal that stopped the process, 0 for none.
       when: time at which that signal was handled, in seconds.
       arrived: time at which the last signal arrived. It is handled later if compiled code runs.
@@ -39,8 +37,6 @@ class _Signals:
     """
 
     handled = 0
-    deferring = False
-    deferred = 0
     stopped_by = 0
     when = -GRACE
     arrived = -GRACE
@@ -108,19 +104,6 @@ def interruptible() -> Iterator[None]:
     finally:
         for number in ours:
             signal.signal(number, _end_at_once)
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """A block that is completed before a signal takes effect."""
-    _Signals.deferring = True
-    try:
-        yield
-    finally:
-        _Signals.deferring = False
-        number, _Signals.deferred = _Signals.deferred, 0
-        if number:
-            _raise_interrupt(number, None)
 
 
 @contextlib.contextmanager
@@ -243,9 +226,6 @@ def _end_at_once(number: int, frame: FrameType | None) -> None:
 
 def _raise_interrupt(number: int, frame: FrameType | None) -> None:
     _Signals.handled += 1
-    if _Signals.deferring:
-        _Signals.deferred = number
-        return
     came = _Signals.arrived if _Signals.arrived > _Signals.when else time.monotonic()
     repeated = came - _Signals.when < GRACE
     if not repeated:

@@ -1,6 +1,6 @@
 """Worker processes for a campaign, on this machine or a dask cluster. If they die or hang, the campaign continues.
 
-On this machine each worker has its own pipe. On a cluster dask starts workers, distributes tasks, and repeats the tasks
+On this machine each worker has its own pipe, and a thread that waits for it. On a cluster dask starts workers, distributes tasks, and repeats the tasks
 of dead workers, up to its `allowed-failures`. Tables come back as bytes, so no folder needs to be shared. This module
 adds four things: a time limit that counts from the moment when a worker begins a task; restarts of workers that hang,
 because `cancel()` does not stop a running task; one task at a time per worker; and at most two queued tasks per worker,
@@ -17,11 +17,10 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Generator, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any
 
 from lqrsim import process
@@ -39,48 +38,59 @@ _context = multiprocessing.get_context("spawn")  # forking a process that has th
 _NAME = "lqrsim worker"
 _RUNS_THE_SCRIPT = 79  # exit code of a worker that, by importing the caller's script, would start the campaign again
 _GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
+_starting = threading.Lock()  # the environment is that of all threads
 _serving = False  # whether this process is a worker that has imported the caller's script
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:
-    """Run the shards in worker processes; yield each shard with its file as it is finished.
+    """Run the shards in worker processes, for each of which a thread waits; yield each shard with its file.
 
     If a process dies, another one runs its shard again. The trials of a shard count as failed if its process dies three
     times, or if it exceeds the time limit.
     """
-    queue, attempts, failed_starts = deque(shards), Counter[Shard](), 0
-    busy: list[_Worker] = []
-    idle: list[_Worker] = []
+    mine, alive, ending = threading.local(), set[_Worker](), threading.Event()  # mine: of this thread
+
+    def run(shard: Shard) -> bytes:
+        died = failed_starts = 0
+        while not ending.is_set():
+            worker, late = getattr(mine, "worker", None) or _Worker(job), False
+            alive.add(worker)
+            if ending.is_set():  # perhaps nobody has seen that it is alive
+                worker.process.kill()
+            try:
+                file = worker.run(shard, time_limit)
+            except TimeoutError:
+                reason = f"took longer than {time_limit if worker.ready else _START_TIMEOUT:g} s, and was stopped"
+                late = worker.ready
+            except (EOFError, OSError):
+                worker.process.join(5.0)
+                reason = f"its worker ended {ATTEMPTS} times, at last with {_exit(worker.process.exitcode)}"
+            else:
+                mine.worker = worker
+                return file
+            mine.worker = None
+            alive.discard(worker)
+            worker.end()
+            if worker.process.exitcode == _RUNS_THE_SCRIPT:
+                raise InputError(f"workers: got a script that each worker runs as it starts, want {_GUARD}")
+            died, failed_starts = died + worker.ready, 0 if worker.ready else failed_starts + 1
+            if failed_starts == ATTEMPTS:
+                raise InputError(f"workers: got processes that do not start ({reason}), want {_GUARD}")
+            if late or died == ATTEMPTS:
+                return job.failed(shard, reason)
+        return b""  # for nobody
+
+    threads = ThreadPoolExecutor(max(workers, 1))
     try:
-        while queue or busy:
-            while queue and len(busy) < workers:
-                worker = idle.pop() if idle else _Worker(job)
-                worker.take(queue.popleft(), time_limit)
-                busy.append(worker)
-            nearest = min(worker.deadline for worker in busy)
-            wait([worker.connection for worker in busy], max(0.0, nearest - time.monotonic()))
-            for worker in list(busy):
-                shard, answer = worker.shard, worker.answer(time_limit)
-                if answer is None:
-                    continue
-                busy.remove(worker)
-                if isinstance(answer, bytes):
-                    idle.append(worker)
-                    yield shard, answer
-                    continue
-                worker.end()
-                attempts[shard] += worker.ready
-                if worker.process.exitcode == _RUNS_THE_SCRIPT:
-                    raise InputError(f"workers: got a script that each worker runs as it starts, want {_GUARD}")
-                failed_starts = 0 if worker.ready else failed_starts + 1
-                if failed_starts == ATTEMPTS:
-                    raise InputError(f"workers: got processes that do not start ({answer}), want {_GUARD}")
-                if worker.late or attempts[shard] == ATTEMPTS:
-                    yield shard, job.failed(shard, answer)
-                else:
-                    queue.appendleft(shard)
+        running = {threads.submit(run, shard): shard for shard in shards}
+        for done in as_completed(running):
+            yield running.pop(done), done.result()
     finally:
-        for worker in [*idle, *busy]:
+        ending.set()
+        for worker in [*alive]:
+            worker.process.kill()  # its thread sees the end of the pipe
+        threads.shutdown(cancel_futures=True)
+        for worker in alive:
             worker.end()
 
 
@@ -95,52 +105,38 @@ def end_if_started_by_import() -> None:
 
 
 class _Worker:
-    """A worker process and the shard that it runs.
+    """A worker process, which runs one shard after the other.
 
-    It sends `STARTED` once it has imported the caller's script, then receives the job and the shard, and sends `READY`
-    when it can begin. The job is not an argument of the process: Python writes arguments to a pipe whose other end it
-    keeps open, and if the process dies before it reads them, the writer waits forever, deaf to Ctrl-C.
+    It says that it has imported the caller's script, then receives the job, says that it can begin, and receives
+    shards. The job is not an argument of the process: Python writes arguments to a pipe whose other end it keeps open,
+    and if the process dies before it reads them, the writer waits forever.
+
+    Attributes:
+      ready: whether it can begin.
     """
 
-    STARTED, READY = "started", "ready"
-
     def __init__(self, job: Job) -> None:
-        self.job = job
+        self.job, self.ready = job, False
         self.connection, theirs = _context.Pipe()
         self.process = _context.Process(target=_serve, args=(theirs,), name=_NAME, daemon=True)
-        with process.uninterrupted(), _worker_environment(), _without_ctrl_c():
+        with _starting, _worker_environment(), _without_ctrl_c():
             self.process.start()
         theirs.close()  # then the end of the process closes the pipe
-        self.ready = self.late = False
-        self.deadline = time.monotonic() + _START_TIMEOUT
 
-    def take(self, shard: Shard, time_limit: float) -> None:
-        self.shard = shard
-        if self.ready:
-            self.deadline = time.monotonic() + time_limit
-            with contextlib.suppress(OSError):  # if it has died, `answer` says so
-                self.connection.send(shard)
+    def run(self, shard: Shard, time_limit: float) -> bytes:
+        """The shard's file. Raises EOFError or OSError if the process dies, and TimeoutError."""
+        if not self.ready:
+            self._hear(_START_TIMEOUT)
+            self.connection.send(self.job)
+            self._hear(_START_TIMEOUT)
+            self.ready = True
+        self.connection.send(shard)
+        return self._hear(time_limit)
 
-    def answer(self, time_limit: float) -> bytes | str | None:
-        """The shard's file; or the reason why there will be no file; or None while the shard is being run."""
-        try:
-            while self.connection.poll():
-                message = self.connection.recv()
-                if message == self.STARTED:
-                    self.connection.send(self.job)
-                    self.connection.send(self.shard)
-                elif message == self.READY:
-                    self.ready = True
-                    self.deadline = time.monotonic() + time_limit  # counts from now on
-                else:
-                    return message
-        except (EOFError, OSError):
-            self.process.join(5.0)
-            return f"its worker ended {ATTEMPTS} times, at last with {_exit(self.process.exitcode)}"
-        if time.monotonic() < self.deadline:
-            return None
-        self.late = self.ready
-        return f"took longer than {time_limit if self.ready else _START_TIMEOUT:g} s, and was stopped"
+    def _hear(self, seconds: float) -> Any:
+        if not self.connection.poll(seconds):
+            raise TimeoutError
+        return self.connection.recv()
 
     def end(self) -> None:
         """Stop the process, even in the middle of a task."""
@@ -155,13 +151,13 @@ def _serve(connection: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the driver handles it
     try:
-        connection.send(_Worker.STARTED)
+        connection.send("started")
         job: Job = connection.recv()
     except (EOFError, OSError):  # the driver has ended
         return
     job.prepare()
     with contextlib.suppress(EOFError, OSError):
-        connection.send(_Worker.READY)
+        connection.send("ready")
         while True:
             connection.send(job.work(connection.recv()))
 
