@@ -282,19 +282,15 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
 @contextlib.contextmanager
 def _silenced() -> Iterator[None]:
     """In this block dask prints no tracebacks; errors that matter are raised."""
-
-    def silent(record: logging.LogRecord) -> bool:
-        return False
-
     known = [one for one in logging.Logger.manager.loggerDict.values() if isinstance(one, logging.Logger)]
     loggers = [one for one in known if one.name.split(".")[0] == "distributed"]
     for logger in loggers:
-        logger.addFilter(silent)
+        logger.disabled = True
     try:
         yield
     finally:
         for logger in loggers:
-            logger.removeFilter(silent)
+            logger.disabled = False
 
 
 def _task(job: Job, shard: Shard) -> bytes:
