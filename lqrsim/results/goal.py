@@ -30,14 +30,6 @@ def scale_of(plan: Array) -> Array:
     return np.maximum(np.ptp(plan, axis=0), 1.0)
 
 
-def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
-    """Distance (..., T+1) of states (..., T+1, n) from the states of a plan (T+1, n), in `tracking_unit`."""
-    if space.position:
-        place = list(space.position)
-        return np.linalg.norm(states[..., place] - plan[..., place], axis=-1)
-    return np.max(np.abs(space.difference(states, plan)) / scale_of(plan), axis=-1)
-
-
 def worst_of(space: Coordinates, off: Array, scale: Array, tolerance: float | None = None) -> str:
     """The state with the largest of the differences (n,), relative to their scale (n,), as text: "elbow -0.1 rad".
 
@@ -79,7 +71,7 @@ def departure(space: Coordinates, states: Array, plan: Array, dt: float) -> str:
 
 
 def tracking_unit(space: Coordinates) -> str:
-    """The unit of `tracking_error`: m, or OF_RANGE for robots without a position."""
+    """The unit of tracking errors: m, or OF_RANGE for robots without a position."""
     return "m" if space.position else OF_RANGE
 
 

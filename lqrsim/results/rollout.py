@@ -13,7 +13,7 @@ from lqrsim.annotations import Bounds, Index, Line, NonNegative, Positive, check
 from lqrsim.errors import Array, InputError, check_symmetric, excerpt, vectors_of
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_error, tracking_unit, worst_of
+from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
 LISTED = 10  # largest number of trials in a summary, as in a notebook
@@ -284,7 +284,11 @@ class Rollout:
     @cached_property
     def tracking_error(self) -> Array:
         """Distance from the plan, (K, T+1), in `tracking_unit`."""
-        return tracking_error(self.state_coordinates, self.states, self.plan.states)
+        space, plan = self.state_coordinates, self.plan.states
+        if space.position:
+            place = list(space.position)
+            return np.linalg.norm(self.states[..., place] - plan[..., place], axis=-1)
+        return np.max(np.abs(space.difference(self.states, plan)) / scale_of(plan), axis=-1)
 
     @property
     def tracking_unit(self) -> str:
