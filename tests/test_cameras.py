@@ -128,7 +128,7 @@ def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
     written = metadata(rollout)
     path = tmp_path / "run.mp4"
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-        written.embed(container)
+        container.metadata["comment"] = written.as_json()
         stream = container.add_stream("libx264", rate=written.rate)
         stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
         for _ in range(written.frames):

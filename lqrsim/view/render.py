@@ -47,7 +47,7 @@ def encoder(
     path.write_bytes(bytes(4096))  # FFmpeg crashes on a disk that is so full that it cannot even write its header
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:
-            metadata.embed(container)
+            container.metadata["comment"] = metadata.as_json()  # before the first frame
         stream = container.add_stream("libx264", rate=rate, options={"preset": preset, "crf": str(crf)})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         # If the file states no colour matrix, players guess one, and not all guess the same.

@@ -4,7 +4,6 @@ import json
 import os
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import av
 import numpy as np
@@ -16,9 +15,6 @@ from lqrsim.results.archive import excerpt_of, sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import record_from, tree_of
 from lqrsim.view.cameras import Camera
-
-if TYPE_CHECKING:
-    from av.container import OutputContainer
 
 FORMAT, VERSION = "lqrsim footage", 1
 
@@ -89,10 +85,6 @@ class VideoMetadata:
     def times(self) -> np.ndarray:
         """Times of the frames in seconds after the start of a run, (frames,)."""
         return np.arange(self.frames) * (self.speed / float(self.rate))
-
-    def embed(self, container: "OutputContainer") -> None:
-        """Write the metadata into a video, before its first frame."""
-        container.metadata["comment"] = self.as_json()
 
 
 def read(path: str | os.PathLike[str]) -> VideoMetadata:
