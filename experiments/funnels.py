@@ -20,7 +20,7 @@ from replan.delay import firm
 from runner import FolderSettings, Result, at_most, between, counting, interval, opening, run, table
 
 import lqrsim as ls
-from lqrsim.stress.levels import find_level, fresh, smallest_test
+from lqrsim.stress.funnels import find_level, fresh, smallest_test
 from lqrsim.stress.statistics import compare, paired_difference
 from lqrsim.stress.statistics import rate as rate_of
 

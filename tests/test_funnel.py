@@ -35,8 +35,7 @@ from lqrsim.disturbances import (
 from lqrsim.errors import InputError
 from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress import funnels
-from lqrsim.stress.funnels import points_of
-from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smallest_test
+from lqrsim.stress.funnels import NEAR, FoundLevel, find_level, lowest_rate, points_of, smallest_test
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.view import plots
 

@@ -16,7 +16,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.smoother import smooth
-from lqrsim.stress.levels import MOST_TRIALS
+from lqrsim.stress.funnels import MOST_TRIALS
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.statistics import rate as rate_of
 
