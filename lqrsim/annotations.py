@@ -97,23 +97,15 @@ def repr_of(self: Any) -> str:
 
 
 class Declared(NamedTuple):
-    """The content of an annotation.
+    """The content of an annotation."""
 
-    Attributes:
-      kinds: the allowed types, as `typing` names them.
-      dtype: type of an array, float64 or int64; None if it is no array.
-      letters: the shape of an array, or the length of something else; empty if not given.
-      longest: characters of a text that is one printable line; None for any text.
-      names: the texts that it may be; empty for any.
-    """
-
-    kinds: tuple[Any, ...]
-    dtype: type[np.generic] | None
-    letters: str
+    kinds: tuple[Any, ...]  # the allowed types, as `typing` names them
+    dtype: type[np.generic] | None  # of an array, float64 or int64; None if it is no array
+    letters: str  # the shape of an array, or the length of something else; empty if not given
     bounds: Bounds | None
-    longest: int | None
-    want: str
-    names: Collection[str]
+    longest: int | None  # characters of a text that is one printable line; None for any text
+    want: str  # the end of messages; empty for the name of the type
+    names: Collection[str]  # the texts that it may be; empty for any
     optional: bool
 
     @property

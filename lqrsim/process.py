@@ -25,23 +25,14 @@ class Unprintable(Exception):
 
 
 class _Signals:
-    """The signals that this process has received.
+    """The signals that this process has received."""
 
-    Attributes:
-      handled: number of signals that were handled.
-      stopped_by: number of the signal that stopped the process, 0 for none.
-      when: time at which that signal was handled, in seconds.
-      arrived: time at which the last signal arrived. It is handled later if compiled code runs.
-      ending: number of the signal with which the process ends, 0 as long as it does not.
-      last_words: text for stderr when the process is stopped.
-    """
-
-    handled = 0
-    stopped_by = 0
-    when = -GRACE
-    arrived = -GRACE
-    ending = 0
-    last_words = ""
+    handled = 0  # number of signals that were handled
+    stopped_by = 0  # number of the signal that stopped the process, 0 for none
+    when = -GRACE  # time at which that signal was handled, in seconds
+    arrived = -GRACE  # time at which the last signal arrived; it is handled later if compiled code runs
+    ending = 0  # number of the signal with which the process ends, 0 as long as it does not
+    last_words = ""  # text for stderr when the process is stopped
 
 
 def handle_signals(last_words: str = "") -> None:

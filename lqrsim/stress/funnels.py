@@ -53,16 +53,11 @@ Runs = Callable[[float, npt.NDArray[np.intp]], npt.NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class LevelTest:
-    """The test that a level has to pass.
-
-    Attributes:
-      trials: number of trials. failures: number of trials that may fail. aim: number that may fail in the pilot. It is
-        smaller, because a level that just passes in the pilot would fail every second test.
-    """
+    """The test that a level has to pass."""
 
     trials: int
-    failures: int
-    aim: int
+    failures: int  # that there may be
+    aim: int  # failures in the pilot; fewer, because a level that just passes there would fail every second test
 
 
 @checked
@@ -98,19 +93,14 @@ def lowest_rate(successes: int, trials: int, confidence: float) -> float:
 
 @dataclass(frozen=True)
 class FoundLevel:
-    """A certified level.
-
-    Attributes:
-      level: 0 if no level passed. trials, successes: the numbers in its test. reason: why the level is 0, or why no
-        larger level was tried; else empty. pilot: the pilot's level. simulated: number of all trials.
-    """
+    """A certified level, 0 if no level passed."""
 
     level: float
-    trials: int
+    trials: int  # of its test
     successes: int
-    reason: str
-    pilot: float
-    simulated: int
+    reason: str  # why the level is 0, or why no larger level was tried; else empty
+    pilot: float  # the pilot's level
+    simulated: int  # number of all trials
 
 
 def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rate: float) -> FoundLevel:

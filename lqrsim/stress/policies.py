@@ -25,17 +25,12 @@ _log = logging.getLogger("lqrsim")
 
 
 class PolicyKind(NamedTuple):
-    """The way in which a policy is made.
-
-    Attributes:
-      designed: whether it is designed for disturbances that the user may choose.
-      per_cell: whether it is designed anew for the disturbances of each cell, at their strength.
-    """
+    """The way in which a policy is made."""
 
     solver: str = "smooth"
     controller: str = "feedback"
-    designed: bool = False
-    per_cell: bool = False
+    designed: bool = False  # for disturbances that the user may choose
+    per_cell: bool = False  # anew for the disturbances of each cell, at their strength
 
 
 POLICY_KINDS = {

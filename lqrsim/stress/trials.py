@@ -94,17 +94,13 @@ class Trials:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Everything that a worker needs for a campaign.
+    """Everything that a worker needs for a campaign."""
 
-    Attributes:
-      campaign: the campaign as in its manifest. digest: the manifest's. solutions: solutions by policy.
-      run: an identifier that differs in every run, even of the same campaign.
-    """
-
-    campaign: Mapping[str, Any]
-    digest: str
-    solutions: Mapping[str, Solution]
+    campaign: Mapping[str, Any]  # as in its manifest
+    digest: str  # of the manifest
+    solutions: Mapping[str, Solution]  # by policy
     batch: int
+    # An identifier that differs in every run, even of the same campaign.
     run: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
 
     @classmethod

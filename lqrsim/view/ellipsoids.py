@@ -19,15 +19,11 @@ APART = 0.8  # distance between neighbours, in half axes
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoids:
-    """Ellipsoids at the knots of a plan, or at some of them: centres (k, d) and covariances (k, d, d).
-
-    Attributes:
-      end: largest half axis in metres that is drawn, if ellipsoids are left out from the first larger one on.
-    """
+    """Ellipsoids at the knots of a plan, or at some of them: centres (k, d) and covariances (k, d, d)."""
 
     centres: Array
     covariances: Array
-    end: float | None = None
+    end: float | None = None  # largest half axis in m, if ellipsoids are left out from the first larger one on
 
     @classmethod
     def predicted(cls, centres: Array, covariances: Array) -> "Ellipsoids":

@@ -64,30 +64,20 @@ class TubeArea(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """What views of a robot show: obstacles about it, tubes, paths, balls, and objects that it moved.
+    """What views of a robot show: obstacles about it, tubes, paths, balls, and objects that it moved."""
 
-    Attributes:
-      title: of each view; where there are two, with its direction.
-      places: (k, 2 or 3), which the views contain.
-      planes: of each view, the axes of the places that it shows.
-      certified: ellipsoids with a thick outline.
-      paths: the plan is last, on top, with marks at its ends.
-      balls: centres (3,) and radii of balls, with their colours.
-      limits: lowest and highest corner; by default around the places.
-    """
-
-    title: str
+    title: str  # of each view; where there are two, with its direction
     space: Coordinates
     world: World
     radius: float
-    places: Array
-    planes: Sequence[tuple[int, int]]
-    paths: Sequence[DrawnPath]
+    places: Array  # (k, 2 or 3), which the views contain
+    planes: Sequence[tuple[int, int]]  # of each view, the axes of the places that it shows
+    paths: Sequence[DrawnPath]  # the plan is last, on top, with marks at its ends
     tubes: Sequence[TubeArea] = ()
-    certified: Ellipsoids | None = None
+    certified: Ellipsoids | None = None  # with a thick outline
     moved: Sequence["MovedObject"] = ()
-    balls: Sequence[tuple[Array, float, str]] = ()
-    limits: tuple[Array, Array] | None = None
+    balls: Sequence[tuple[Array, float, str]] = ()  # centres (3,) and radii, with their colours
+    limits: tuple[Array, Array] | None = None  # lowest and highest corner; by default around the places
 
     @property
     def corners(self) -> tuple[Array, Array]:

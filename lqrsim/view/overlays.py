@@ -39,31 +39,21 @@ ARROW = 4.0  # length of the largest force's arrow, in radii of the robot: longe
 
 @dataclass(frozen=True, eq=False)
 class Drawable:
-    """Something in the world, in metres and seconds.
+    """Something in the world, in metres and seconds."""
 
-    Attributes:
-      name: of the overlay, of a part of it, or of an obstacle that moves.
-      label: in the legend; none if empty.
-    """
-
-    name: str
+    name: str  # of the overlay, of a part of it, or of an obstacle that moves
     rgba: tuple[float, float, float, float]
-    label: str
+    label: str  # in the legend; none if empty
 
 
 @dataclass(frozen=True, eq=False)
 class Line(Drawable):
-    """A line through points (k, 3), with half its width and half its thickness as profile.
-
-    Attributes:
-      times: (k,) at which it gets to its points; None for a line that is always whole.
-      colours: (k-1, 4) of its segments, by the map of the tracking error; None if all have `rgba`.
-    """
+    """A line through points (k, 3), with half its width and half its thickness as profile."""
 
     points: Array
     profile: tuple[float, float]
-    times: Array | None = None
-    colours: Array | None = None
+    times: Array | None = None  # (k,) at which it gets to its points; None for a line that is always whole
+    colours: Array | None = None  # (k-1, 4) of its segments, by the map of the tracking error; None if all have `rgba`
 
     def until(self, time: float) -> tuple[Array, Array]:
         """Its points (j, 3) up to a time, and the colours (j-1, 4) of the segments between them."""

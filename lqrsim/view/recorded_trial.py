@@ -24,22 +24,15 @@ Triangles = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]  # vertices (v
 
 @dataclass(frozen=True, eq=False)
 class DrawnGeom:
-    """A geom as pictures outside of MuJoCo draw it, in its own axes, with its number in the model.
-
-    Attributes:
-      kind: in the words of the MJCF, such as "capsule".
-      size: (3,) as in the MJCF; a plane without an end is twice as wide as the scene.
-      colour: (4,); of a texture, the mean.
-      triangles: of a mesh, a height field or a signed distance function.
-    """
+    """A geom as pictures outside of MuJoCo draw it, in its own axes, with its number in the model."""
 
     number: int
     name: str
-    kind: str
-    size: Array
-    colour: Array
+    kind: str  # in the words of the MJCF, such as "capsule"
+    size: Array  # (3,) as in the MJCF; a plane without an end is twice as wide as the scene
+    colour: Array  # (4,); of a texture, the mean
     moves: bool
-    triangles: Triangles | None
+    triangles: Triangles | None  # of a mesh, a height field or a signed distance function
 
 
 class RecordedTrial:
