@@ -47,24 +47,17 @@ Bridgeable = Plan | AffinePolicy | OutputFeedbackPolicy | Controller | LiveRepla
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bridged:
-    """The record of a controller's run, up to the safe command.
-
-    Attributes:
-      reason: one line that says why not; empty if all were run.
-      commands: (T, m), as published.
-      refused: number of messages that were not used because of their content, and the last reason.
-      response: (T,) time in s until each period's command was published, from the beginning of the period; in lockstep,
-        from the arrival of its state.
-      late: (T,) delay in s of each period's beginning behind the clock; zeros in lockstep.
-    """
+    """The record of a controller's run of T periods, up to the safe command."""
 
     completed: bool
-    reason: str
-    commands: Array
-    held: int
-    refused: tuple[int, str]
+    reason: str  # why not all periods were run, in one line; empty if all were
+    commands: Array  # (T, m), as published
+    held: int  # periods that had to use the state of an earlier one
+    refused: tuple[int, str]  # number of messages not used because of their content, and the last reason
+    # (T,) time in s until each command was published, from the beginning of its period; in lockstep, from the arrival of
+    # its state.
     response: Array
-    late: Array
+    late: Array  # (T,) delay in s of each period's beginning behind the clock; zeros in lockstep
 
     def summary(self) -> str:
         lines = [f"{len(self.commands)} periods, {self.held} with the state held"]

@@ -63,23 +63,14 @@ class BallRecord:
 @checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingObstacles:
-    """The obstacles of a run that MuJoCo does not have, for pictures.
-
-    O obstacles, with axes and sizes as in an `Obstacle`.
-
-    Attributes:
-      positions: (O, 3) at the beginning of the run, in metres.
-      rotations: (O, 3, 3) with their axes as columns.
-      sizes: (O, 3) in metres.
-      velocities: (O, 3) in m/s.
-    """
+    """The O obstacles of a run that MuJoCo does not have, with axes and sizes as in an `Obstacle`, for pictures."""
 
     names: Annotated[tuple[Line, ...], "O"]
     kinds: Annotated[tuple[Line, ...], "O"]
-    positions: Annotated[Array, "O 3", Bounds()]
-    rotations: Annotated[Array, "O 3 3", Bounds()]
+    positions: Annotated[Array, "O 3", Bounds()]  # at the beginning of the run, in metres
+    rotations: Annotated[Array, "O 3 3", Bounds()]  # with their axes as columns
     sizes: Annotated[Array, "O 3"]
-    velocities: Annotated[Array, "O 3", Bounds()]
+    velocities: Annotated[Array, "O 3", Bounds()]  # in m/s
 
     __repr__ = repr_of
 

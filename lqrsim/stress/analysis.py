@@ -50,19 +50,14 @@ def _checked_table(table: Table) -> Table:
 
 @dataclass(frozen=True)
 class Success:
-    """The success rate of a cell.
-
-    Attributes:
-      exact: the rate with Clopper and Pearson's interval, for claims. band: the rate with Wilson's interval, for plots.
-      alike: whether all trials are the same run, because nothing was drawn; the rate is then exact.
-    """
+    """The success rate of a cell."""
 
     cell: Cell
     reached: int
     trials: int
-    exact: Estimate
-    band: Estimate
-    alike: bool
+    exact: Estimate  # the rate with Clopper and Pearson's interval, for claims
+    band: Estimate  # the rate with Wilson's interval, for plots
+    alike: bool  # whether all trials are the same run, because nothing was drawn; the rate is then exact
 
 
 @checked
@@ -102,12 +97,7 @@ def degradation(table: Table, policy: str, sweep: str) -> list[Success]:
 
 @dataclass(frozen=True)
 class BreakingPoint:
-    """The strength at which a policy breaks.
-
-    Attributes:
-      strength: the smallest tried strength at which the interval of the success rate lies below the limit; None without
-        such a strength.
-    """
+    """The smallest tried strength at which the interval of the success rate lies below the limit, if there is one."""
 
     policy: str
     sweep: str
@@ -130,28 +120,18 @@ def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of two cells: on the same trials, or on trials of their own.
-
-    Attributes:
-      success: success rate of the first minus that of the second, which is failure rate of the second minus that of the
-        first. rms: the difference of the mean tracking errors, over the `both` trials in which both succeeded; None if
-        there are fewer than two, or trials of their own.
-      only_first, only_second: number of trials in which only one of them succeeded; None for trials of their own.
-      p_value: of the exact test that their success rates are equal, McNemar's on the same trials and else Fisher's; NaN
-        if nothing was drawn in either.
-      adjusted: p-value, adjusted for the number of comparisons.
-    """
+    """A comparison of two cells: on the same trials, or on trials of their own, where None is of pairs."""
 
     first: Cell
     second: Cell
     rates: tuple[Success, Success]
-    success: Estimate
-    rms: Estimate | None
-    both: int
-    only_first: int | None
+    success: Estimate  # success rate of the first minus that of the second; failure rates the other way round
+    rms: Estimate | None  # difference of the mean tracking errors, over `both`; None if there are fewer than two
+    both: int  # trials in which both succeeded
+    only_first: int | None  # trials in which only the first succeeded
     only_second: int | None
-    p_value: float
-    adjusted: float
+    p_value: float  # that success rates are equal: McNemar's exact test, or Fisher's; NaN if nothing was drawn
+    adjusted: float  # p-value, adjusted for the number of comparisons
 
 
 def comparisons(table: Table) -> list[Comparison]:

@@ -38,25 +38,18 @@ GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of
 
 @dataclass(frozen=True, eq=False)
 class DesignPoint:
-    """The nearest failure that was found.
+    """The nearest failure that was found."""
 
-    Attributes:
-      numbers: z, (d,). distance: |z|, the reliability index. score: score of z, positive.
-      first_order_probability: Phi(-|z|), FORM's estimate of the probability of failure.
-      history: |z| after each round, the start first. simulations: number of computed scores.
-      remaining: fraction of |z| that could still be gained, by the noise of the gradient, if the failures lie beyond a
-        plane; NaN without a gradient. converged: whether this is less than the tolerance, and the last rounds did not
-        come closer.
-    """
-
-    numbers: Array
-    distance: float
-    score: float
-    first_order_probability: float
-    history: Array
-    simulations: int
+    numbers: Array  # z, (d,)
+    distance: float  # |z|, the reliability index
+    score: float  # of z, positive
+    first_order_probability: float  # Phi(-|z|), FORM's estimate of the probability of failure
+    history: Array  # |z| after each round, the start first
+    simulations: int  # number of computed scores
+    # Fraction of |z| that could still be gained, by the noise of the gradient, if the failures lie beyond a plane; NaN
+    # without a gradient.
     remaining: float
-    converged: bool
+    converged: bool  # whether this is less than the tolerance, and the last rounds did not come closer
 
 
 @checked

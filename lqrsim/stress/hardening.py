@@ -55,22 +55,16 @@ REMEDY = "more range of the controls, less lag, or other tolerances may help"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HardeningRound:
-    """A plan, and how its runs fail.
-
-    Attributes:
-      rare: its failures; None if none was found.
-      unfailing: number of independent trials that were run if none was found; none of them failed.
-      hit: fraction of the failing runs that return to the plan, but hit an obstacle before, by the obstacle's name.
-      strays: fraction of the failing runs that leave the plan for good: their simulation diverges, or they end farther
-        from it than six standard deviations of the position, where these are largest.
-    """
+    """A plan, and how its runs fail."""
 
     solution: Solution
     cost: float
-    rare: RareFailures | None
-    hit: dict[str, float]
+    rare: RareFailures | None  # None if no failure was found
+    hit: dict[str, float]  # fraction of the failing runs that hit an obstacle and return to the plan, by its name
+    # Fraction of the failing runs that leave the plan for good: their simulation diverges, or they end farther from it
+    # than six standard deviations of the position, where these are largest.
     strays: float
-    unfailing: int = 0
+    unfailing: int = 0  # independent trials that were run if no failure was found; none of them failed
 
     @property
     def probability(self) -> Estimate:

@@ -60,25 +60,18 @@ class NoFailure(InputError):
 
 @dataclass(frozen=True, eq=False)
 class SplittingResult:
-    """An estimate of the probability of failure.
+    """An estimate of the probability of failure."""
 
-    Attributes:
-      probability: the mean of the repetitions, with its interval; see the top of this file. If there is only one level,
-        the repetitions are plain trials, and the interval is Clopper and Pearson's exact interval.
-      standard_error: standard error of the mean. repetitions: (R,), independent unbiased estimates.
-      levels: levels of the score, the last one 0. step_sizes: b of the moves at each level but the last.
-      simulations: number of computed scores, including the pilot run.
-      failures: (k, d) vectors that fail, from all repetitions, in their own distribution. scores: (k,) scores of these.
-    """
-
+    # The mean of the repetitions, with its interval; see the top of this file. If there is only one level, the
+    # repetitions are plain trials, and the interval is Clopper and Pearson's exact interval.
     probability: Estimate
-    standard_error: float
-    repetitions: Array
-    levels: Array
-    step_sizes: Array
-    simulations: int
-    failures: Array
-    scores: Array
+    standard_error: float  # of the mean
+    repetitions: Array  # (R,), independent unbiased estimates
+    levels: Array  # of the score, the last one 0
+    step_sizes: Array  # b of the moves at each level but the last
+    simulations: int  # number of computed scores, including the pilot run
+    failures: Array  # (k, d) vectors that fail, from all repetitions, in their own distribution
+    scores: Array  # (k,), of these
 
     @property
     def plain_trials(self) -> float:

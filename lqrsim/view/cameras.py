@@ -26,19 +26,13 @@ NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic vie
 @checked
 @dataclass(frozen=True)
 class Camera:
-    """An orthographic view of the world. Pixels are (column, row) from the upper left corner, centres at halves.
-
-    Attributes:
-      position: in metres; the line from here along `forward` meets the middle of the picture.
-      forward, up: orthogonal unit vectors.
-      height: of the picture, in metres of the world.
-    """
+    """An orthographic view of the world. Pixels are (column, row) from the upper left corner, centres at halves."""
 
     name: Line
-    position: Vector
-    forward: Vector
+    position: Vector  # in metres; the line from here along `forward` meets the middle of the picture
+    forward: Vector  # a unit vector, as `up`, to which it is orthogonal
     up: Vector
-    height: Positive
+    height: Positive  # of the picture, in metres of the world
 
     def __post_init__(self) -> None:
         directions = np.array([self.forward, self.up])

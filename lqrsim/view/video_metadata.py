@@ -39,17 +39,11 @@ class Pane:
 @checked
 @dataclass(frozen=True)
 class VideoMetadata:
-    """The content of a video. Frame k shows a run `k / rate * speed` seconds after its start.
+    """The content of a video. Frame k shows a run `k / rate * speed` seconds after its start."""
 
-    Attributes:
-      runs: digests of the rollouts.
-      markers: radius in metres of each robot's mark in panes with a camera; see `geoms.py`.
-      rate: frames per second, `frames` in all.
-    """
-
-    runs: tuple[Line, ...]
-    markers: tuple[Positive, ...]
-    rate: Fraction
+    runs: tuple[Line, ...]  # digests of the rollouts
+    markers: tuple[Positive, ...]  # radius in metres of each robot's mark in panes with a camera; see `geoms.py`
+    rate: Fraction  # frames per second
     speed: Positive
     frames: Count
     panes: tuple[Pane, ...]
