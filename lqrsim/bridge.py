@@ -54,8 +54,8 @@ class Bridged:
     commands: Array  # (T, m), as published
     held: int  # periods that had to use the state of an earlier one
     refused: tuple[int, str]  # number of messages not used because of their content, and the last reason
-    # (T,) time in s until each command was published, from the beginning of its period; in lockstep, from the arrival of
-    # its state.
+    # (T,) time in s until each command was published, from the beginning of its period; in lockstep, from the arrival
+    # of its state.
     response: Array
     late: Array  # (T,) delay in s of each period's beginning behind the clock; zeros in lockstep
 

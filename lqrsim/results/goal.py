@@ -77,18 +77,10 @@ def tracking_unit(space: Coordinates) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The goal of a run, or the end of its plan if the final cost names no goal.
-
-    Args:
-      goal: (n,), NaN in the states that do not count; None without a goal.
-
-    Attributes:
-      state: (n,), the goal or the end of the plan; NaN in the states that do not count.
-      name: "goal" or "plan's end".
-    """
+    """The goal of a run, or the end of its plan if the final cost names no goal."""
 
     space: Coordinates
-    goal: Array | None
+    goal: Array | None  # (n,), NaN in the states that do not count
     plan: Array
 
     def __post_init__(self) -> None:
@@ -103,6 +95,7 @@ class Target:
 
     @property
     def state(self) -> Array:
+        """(n,), the goal or the end of the plan; NaN in the states that do not count."""
         return self.plan[-1] if self.goal is None else self.goal
 
     @property

@@ -23,15 +23,11 @@ TWIST = 1e-6  # m, the largest distance of rotors from the corners of a square
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The body axes of `Quadrotor` relative to the simulator's body axes.
+    """The body axes of `Quadrotor` relative to the simulator's body axes."""
 
-    Attributes:
-      turn: angle from their x axis to ours, in rad. order: (4,) their number of each of our rotors. arm: length in m.
-    """
-
-    turn: float
-    order: npt.NDArray[np.intp]
-    arm: float
+    turn: float  # angle from their x axis to ours, in rad
+    order: npt.NDArray[np.intp]  # (4,) their number of each of our rotors
+    arm: float  # length in m
 
     @classmethod
     def of(cls, name: str, places: Array, turning: Array) -> "Frame":

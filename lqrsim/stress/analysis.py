@@ -120,7 +120,7 @@ def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of two cells: on the same trials, or on trials of their own, where None is of pairs."""
+    """A comparison of two cells on the same trials; or on trials of their own, with None for what is of pairs."""
 
     first: Cell
     second: Cell

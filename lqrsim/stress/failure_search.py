@@ -197,16 +197,11 @@ class ReliabilityProblem(Study):
 
 @dataclass(frozen=True, eq=False)
 class RareFailures:
-    """The probability that a policy fails, and typical failures.
-
-    Attributes:
-      problem: the ReliabilityProblem. options: `seed`, `particles`, `repetitions` and `keep`.
-      splitting: the levels, the estimate of each repetition, and all failures that were found.
-    """
+    """The probability that a policy fails, and typical failures."""
 
     problem: ReliabilityProblem
-    splitting: SplittingResult
-    options: Mapping[str, Any]
+    splitting: SplittingResult  # with the levels, the estimate of each repetition, and all failures that were found
+    options: Mapping[str, Any]  # `seed`, `particles`, `repetitions` and `keep`
 
     @property
     def probability(self) -> Estimate:
@@ -282,19 +277,12 @@ class RareFailures:
 
 @dataclass(frozen=True, eq=False)
 class Recheck:
-    """The repeated measurement of a certificate.
-
-    Attributes:
-      measured: the RareFailures with the same seed.
-      differences: a line for each difference of the two; empty if there is none.
-      changed: the reason why the bits may differ, so that only the intervals were compared: another seed, or changed
-        versions; else empty.
-    """
+    """The repeated measurement of a certificate."""
 
     certificate: FailureCertificate
     measured: RareFailures
-    differences: tuple[str, ...]
-    changed: str
+    differences: tuple[str, ...]  # a line for each difference of the two
+    changed: str  # why the bits may differ, so that intervals were compared: another seed, changed versions; else empty
 
     def summary(self) -> str:
         """Lines that describe the repeated measurement and the comparison."""
@@ -370,23 +358,15 @@ def certify(
 
 @dataclass(frozen=True, eq=False)
 class SmallestFailure:
-    """The failure nearest to the undisturbed trial, and the contribution of each disturbance.
-
-    Attributes:
-      problem: the ReliabilityProblem. options: `seed`, `rounds` and `particles`.
-      point: the random numbers of the failure, their distance in standard deviations, and whether the search converged.
-      simulations: number of trials, including the splitting before the search.
-      disturbances: descriptions. shares: the fraction of each in the squared distance.
-      largest: the largest disturbances of the trial in physical units.
-    """
+    """The failure nearest to the undisturbed trial, and the contribution of each disturbance."""
 
     problem: ReliabilityProblem
     point: DesignPoint
-    simulations: int
-    disturbances: tuple[str, ...]
-    shares: tuple[float, ...]
-    largest: tuple[LargestEffect, ...]
-    options: Mapping[str, int]
+    simulations: int  # number of trials, including the splitting before the search
+    disturbances: tuple[str, ...]  # in words
+    shares: tuple[float, ...]  # the fraction of each in the squared distance
+    largest: tuple[LargestEffect, ...]  # disturbances of the trial in physical units
+    options: Mapping[str, int]  # `seed`, `rounds` and `particles`
 
     @property
     def stopped(self) -> str:

@@ -85,22 +85,16 @@ class HardeningRound:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HardenedPlan:
-    """A plan with its measured probability of failure, and the plans before it.
-
-    Attributes:
-      problem: the ReliabilityProblem. chance: the requested probability. options: `seed`, `particles`, `repetitions`
-        and `rounds`.
-      rounds: a HardeningRound for each plan. chosen: number of the one that is the result, from 0. If it is safe
-        enough, its failures were measured again with fresh random numbers.
-      reason: why there is no success, and what may help; empty if there is.
-    """
+    """A plan with its measured probability of failure, and the plans before it."""
 
     problem: ReliabilityProblem
-    chance: float
-    options: dict[str, int]
-    rounds: tuple[HardeningRound, ...]
+    chance: float  # the requested probability
+    options: dict[str, int]  # `seed`, `particles`, `repetitions` and `rounds`
+    rounds: tuple[HardeningRound, ...]  # one for each plan
+    # The number of the plan that is the result. If it is safe enough, its failures were measured again with fresh random
+    # numbers.
     chosen: int
-    reason: str
+    reason: str  # why there is no success, and what may help; empty if there is
 
     @property
     def solution(self) -> Solution:

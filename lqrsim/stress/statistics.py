@@ -45,15 +45,11 @@ def rate(
 
 @dataclass(frozen=True)
 class Pairs:
-    """A comparison of two policies on the same trials, with the exact McNemar test.
-
-    Attributes:
-      p_value: probability of a split that is at least as uneven, if both policies were equally good.
-    """
+    """A comparison of two policies on the same trials, with the exact McNemar test."""
 
     only_first: int
     only_second: int
-    p_value: float
+    p_value: float  # of a split that is at least as uneven, if both policies were equally good
 
 
 def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:

@@ -102,18 +102,13 @@ VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 @checked
 @dataclass(frozen=True)
 class Criterion:
-    """One test of a verification.
-
-    Attributes:
-      passed: None if it could not be checked.
-      detail: the measured value, and the required value.
-    """
+    """One test of a verification."""
 
     __test__ = False  # pytest would collect it
 
     name: Line
-    passed: bool | None
-    detail: Line
+    passed: bool | None  # None if it could not be checked
+    detail: Line  # the measured value, and the required value
 
 
 @checked
