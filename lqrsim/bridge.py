@@ -287,12 +287,7 @@ def _turns_about(states: Coordinates, names: Sequence[str]) -> str | None:
 
 
 class _Inlet:
-    """The newest state from the topics.
-
-    Attributes:
-      state: (n,); entries that the controller does not measure are 0.
-      refused: as in `Bridged`.
-    """
+    """The newest state (n,) from the topics, 0 for what the controller does not measure; `refused` as in `Bridged`."""
 
     def __init__(
         self, node: "_Node", topics: Mapping[str, str], states: Coordinates, needed: tuple[str, ...],

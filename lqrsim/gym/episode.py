@@ -44,11 +44,7 @@ RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
 class Task:
-    """The task of an environment. It takes the arguments of `Environment`.
-
-    Attributes:
-      scenario, plant: robot and problem of the episodes. low, high: limits of the controls, (m,) each.
-    """
+    """The task of an environment. It takes the arguments of `Environment`."""
 
     _prefix = ""
 
@@ -215,9 +211,7 @@ class Resettable:
 class Episode:
     """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
 
-    Attributes:
-      seed, first: the episodes are the trials `first` to `first + K - 1` of this seed.
-      ended: (K,) whether each episode has ended. outcomes: (K,) outcome of each episode; empty while it is running.
+    The episodes are the trials `first` to `first + K - 1` of `seed`.
     """
 
     def __init__(
@@ -235,7 +229,7 @@ class Episode:
         self._costs, self._plan = task.costs, self._loop.trajectory
         self._loop.begin()
         self.ended = np.zeros(count, dtype=bool)
-        self.outcomes = np.full(count, "", dtype=object)
+        self.outcomes = np.full(count, "", dtype=object)  # empty while an episode is running
         self._last, self._ended_at = self._observe(), np.zeros((2, count), dtype=bool)
 
     @property

@@ -91,8 +91,8 @@ class HardenedPlan:
     chance: float  # the requested probability
     options: dict[str, int]  # `seed`, `particles`, `repetitions` and `rounds`
     rounds: tuple[HardeningRound, ...]  # one for each plan
-    # The number of the plan that is the result. If it is safe enough, its failures were measured again with fresh random
-    # numbers.
+    # The number of the plan that is the result. If it is safe enough, its failures were measured again with fresh
+    # random numbers.
     chosen: int
     reason: str  # why there is no success, and what may help; empty if there is
 

@@ -142,12 +142,7 @@ def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 class Overlays:
-    """The overlays of one trial that have something to draw.
-
-    Attributes:
-      drawables: in the order of the legend.
-      membership: (T+1) whether the run is in the funnel at each step, as text; None without the overlay.
-    """
+    """The overlays of one trial that have something to draw."""
 
     _prefix = ""
 
@@ -163,10 +158,10 @@ class Overlays:
         segments: int = SEGMENTS,
     ) -> None:
         self.recorded, self.scale = recorded, scale
-        self.membership: tuple[str, ...] | None = None
+        self.membership: tuple[str, ...] | None = None  # in the funnel, for each of T+1 steps as text
         self._lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
         self._funnel = None if "funnel" not in show else self._checked(funnel)
-        self.drawables = [*self._draw(show, solution, segments), *self._moving()]
+        self.drawables = [*self._draw(show, solution, segments), *self._moving()]  # in the order of the legend
 
     def readings(self, time: float, speed: float = 1.0) -> list[str]:
         """Time, error, clearance and force at a time, and whether the run is in the funnel or has ended."""

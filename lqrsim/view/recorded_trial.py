@@ -36,17 +36,7 @@ class DrawnGeom:
 
 
 class RecordedTrial:
-    """A trial. A diverged trial stands still from its last finite state on.
-
-    Attributes:
-      robot: number of the robot's body in the model.
-      planar: whether the robot is seen from above, with its overlays on the floor.
-      floor: height of the ground below the robot in the first frame, in metres.
-      size: radius in metres of what stands for the robot at its position; see `drawn_size`.
-      end: of the plan, in seconds.
-      times: (k,) of the finite states, with `states`, `measured`, `error` and `clearance`.
-      force: (T, 3) in N, averaged over FORCE_WINDOW.
-    """
+    """A trial. A diverged trial stands still from its last finite state on."""
 
     def __init__(self, rollout: Rollout, trial: int) -> None:
         """Raises InputError if there is no such trial, or it cannot be drawn."""
@@ -57,19 +47,20 @@ class RecordedTrial:
         if not (whole.any() and alive.any()):
             raise InputError(f"rollout: got trial {trial} without a finite state, want one that can be drawn")
         self.frame_times, self.frames = rollout.frame_times[whole], rollout.frames[trial][whole]
+        # Of the k finite states, as what follows.
         self.times, self.states = rollout.times[alive], rollout.states[trial, alive]
         self.measured = rollout.measured[trial, alive]
         self.error, self.clearance = rollout.tracking_error[trial, alive], rollout.clearance[trial, alive]
         window = max(round(FORCE_WINDOW / rollout.plan.dt), 1)
         total = np.cumsum(np.vstack([np.zeros((window, 3)), np.nan_to_num(rollout.forces[trial])]), axis=0)
-        self.force = (total[window:] - total[:-window]) / window  # means until the end of each period
-        self.end = float(rollout.times[-1])
-        self.planar = rollout.state_coordinates.from_above
+        self.force = (total[window:] - total[:-window]) / window  # (T, 3) in N, means until the end of each period
+        self.end = float(rollout.times[-1])  # of the plan, in seconds
+        self.planar = rollout.state_coordinates.from_above  # the overlays are then on the floor
         self.robot = robot_body(self.model, rollout.body)
         self.size = drawn_size(self.model, rollout, self.robot)
         data = mujoco.MjData(self.model)
         self.pose(data, 0.0)
-        self.floor = floor_below(self.model, data, self.robot)
+        self.floor = floor_below(self.model, data, self.robot)  # in the first frame
 
     @property
     def name(self) -> str:

@@ -42,11 +42,7 @@ GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still
 
 
 class MovableGoal:
-    """The goal position of a problem's final cost, which can be moved. There must be exactly one.
-
-    Attributes:
-      place: the goal in the problem, (2 or 3,).
-    """
+    """The goal position of a problem's final cost, which can be moved. There must be exactly one."""
 
     def __init__(self, problem: Problem) -> None:
         space = problem.dynamics.state_coordinates
@@ -62,7 +58,7 @@ class MovableGoal:
         if len(of_position) != 1:
             raise InputError(f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one")
         ((self._drawing, self._reference),) = of_position
-        self.place = self._reference.about[self._position]
+        self.place = self._reference.about[self._position]  # (2 or 3,)
 
     def cost_at(self, place: Array) -> Cost:
         """The final cost with its goal at another place (2 or 3,)."""
