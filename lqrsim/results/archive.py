@@ -129,12 +129,7 @@ def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str,
 
 
 class Archive:
-    """A file that is open for reading.
-
-    Attributes:
-      meta: the object of the JSON text, unchecked.
-      headers: headers of each array; the arrays have not been read yet.
-    """
+    """A file that is open for reading, of which the arrays have not been read yet."""
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
         self._archive = archive
@@ -153,7 +148,7 @@ class Archive:
         if (total := sum(member.file_size for member in self._members.values())) > _limit(size):
             raise InputError(f"size: got {total:,} bytes, want at most {_limit(size):,} in a file of {size:,}")
         self.headers = {name: self._header(name) for name in self._members if name != META}
-        self.meta = self._text()
+        self.meta = self._text()  # unchecked
 
     def arrays(self) -> Arrays:
         """All arrays. Raises InputError unless the hash of the content is the hash in the file."""

@@ -65,11 +65,7 @@ def _number(value: float) -> str:
 def of_table(
     heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], picture: str = "", *, head: bool = True
 ) -> str:
-    """A heading, remarks, and a table next to a picture.
-
-    Args:
-      head: whether the first row names the columns; otherwise the first column names the rows.
-    """
+    """A heading, remarks, and a table next to a picture; `head`: whether the first row names the columns."""
     lines = "".join(f"<div>{escape(remark)}</div>" for remark in remarks)
     table = ""
     for i, row in enumerate(rows):

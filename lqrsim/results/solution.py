@@ -61,11 +61,7 @@ class Solution(Plan):
 
     @classmethod
     def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
-        """A solution without checks, for solvers, whose parts fit. Some parts are made when they are first read.
-
-        Args:
-          later: name -> function that makes it, for parts without a default.
-        """
+        """A solution without checks, for solvers, whose parts fit; `later` makes parts when they are first read."""
         solution = object.__new__(cls)
         vars(solution).update(parts, _later=later)
         return solution

@@ -154,11 +154,8 @@ def _about(shard: Shard, campaign: str) -> dict[str, Any]:
 
 
 def _texts(file: pq.ParquetFile, name: str, size: int) -> npt.NDArray[np.str_]:
-    """A column of texts, in parts: a text that rows have in common stands in the file once, and is unpacked for each.
-
-    Args:
-      size: bytes of the column in the file.
-    """
+    # In parts, of a column of `size` bytes: a text that rows have in common stands in the file once, and is unpacked
+    # for each.
     found = list[str]()
     for part in file.iter_batches(max(_AT_ONCE // (_SNAPPY * size + 1), 1), columns=[name], use_threads=False):
         texts = part.column(0).to_pylist()

@@ -202,16 +202,12 @@ class CountedScore:
 
 @dataclass(frozen=True)
 class _Splitting:
-    """What the pilot run and the repetitions do with vectors (k, d) and their scores (k,).
-
-    Attributes:
-      particles: N. moves: number of moves of each particle at a level.
-    """
+    """What the pilot run and the repetitions do with vectors (k, d) and their scores (k,)."""
 
     score: Score
     size: int
-    particles: int
-    moves: int
+    particles: int  # N
+    moves: int  # of each particle at a level
 
     def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
         """N vectors with their scores."""

@@ -307,11 +307,7 @@ def marker_centre(image: npt.NDArray[np.uint8], radius: float) -> Array:
 
 
 def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) -> tuple[Array, Array]:
-    """Positions (N, d) that best fit measurements (N, views, 2) of N frames, and the disagreement of the views, (N,).
-
-    Args:
-      plane: the axes of the positions: "xyz", or the two axes of a planar robot.
-    """
+    """Positions (N, d) along these axes that best fit measurements (N, views, 2), and the views' disagreement, (N,)."""
     size, columns = len(plane), ["xyz".index(axis) for axis in plane]
     axes = np.vstack([view.axes for view in views])[:, columns] if views else np.zeros((0, size))
     if np.linalg.matrix_rank(axes) < size:

@@ -65,11 +65,7 @@ class Camera:
 
 
 def top(rollout: Rollout, aspect: float = 4 / 3, *, around: Array | None = None) -> Camera:
-    """A camera above that shows the plan and all trials with a margin, in a picture of this aspect ratio.
-
-    Args:
-      around: corners (k, 3) of what is shown as well, in metres.
-    """
+    """A camera above that shows the plan and all trials with a margin, and points (k, 3) `around` them."""
     low, high = _bounds(rollout, around)
     right = _right(high - low, aspect)
     return _camera("top", low, high, right, np.cross([0.0, 0.0, 1.0], right), aspect)

@@ -147,11 +147,7 @@ def bounds(places: Array, world: World, margin: float | Array = 0.0) -> tuple[Ar
 
 
 def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: float, *, plane: str = "xy") -> None:
-    """Draw obstacles between two corners (2,), and in a paler colour the places closer to them than the robot's radius.
-
-    Args:
-      flat: the world in the plane of the robot.
-    """
+    """Draw obstacles between two corners (2,), and in a paler colour the places closer than the robot's radius."""
     _begin_view(axes, low, high, plane)
     if not flat.obstacles:
         return

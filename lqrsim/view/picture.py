@@ -74,8 +74,7 @@ class SceneRenderer:
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
         """The picture (height, width, 3) at `time`, with the robot also at earlier times; the next call overwrites it.
 
-        Args:
-          fade: largest change of an opacity since the previous picture.
+        No opacity changes by more than `fade` from the previous picture.
         """
         model, data, scene = self.model, self.data, self.scene
         self.recorded.pose(data, time)
@@ -273,11 +272,7 @@ class Picture:
         return tuple(sizes[id(run)] for run in self.runs)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
-        """The picture (height, width, 3) at `time`, with the robot also at earlier times.
-
-        Args:
-          fade: largest change of an opacity since the previous picture.
-        """
+        """The picture (height, width, 3) at `time`, with the robot also at earlier times."""
         earlier = list(earlier)
         image = np.empty((self.size[1], self.size[0], 3), dtype=np.uint8)
         for part in self.parts:
@@ -309,11 +304,7 @@ class LivePicture:
         self._picture: Picture | None = None
 
     def draw(self, so_far: Callable[[], Rollout], frame: Array, time: float) -> Pixels:
-        """The picture (height, width, 3) of MuJoCo's qpos `frame` (nq,).
-
-        Args:
-          so_far: returns the run so far; called when the picture is opened.
-        """
+        """The picture (height, width, 3) of MuJoCo's qpos `frame` (nq,), opened with the run so far."""
         if self._picture is None:
             self._picture = self._stack.enter_context(open_picture(so_far(), self._options))
         for part in self._picture.parts:

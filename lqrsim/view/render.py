@@ -39,11 +39,7 @@ COLOURS = 192  # number of colours of a GIF
 def encoder(
     path: Path, size: tuple[int, int], rate: Fraction, *, crf: int, preset: str, metadata: VideoMetadata | None = None
 ) -> Iterator[Callable[[Pixels], None]]:
-    """A function that appends a frame (height, width, 3), which must not change afterwards.
-
-    Args:
-      crf, preset: x264's settings of quality and compression.
-    """
+    """A function that appends a frame (height, width, 3), which must not change afterwards."""
     path.write_bytes(bytes(4096))  # FFmpeg crashes on a disk that is so full that it cannot even write its header
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:

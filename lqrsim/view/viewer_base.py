@@ -50,11 +50,6 @@ class Viewer(abc.ABC):
       push: velocity that a key adds, in m/s.
       speed: of the time shown; 1 is real time.
       seconds: after which the viewer closes; never by default.
-
-    Attributes:
-      data: the state that is shown, and its `caption` in lines, the last of which are the `remark`.
-      wrench: force and torque (6,) of a drag.
-      holds_goal: whether mouse and keys move the goal instead of the robot.
     """
 
     def __init__(
@@ -76,12 +71,12 @@ class Viewer(abc.ABC):
             raise InputError(f"state_coordinates.position: got none, want {wanted}")
         # A copy, because a viewer has sliders for gravity and other settings.
         self.model = copy.copy(model)
-        self.data = mujoco.MjData(self.model)
+        self.data = mujoco.MjData(self.model)  # that is shown, with a caption whose last lines are the remark
         self.space, self.robot = space, robot_body(model, body)
         self.radius, self.speed, self.paused, self.caption, self.remark = radius, speed, False, "", ""
         self.goal_body, self.holds_goal = 0 if goal is None else robot_body(model, goal), False
         self._balls = None if space.position else balls
-        self.wrench = np.zeros(6)
+        self.wrench = np.zeros(6)  # of a drag
         self._mass = float(model.body_subtreemass[self.robot])
         self._push, self._impulse = push * self._mass, np.zeros(3)
         if self._balls is not None:
