@@ -15,17 +15,7 @@ import numpy as np
 
 from lqrsim.annotations import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
-from lqrsim.results.archive import (
-    Arrays,
-    Header,
-    anything,
-    canonical,
-    digest,
-    of_other_version,
-    opened,
-    parse,
-    write,
-)
+from lqrsim.results import archive
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel
@@ -68,25 +58,25 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     If the path is a link, the file that it points to changes. Only regular files are replaced.
     """
     path = check_path("output", path)
-    write(path, *_content(result))
+    archive.write(path, *_content(result))
     return path
 
 
 def hash_of(result: Saved) -> str:
     """The `sha256` of the file that `save` would write. Raises InputError as `save` does."""
-    return digest(*_content(result))
+    return archive.digest(*_content(result))
 
 
-def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
+def _content(result: Saved) -> tuple[archive.Arrays, dict[str, Any]]:
     """The arrays and the JSON tree of a file. Raises InputError if the result could not be read again."""
     kinds = ", ".join(f"{'an' if kind.__name__[0] in 'AO' else 'a'} {kind.__name__}" for kind in FORMATS)
     check_kind("result", result, tuple(FORMATS), f"one of: {kinds}")
     kind = next(kind for kind in FORMATS if isinstance(result, kind))
     name, version = FORMATS[kind]
-    arrays: Arrays = {}
+    arrays: archive.Arrays = {}
     try:
-        tree = parse(canonical(tree_of(result, "", arrays)))
-        _check_arrays(kind, {name: Header(array.dtype.str, array.shape) for name, array in arrays.items()})
+        tree = archive.parse(archive.canonical(tree_of(result, "", arrays)))
+        _check_arrays(kind, {name: archive.Header(array.dtype.str, array.shape) for name, array in arrays.items()})
         record_from(kind, tree, "", dict(arrays))
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
@@ -115,17 +105,17 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
     if path.is_dir():
         known = "; the folder of a campaign is opened with ls.stress.Results(folder)"
         raise InputError(f"{wanted or 'path'}: got {path}, a folder, want a file{known}")
-    with opened(path, wanted, VERSIONS) as archive:
-        found = str(archive.meta["format"]).removeprefix("lqrsim ")
+    with archive.opened(path, wanted, VERSIONS) as file:
+        found = str(file.meta["format"]).removeprefix("lqrsim ")
         kind = next(kind for kind, (name, _) in FORMATS.items() if name == found)
-        _check_arrays(kind, archive.headers)
+        _check_arrays(kind, file.headers)
         outside = ("format", "version", "sha256")
-        arrays, tree = archive.arrays(), {name: one for name, one in archive.meta.items() if name not in outside}
+        arrays, tree = file.arrays(), {name: one for name, one in file.meta.items() if name not in outside}
         record = record_from(kind, tree, "", arrays)
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want it mentioned there")
-        if (version := archive.meta["version"]) != (own := VERSIONS[found][_has_turns(record)]):
-            raise of_other_version(path, found, version, (own,))
+        if (version := file.meta["version"]) != (own := VERSIONS[found][_has_turns(record)]):
+            raise archive.of_other_version(path, found, version, (own,))
         return record
 
 
@@ -137,7 +127,7 @@ def _has_turns(value: Any) -> bool:
     return any(map(_has_turns, inside)) if is_dataclass(value) or isinstance(value, tuple) else False
 
 
-def tree_of(value: Any, path: str, arrays: Arrays) -> Any:
+def tree_of(value: Any, path: str, arrays: archive.Arrays) -> Any:
     """The JSON tree of a value, for `record_from`. Its arrays are put into `arrays`, by the paths of their fields."""
     if is_dataclass(value):
         tree = {}
@@ -153,7 +143,7 @@ def tree_of(value: Any, path: str, arrays: Arrays) -> Any:
     return dict(value) if isinstance(value, Mapping) else value
 
 
-def _check_arrays(kind: type, headers: Mapping[str, Header]) -> None:
+def _check_arrays(kind: type, headers: Mapping[str, archive.Header]) -> None:
     """Raises InputError unless each array belongs to a record of this kind, with its type and sizes."""
     sizes: Sizes = {}
     for name, header in headers.items():
@@ -178,7 +168,7 @@ def _declared_at(kind: type, path: str) -> Declared | None:
     return found
 
 
-def record_from(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
+def record_from(kind: Any, tree: Any, path: str, arrays: archive.Arrays) -> Any:
     """Build a record of this kind from a file, taking its arrays out of `arrays`. Raises InputError if it cannot."""
     if not isinstance(tree, dict):
         raise InputError(f"{path}: got {excerpt(tree)}, want an object")
@@ -202,7 +192,7 @@ def record_from(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         raise InputError(f"{path}: {error}" if path else f"{error}") from None
 
 
-def _value(said: Declared, tree: Any, path: str, arrays: Arrays) -> Any:
+def _value(said: Declared, tree: Any, path: str, arrays: archive.Arrays) -> Any:
     """Build the value of a field; the constructor of its record checks the rest."""
     if tree is None and said.optional:
         return None
@@ -220,7 +210,7 @@ def _value(said: Declared, tree: Any, path: str, arrays: Arrays) -> Any:
         return kind(check_name(path, tree[:100] if isinstance(tree, str) else tree, [str(one.value) for one in kind]))
     if said.dtype is not None:
         raise InputError(f"{path}: got {excerpt(tree)} in meta, want an array")
-    return anything(path, tree)
+    return archive.anything(path, tree)
 
 
 def _join(path: str, name: str | int) -> str:

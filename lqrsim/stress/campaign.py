@@ -28,18 +28,8 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors
-from lqrsim.stress.campaign_files import (
-    GIVEN,
-    NAME,
-    Damaged,
-    digest_of_solution,
-    read,
-    read_manifest,
-    sole_writer,
-    write,
-    write_manifest,
-)
 from lqrsim.stress.policies import (
     CAMPAIGN_POLICIES,
     DEFAULT_POLICIES,
@@ -59,7 +49,7 @@ from lqrsim.versions import changed, other_lqrsim, versions
 _log = logging.getLogger("lqrsim")
 
 MOST_WORKERS, LARGEST_BATCH = 1024, 100_000
-_CAMPAIGN_FILES = {NAME, GIVEN, "campaign.lock", "policies", "shards", "damaged"}
+_CAMPAIGN_FILES = {files.NAME, files.GIVEN, "campaign.lock", "policies", "shards", "damaged"}
 
 
 @checked
@@ -91,13 +81,13 @@ def run_campaign(
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
     deterministic = _check_runnable(campaign)
-    if os.path.isdir(folder) and not os.path.exists(folder / NAME):
+    if os.path.isdir(folder) and not os.path.exists(folder / files.NAME):
         names = (name for name in os.listdir(folder) if not name.startswith(".unfinished-"))
         if others := sorted({*names} - _CAMPAIGN_FILES):
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
-        stack.enter_context(sole_writer(folder))
+        stack.enter_context(files.sole_writer(folder))
         _write_or_check_manifest(campaign, folder, deterministic)
         results = Results(folder, scenario=campaign.scenario)
         results.campaign = campaign
@@ -121,7 +111,7 @@ def run_campaign(
         else:
             work = ((shard, job.work(shard, results.trials)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
-            write(contents, results.path(shard))
+            files.write(contents, results.path(shard))
             done += shard.count
             tell(done, total)
         for cell in results.cells:
@@ -200,11 +190,11 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
         "start": solving.digest_of_start(scenario),
-        "solution": None if given is None else digest_of_solution(given),
+        "solution": None if given is None else files.digest_of_solution(given),
         "code": _code(campaign),
     }
-    if os.path.exists(folder / NAME):
-        _check_same_campaign(specification, read_manifest(folder), folder)
+    if os.path.exists(folder / files.NAME):
+        _check_same_campaign(specification, files.read_manifest(folder), folder)
         return
     design, policies = campaign.design_disturbances, {}
     solutions = solve(campaign.policies, scenario, design, given)
@@ -212,9 +202,9 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         make_controller(POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
-        policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
+        policies[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
-        save_load.save(given, folder / GIVEN)
+        save_load.save(given, folder / files.GIVEN)
     remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
     impossible = impossible_policies(scenario, given)
     # Policies that were chosen leave out others on purpose.
@@ -225,7 +215,7 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         "left_out": f"left out: {left_out}" if left_out else "",
         "deterministic": [list(pair) for pair in deterministic],
     }  # fmt: skip
-    write_manifest(folder, specification | {"policies": policies} | about)
+    files.write_manifest(folder, specification | {"policies": policies} | about)
 
 
 def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
@@ -248,7 +238,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(f"scenario: got a {what} other than the one {folder} was begun with{older}, want another")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
-        want = "none" if manifest["solution"] is None else folder / GIVEN
+        want = "none" if manifest["solution"] is None else folder / files.GIVEN
         raise InputError(f"solution: got {got}, want {want}, as {folder} was begun with, or another folder")
     for kind, digest in specification["code"].items():
         if digest != manifest["code"].get(kind):
@@ -298,8 +288,8 @@ def _is_intact(results: Results, shard: Shard) -> bool:
     """Whether a shard's file is as it was written; if it is not, it is moved aside."""
     path = results.path(shard)
     try:
-        read(path, shard, results.manifest["digest"])
-    except Damaged as error:
+        files.read(path, shard, results.manifest["digest"])
+    except files.Damaged as error:
         aside = results.folder / "damaged" / path.name
         for number in itertools.count(1):
             if not aside.exists():

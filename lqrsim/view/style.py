@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import matplotlib.style
+from matplotlib import ticker
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -16,15 +17,6 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
-from matplotlib.ticker import (
-    LogFormatter,
-    LogLocator,
-    MaxNLocator,
-    NullFormatter,
-    NullLocator,
-    ScalarFormatter,
-    StrMethodFormatter,
-)
 
 from lqrsim.annotations import checked
 from lqrsim.errors import InputError, check_path, excerpt
@@ -169,13 +161,13 @@ def legend_below(figure: Figure, entries: Mapping[str, Artist]) -> None:
 def _set_ticks(axes: Axes) -> None:
     """Plain numbers on logarithmic axes, and no axis on which rounding errors look like changes."""
     for axis, scale in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
-        if isinstance(axis.get_major_formatter(), LogFormatter):  # this formatter writes powers as mathematics
+        if isinstance(axis.get_major_formatter(), ticker.LogFormatter):  # this formatter writes powers as mathematics
             low, high = axis.get_view_interval()
             if high < 100 * low:  # less than two decades have one power of ten in them, or none
                 plain_decades(axis)
-            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axis.set_minor_formatter(NullFormatter())
-        elif isinstance(axis.get_major_formatter(), ScalarFormatter):
+            axis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(ticker.NullFormatter())
+        elif isinstance(axis.get_major_formatter(), ticker.ScalarFormatter):
             low, high = sorted(axis.get_view_interval())
             beyond = max(abs(low), abs(high))
             if axes.get_aspect() == "auto" and high - low < ROUNDING * beyond:
@@ -186,15 +178,15 @@ def _keep_apart(axes: Axes) -> None:
     """Fewer ticks where their numbers would overlap, titles in lines, and what ticks leave out in the axis' label."""
     for along, axis in enumerate((axes.xaxis, axes.yaxis)):
         locator, formatter = axis.get_major_locator(), axis.get_major_formatter()
-        if isinstance(locator, MaxNLocator | LogLocator):
-            name = "nbins" if isinstance(locator, MaxNLocator) else "numticks"
+        if isinstance(locator, ticker.MaxNLocator | ticker.LogLocator):
+            name = "nbins" if isinstance(locator, ticker.MaxNLocator) else "numticks"
             for most in range(len(axis.get_major_ticks()), 0, -1):
                 axis.get_tightbbox(None)  # places the ticks
                 if not _overlap(axis, along):
                     break
                 options: dict[str, Any] = {name: most}
                 locator.set_params(**options)
-        if isinstance(formatter, ScalarFormatter) and (left_out := formatter.get_offset()):
+        if isinstance(formatter, ticker.ScalarFormatter) and (left_out := formatter.get_offset()):
             axis.offsetText.set_visible(False)
             plus = left_out.startswith(("+", "-", "\N{MINUS SIGN}"))
             said = left_out if plus else f"times {left_out}"
@@ -221,6 +213,6 @@ def _overlap(axis: Axis, along: int) -> bool:
 def plain_decades(*axes: Axis) -> None:
     """Set the ticks of logarithmic axes over a few decades to 1, 2, 5, 10, 20, ..., in plain numbers."""
     for axis in axes:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_minor_locator(ticker.NullLocator())
+        axis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
