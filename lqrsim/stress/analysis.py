@@ -14,16 +14,9 @@ import numpy.typing as npt
 
 from lqrsim.annotations import SHARE, Bounds, Count, OneOf, checked
 from lqrsim.errors import Array, InputError, check_name, excerpt
+from lqrsim.stress import statistics
 from lqrsim.stress.outcome_table import Outcomes
-from lqrsim.stress.statistics import (
-    Estimate,
-    compare,
-    holm,
-    independent_difference,
-    mean,
-    paired_difference,
-    rate,
-)
+from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.study import Cell
 
 Table = Mapping[Cell, Outcomes]
@@ -64,7 +57,7 @@ class Success:
 def success(cell: Cell, outcomes: Outcomes) -> Success:
     """The success rate of a cell with its intervals. Raises InputError if there are no trials."""
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
-    exact, band = rate(reached, trials), rate(reached, trials, method="wilson")
+    exact, band = statistics.rate(reached, trials), statistics.rate(reached, trials, method="wilson")
     same = alike(cell, outcomes)
     if same:
         exact = band = Estimate(exact.value, exact.value, exact.value)
@@ -164,7 +157,8 @@ def compared(
     """
     compared = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
     tested = [place for place, pair in enumerate(compared) if not np.isnan(pair.p_value)]
-    for place, adjusted in zip(tested, holm([compared[place].p_value for place in tested]).tolist(), strict=True):
+    p_values = statistics.holm([compared[place].p_value for place in tested]).tolist()
+    for place, adjusted in zip(tested, p_values, strict=True):
         compared[place] = replace(compared[place], adjusted=adjusted)
     return compared
 
@@ -174,14 +168,14 @@ def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes, *, pair
     if paired:
         if not np.array_equal(one.trial, other.trial):
             raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
-        pairs = compare(succeeded(one), succeeded(other))
+        pairs = statistics.compare(succeeded(one), succeeded(other))
         only_first, only_second, p_value = pairs.only_first, pairs.only_second, pairs.p_value
-        difference = paired_difference(only_first, only_second, len(one))
+        difference = statistics.paired_difference(only_first, only_second, len(one))
         joint = succeeded(one) & succeeded(other)
         both = int(joint.sum())
-        rms = mean(one.rms[joint] - other.rms[joint]) if both > 1 else None
+        rms = statistics.mean(one.rms[joint] - other.rms[joint]) if both > 1 else None
     else:
-        difference, p_value = independent_difference(*((rate.reached, rate.trials) for rate in rates))
+        difference, p_value = statistics.independent_difference(*((rate.reached, rate.trials) for rate in rates))
     if all(rate.alike for rate in rates):  # the difference of two runs
         difference, p_value = replace(difference, low=difference.value, high=difference.value), float("nan")
     return Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)

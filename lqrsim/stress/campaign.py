@@ -29,18 +29,7 @@ from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import campaign_files as files
-from lqrsim.stress import executors
-from lqrsim.stress.policies import (
-    CAMPAIGN_POLICIES,
-    DEFAULT_POLICIES,
-    DESIGNED,
-    POLICY_KINDS,
-    check_used,
-    design_uncertainty,
-    impossible_policies,
-    make_controller,
-    solve,
-)
+from lqrsim.stress import executors, policies
 from lqrsim.stress.results import Results
 from lqrsim.stress.study import Campaign, Shard
 from lqrsim.stress.trials import Job
@@ -140,12 +129,12 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     """
     scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()
-    impossible = impossible_policies(scenario, given)
+    impossible = policies.impossible_policies(scenario, given)
     for policy in campaign.policies:
         if policy in impossible:
-            possible = ", ".join(one for one in CAMPAIGN_POLICIES if one not in impossible)
+            possible = ", ".join(one for one in policies.CAMPAIGN_POLICIES if one not in impossible)
             raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
-    check_used(given, campaign.policies)
+    policies.check_used(given, campaign.policies)
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
@@ -165,12 +154,12 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
                 _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
                 known = False
             fixed[cell.sweep, cell.strength] &= known and generator.bit_generator.state == untouched
-    if {*DESIGNED} & {*campaign.policies}:
-        design_uncertainty(scenario, campaign.design_disturbances)
+    if {*policies.DESIGNED} & {*campaign.policies}:
+        policies.design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
-        if POLICY_KINDS[cell.policy].per_cell:
+        if policies.POLICY_KINDS[cell.policy].per_cell:
             try:
-                design_uncertainty(scenario, campaign.disturbances(cell))
+                policies.design_uncertainty(scenario, campaign.disturbances(cell))
             except InputError as error:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
@@ -196,26 +185,26 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
     if os.path.exists(folder / files.NAME):
         _check_same_campaign(specification, files.read_manifest(folder), folder)
         return
-    design, policies = campaign.design_disturbances, {}
-    solutions = solve(campaign.policies, scenario, design, given)
-    for policy in {*DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
-        make_controller(POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
+    design, hashes = campaign.design_disturbances, {}
+    solutions = policies.solve(campaign.policies, scenario, design, given)
+    for policy in {*policies.DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
+        policies.make_controller(policies.POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
-        policies[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
+        hashes[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
         save_load.save(given, folder / files.GIVEN)
     remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
-    impossible = impossible_policies(scenario, given)
+    impossible = policies.impossible_policies(scenario, given)
     # Policies that were chosen leave out others on purpose.
-    missing = impossible if {*campaign.policies} == {*DEFAULT_POLICIES} - {*impossible} else {}
+    missing = impossible if {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*impossible} else {}
     left_out = "; ".join(f"{policy}, {why}" for policy, why in missing.items())
     about = {
         "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {left_out}" if left_out else "",
         "deterministic": [list(pair) for pair in deterministic],
     }  # fmt: skip
-    files.write_manifest(folder, specification | {"policies": policies} | about)
+    files.write_manifest(folder, specification | {"policies": hashes} | about)
 
 
 def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
