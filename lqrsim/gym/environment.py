@@ -124,7 +124,6 @@ class Expert:
 
     Args:
       env: the environment, possibly in wrappers that change neither observations nor actions.
-      controller: as in `simulate`; by default the policy of the environment's solution.
     """
 
     def __init__(self, env: Any, controller: ControllerLike | None = None) -> None:

@@ -151,7 +151,6 @@ def compared(
     """Compare pairs of cells, with p-values adjusted for their number (Holm).
 
     Args:
-      pairs: a cell of `firsts` and a cell of `seconds`.
       paired: whether trials of the same number are compared with each other, see `comparisons`. If not, the difference
         of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
     """

@@ -60,9 +60,8 @@ def run_campaign(
       scheduler: address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786.
 
     Raises:
-      InputError: the campaign, its solution or the folder's contents do not fit; another process writes the folder; the
-        cluster cannot be reached; or a script calls this with workers and without `if __name__ == "__main__":`, so that
-        each worker would call it again.
+      InputError: a script calls this with workers and without `if __name__ == "__main__":`, so that each worker would
+        call it again.
     """
     executors.end_if_started_by_import()
     # A copy, so that the next run resolves the scenario again: its code may have changed.
@@ -124,8 +123,7 @@ def _resumable(results: Results) -> Iterator[None]:
 def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     """Raise InputError for errors that would occur in every trial, before anything is solved or written.
 
-    Returns:
-      The sweeps and strengths whose disturbances are lqrsim's own and draw nothing. Others may draw during a run.
+    Return the sweeps and strengths whose disturbances are lqrsim's own and draw nothing. Others may draw during a run.
     """
     scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()

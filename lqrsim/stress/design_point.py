@@ -73,7 +73,6 @@ def smallest_failure(
         mostly noise.
 
     Raises:
-      NoFailure: no failure was given, and none was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
     """
     pairs = max(250, size // 2) if pairs is None else pairs

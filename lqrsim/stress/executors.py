@@ -111,9 +111,6 @@ class _Worker:
     It says that it has imported the caller's script, then receives the job, says that it can begin, and receives
     shards. The job is not an argument of the process: Python writes arguments to a pipe whose other end it keeps open,
     and if the process dies before it reads them, the writer waits forever.
-
-    Attributes:
-      ready: whether it can begin.
     """
 
     def __init__(self, job: Job) -> None:

@@ -105,7 +105,6 @@ class ReliabilityProblem(Study):
           report: called with the summary, and with a line for each level that the pilot run finds.
 
         Raises:
-          NoFailure: no failure was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
         check_keep(keep, particles)
@@ -135,7 +134,6 @@ class ReliabilityProblem(Study):
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
 
         Raises:
-          NoFailure: none was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
         seed = self.seed if seed is None else seed
@@ -316,9 +314,6 @@ def certify(
       repetitions: number of its repetitions to run, at least 2; by default all.
       seed: another seed, for fresh random numbers: then intervals are compared. By default the certificate's.
       scenario: reference to the scenario if it is your own function: files never choose code to run.
-
-    Raises:
-      NoFailure: no failure was found.
     """
     every = len(certificate.repetitions)
     count = every if repetitions is None else repetitions

@@ -113,13 +113,11 @@ def failure_probability(
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       keep: fraction of the vectors that exceeds the next level, at least 2 / `particles`. With 0 there are no levels,
         and failures are counted.
-      moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds, and again for each batch that it draws where scores tie.
 
     Raises:
-      NoFailure: no failure was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the result of the repetitions that are done, None if none has failed.
     """
     check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved vectors, and copies of both

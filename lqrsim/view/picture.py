@@ -32,9 +32,6 @@ class SceneRenderer:
     """Draws views of a trial, in panes of its part of a picture; to be used with `with`, as it holds an OpenGL context.
 
     MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
-
-    Args:
-      views: with their boxes in the part. box: the part.
     """
 
     def __init__(

@@ -72,11 +72,7 @@ def figure(
     """A figure that is written to each path when the block ends: png, pdf or svg.
 
     A block that fails writes nothing. Numbers of ticks that would overlap, and titles wider than their axes, are mended
-    when the block ends: layout engines do not do that.
-
-    Args:
-      size: inches wide and high. By default `style` gives the width, `arrange` the height, and the layout keeps titles,
-        ticks and labels apart.
+    when the block ends: layout engines do not do that. By default `style` gives the width and `arrange` the height.
     """
     places = [check_path("path", path) for path in paths]
     for place in places:
