@@ -217,24 +217,6 @@ def test_a_free_duration_keeps_them_at_their_knots() -> None:
     assert solution.trajectory.states[12, 0] <= 0.5 + 1e-6
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ((np.zeros(21), 1.0, 2.0), "StateBounds: 'x': got 3 items, want .low, high., each a number or one for each"),
-        ((np.zeros(21), np.ones(20)), "StateBounds: 'x': got 21 and 20 numbers, want one for each knot in both"),
-        ((np.arange(21.0), 5.0), "StateBounds: 'x': got 5 to 5 at knot 5, want low below high"),
-        ((np.full(21, -np.inf), np.inf), "StateBounds: 'x': got -inf to inf, want low below high, and one of them fin"),
-        ((np.full(21, np.nan), 1.0), "StateBounds: 'x': low: got nan at index .0., want a number"),
-        (([], 1.0), "StateBounds: 'x': low: got no numbers, want one, or one for each knot"),
-        ((np.zeros((3, 2)), 1.0), "StateBounds: 'x': low: got shape .3, 2., want"),
-        (("low", 1.0), "StateBounds: 'x': low: got 'low', want a number, or one for each knot"),
-    ],
-)
-def test_what_is_wrong_is_named(given: Any, message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        ls.StateBounds(x=given)
-
-
 def test_numbers_that_do_not_fit_the_problem_are_named() -> None:
     with pytest.raises(ls.InputError, match="StateBounds: x: got 20 numbers, want one, or one for each of 21 knots"):
         cart(constraints=[ls.StateBounds(x=(np.zeros(20), 1.0))])

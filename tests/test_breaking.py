@@ -1,7 +1,5 @@
 """The nearest failure, where it is known, and what it is in newtons and seconds."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -112,21 +110,3 @@ def test_disturbances_in_physical_units(quadrotor: ls.Scenario, quadrotor_soluti
     assert (force.size, force.time) == (pytest.approx(0.5 * 30), pytest.approx(2.0))
     assert [one.what for one in rest] == [f"error of rotor_{i} as applied" for i in (1, 2, 3, 4)]
     assert all(one.unit == "N" and 0.01 < one.size < 0.05 for one in rest)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: smallest_failure(lambda z: z[:, 0], 0), "size: got 0"),
-        (lambda: smallest_failure(lambda z: z[:, 0], 2, pairs=1), "pairs: got 1"),
-        (
-            lambda: smallest_failure(lambda z: z[:, 0] - 9, 2, failures=np.ones((1, 2))),
-            "failures: got vectors that do not fail",
-        ),
-        (lambda: smallest_failure(lambda z: z[:, 0], 2, failures=np.ones((0, 2))), "failures: got none, want"),
-        (lambda: smallest_failure(lambda z: z[:, 0], 2, failures=np.ones((1, 3))), r"failures: got shape \(1, 3\)"),
-    ],
-)
-def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        call()

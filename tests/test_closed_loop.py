@@ -306,11 +306,6 @@ def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
 # Bad input
 
 
-def test_a_scene_without_the_robot_is_told_what_it_has():
-    with pytest.raises(InputError, match=r"^scene arena: got no robot quadrotor in it, want its body .* has: .*create"):
-        Plant(Quadrotor(), load_scene("arena"))
-
-
 @pytest.mark.parametrize(("part", "name"), [("body", "sled"), ("joint", "across"), ("actuator", "steer")])
 def test_a_robot_that_lacks_a_part_is_told_which(tmp_path, part, name):
     (tmp_path / "ice.xml").write_text(SLED.replace(f'"{name}"', f'"other_{name}"'))
@@ -410,35 +405,6 @@ def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
         InputError, match=r"control period: got 0.09 s, 3,000,000 physics steps of scene ice, want at most 20,000"
     ):
         plant.substeps(0.09)
-
-
-def test_a_policy_for_another_robot_is_refused(cage):
-    with pytest.raises(InputError, match=r"^controller: got a policy with the states x, y, heading, want .*, as robot"):
-        simulate(cage, weave(5))
-
-
-def test_a_plan_that_is_not_finite_is_refused(cage):
-    solution = hover(5)
-    states = solution.trajectory.states.copy()
-    states[3, 0] = np.inf
-    failed = replace(solution, status=Status.NOT_FINITE, trajectory=replace(solution.trajectory, states=states))
-    with pytest.raises(InputError, match=r"^plan: got a plan that is not finite \(NOT_FINITE\), want one"):
-        simulate(cage, failed)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"trials": 0}, "^trials: got 0, want a whole number >= 1$"),
-        ({"seed": -1}, "^seed: got -1, want a whole number >= 0$"),
-        ({"first_trial": 0.5}, "^first_trial: got 0.5"),
-        ({"goal_radius": float("nan")}, "^goal_radius: got nan"),
-        ({"disturbances": ["wind"]}, "^disturbances: got 'wind' at 0, want disturbances"),
-    ],
-)
-def test_bad_options_are_told(cage, options, message):
-    with pytest.raises(InputError, match=message):
-        simulate(cage, hover(5), **options)
 
 
 def test_a_saved_policy_runs_as_the_one_that_was_saved(

@@ -329,26 +329,3 @@ class TestEndings:
 
         with pytest.raises(KeyboardInterrupt):
             smooth_continuous(scalar(), callback=interrupt)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"tolerance": 0.0}, "tolerance: got 0.0, want a finite number > 0"),
-        ({"gap_tolerance": -1.0}, "gap_tolerance: got -1.0, want a finite number > 0"),
-        ({"max_iterations": 0}, "max_iterations: got 0, want a whole number >= 1"),
-        ({"start": (0.1,) * 3}, r"start: got shape \(3,\), want \(2,\)"),
-        ({"atol": 0.0}, "atol: got 0.0, want a finite number > 0"),
-    ],
-)
-def test_bad_options_get_one_line(differential_drive: ls.Scenario, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ls.InputError, match=f"^{message}"):
-        smooth_continuous(**dict[str, Any](problem=differential_drive.problem, **options))
-
-
-def test_a_fixed_start_is_refused(differential_drive: ls.Scenario) -> None:
-    problem = dataclasses.replace(differential_drive.problem, initial=ls.FixedState((0, -2.5, np.pi)))
-    with pytest.raises(ls.InputError, match=r"^initial: got a FixedState, want an initial cost"):
-        smooth_continuous(problem)
-    with pytest.raises(ls.InputError, match=r"^problem: got 'drive', want a Problem"):
-        smooth_continuous("drive")  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,5 @@
 """Sec. IV in continuous time, against boundary-value problems, matrix equations and one dense linear system."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from scipy.integrate import quad, solve_bvp
 from scipy.linalg import expm, solve_continuous_are
 
-import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.linear_quadratic import Stage
 from lqrsim.results.solution_parts import Status
@@ -234,42 +232,3 @@ def test_times_come_in_any_shape() -> None:
     assert solution.cost_to_go(2.0 + 1e-12).hessian[0, 0] == pytest.approx(1.0)
     assert solution.cost_to_go(0.0).hessian[0, 0] == pytest.approx(1 / 3, abs=1e-8)
     assert "one pass each way" in str(solution)
-
-
-@pytest.mark.parametrize(
-    ("ask", "message"),
-    [
-        (lambda s: s.policy([0.0], -0.1), r"t: got -0\.1, want seconds from 0 to 2"),
-        (lambda s: s.x_hat([0.0, 2.1]), r"t: got 2\.1, want seconds from 0 to 2"),
-        (lambda s: s.total_cost(np.nan), "t: got nan, want seconds from 0 to 2"),
-        (lambda s: s.cost_to_go("now"), "t: got 'now', want numbers"),
-        (lambda s: s.policy([0.0, 1.0], 0.0), r"x: got shape \(2,\), want \(\.\.\., 1\)"),
-        (lambda s: s.policy(np.zeros((3, 1)), [0.0, 1.0]), r"x: got shape \(3, 1\), want"),
-        (lambda s: s.inverse_policy([np.inf], 0.0), "x: got .*inf.*, want finite numbers"),
-    ],
-)
-def test_questions_that_have_no_answer(ask: Callable[[Any], Any], message: str) -> None:
-    solution = smooth_lq_continuous(STAGE, horizon=2.0, initial=UNIT, final=UNIT)
-    with pytest.raises(ls.InputError, match=f"^{message}"):
-        ask(solution)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"horizon": 0.0}, "horizon: got 0.0, want a finite number > 0"),
-        ({"rtol": 1e-16}, "rtol: got 1e-16, want a finite number >= 1e-13"),
-        ({"stage": 3}, "stage: got 3, want a Stage without a leading axis"),
-        ({"stage": Stage(A=np.zeros((2, 1, 1)), B=np.ones((2, 1, 1)), R=np.ones((2, 1, 1)))}, "stage: got a Stage"),
-        (
-            {"stage": lambda t: STAGE if t == 0 else Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])},
-            r"stage: got B of shape \(2, 1\), want \(1, 1\) at all times",
-        ),
-        ({"initial": None}, "initial: got None, want a Quadratic"),
-        ({"final": Quadratic(np.eye(2), np.zeros(2), np.array(0.0))}, r"final: hessian: got shape \(2, 2\), want"),
-    ],
-)
-def test_bad_linear_quadratic_input_gets_one_line(changes: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {"stage": STAGE, "horizon": 1.0, "initial": UNIT, "final": UNIT}
-    with pytest.raises(ls.InputError, match=f"^{message}"):
-        smooth_lq_continuous(**(arguments | changes))

@@ -1,6 +1,5 @@
 """Representatives of angles and rotation vectors, against SciPy's rotations."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -80,28 +79,6 @@ def test_leading_dimensions_broadcast() -> None:
 def test_a_vector_near_enough_is_returned_to_the_bit() -> None:
     vector = np.array([0.1, 3.0, 0.3, -0.2, 1.1])
     assert (SPACE.nearest(vector, vector + 0.1) == vector).all()
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"units": ("m",)}, "units: got 1 of them, want 2"),
-        ({"names": ("a", "a")}, "names: got a name twice"),
-        ({"position": (0,)}, "position: got 1 entries, want 2"),
-        ({"angles": (2,)}, r"angles: got indices \(2,\), want them between 0 and 1"),
-        ({"low": (1.0, 0.0), "high": (0.0, 1.0)}, "limits of a: got 1 to 0, want the first below the second"),
-    ],
-)
-def test_what_does_not_fit_is_refused(fields: dict, message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        ls.types.Coordinates(**{"names": ("a", "b"), "units": ("", ""), **fields})
-
-
-def test_of_a_rotation_vector_one_entry_at_most_is_an_angle() -> None:
-    with pytest.raises(
-        ls.InputError, match=r"^angles: got rx, rz of one rotation vector, want at most one of the three"
-    ):
-        dataclasses.replace(SPACE, angles=(2, 4))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -140,24 +139,6 @@ def test_a_trial_more_is_seen_in_a_fraction(trials: int) -> None:
     spec = fraction_format(trials)
     assert format(1 / trials, spec) != format(0.0, spec)
     assert format(1 - 1 / trials, spec) != format(1.0, spec)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: ls.types.DataTable({}), "got none, want at least one column"),
-        (lambda: ls.types.DataTable({"a": [1], "b": [1, 2]}), "got 1 in 'a', 2 in 'b', want at least one column"),
-        (lambda: ls.types.DataTable({"a": [np.nan]}), "columns: 'a': got nan"),
-        (lambda: ls.types.DataTable({"a": ["two\nlines"]}), "columns: 'a': got"),
-        (lambda: ls.types.DataTable({"a": [1.0]}, {"b": ".3f"}), "formats: got 'b', want one of: a"),
-        (lambda: ls.types.DataTable({"a": [1.0]}, {"a": ".999f"}), "formats: 'a': got '.999f'"),
-        (lambda: ls.types.DataTable({"a": [1.0]}).select(["b"]), "headings: got 'b', want one of: a"),
-        (lambda: ls.types.DataTable({"a": [1.0]}).save("a.xlsx"), "want a name that ends in .csv, .tex, .md"),
-    ],
-)
-def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:
-    with pytest.raises(ls.InputError, match=re.escape(message)):
-        call()
 
 
 @pytest.fixture(scope="module")

@@ -193,12 +193,3 @@ def test_a_wheel_that_lost_its_drive_turns_freely(arena):
     held = simulate(arena, braking)
     assert abs(held.states[0, -1, 2] - np.pi / 2) < 0.01
     assert free.states[0, -1, 2] < np.pi / 2 - 0.1
-
-
-def test_a_loss_that_does_not_fit_is_refused_by_name(cage):
-    with pytest.raises(
-        InputError, match=r"^ActuatorLoss: actuator of quadrotor: got 'rotor_1', want one of: quadrotor_"
-    ):
-        simulate(cage, hover(5), disturbances=[ActuatorLoss("rotor_1")])
-    with pytest.raises(InputError, match=r"^ActuatorLoss: at: got 3 s, want a time before"):
-        simulate(cage, hover(5), disturbances=[ActuatorLoss(at=3.0)])

@@ -176,33 +176,6 @@ def test_the_robot_hits_obstacles_where_they_are_not_where_the_scene_has_them(ar
     assert 10 < (rollout.contacts > 0).sum() < 50
 
 
-@pytest.mark.parametrize(
-    "mismatch", [MassMismatch, ThrustMismatch, WheelRadiusMismatch, AxleMismatch, FrictionMismatch]
-)
-def test_a_factor_without_numbers_is_refused(mismatch):
-    for factor in ([], (), np.zeros(0), [[]], np.zeros((0, 3))):
-        with pytest.raises(InputError, match=f"^{mismatch.__name__}: factor: got "):
-            mismatch(factor=factor)
-
-
-@pytest.mark.parametrize(
-    ("fixture", "disturbance", "message"),
-    [
-        ("cage", WheelRadiusMismatch(0.01), "^WheelRadiusMismatch: got robot quadrotor, which has no wheels"),
-        ("cage", AxleMismatch(0.01), "^AxleMismatch: got robot quadrotor, which has no wheels"),
-        ("cage", FrictionMismatch(0.01), "^FrictionMismatch: got robot quadrotor, which has no wheels"),
-        ("arena", ThrustMismatch(0.01), "^ThrustMismatch: got robot differential_drive, whose actuators are servos"),
-        ("cage", ThrustMismatch(factor=(1.0, 1.1)), "^ThrustMismatch: factor: got 2 numbers, want 1 or 4: quadrotor_"),
-        ("cage", MassMismatch(factor=(1.0, 1.1)), "^MassMismatch: factor: got 2 numbers, want 1 or 1: mass$"),
-        ("cage", InitialStateError((1.0, 1.1)), "^InitialStateError: std: got 2 numbers, want 1 or 12: x, y"),
-    ],
-)
-def test_what_does_not_fit_the_plant_is_refused_by_name(request, fixture, disturbance, message):
-    plant, solution = request.getfixturevalue(fixture), (weave if fixture == "arena" else hover)(3)
-    with pytest.raises(InputError, match=message):
-        simulate(plant, solution, disturbances=[disturbance])
-
-
 def test_a_scene_without_obstacles_has_none_to_displace(cage, tmp_path):
     text = cage.scene.xml
     spec = mujoco.MjSpec.from_string(text)

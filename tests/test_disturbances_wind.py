@@ -4,16 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
-from tracking import hover, weave
+from tracking import hover
 
-from lqrsim.errors import InputError
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Dryden, Gusts, MeanWind
 from lqrsim.simulation.disturbances.wind import first_order, second_order
-from lqrsim.simulation.plant import Plant
 
 DT = 1 / 30
 
@@ -131,11 +127,3 @@ def test_the_filters_are_discretised_exactly(step):
     lags = np.abs(np.subtract.outer(np.arange(40), np.arange(40)))
     expected = np.array([output @ expm(a * step * lag) @ output for lag in range(40)])[lags]
     np.testing.assert_allclose(covariance, expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("wind", [MeanWind((1.0, 0.0, 0.0)), Gusts(), Dryden()])
-def test_a_robot_without_drag_is_refused_by_name(wind):
-    arena = Plant(DifferentialDrive(), load_scene("arena"))
-    message = f"^{type(wind).__name__}: got robot differential_drive, which wind cannot push without drag"
-    with pytest.raises(InputError, match=message):
-        simulate(arena, weave(5), disturbances=[wind])

@@ -200,12 +200,6 @@ def test_turns_after_tilts_are_scipys(axis: str, seed: int) -> None:
         assert (np.abs(turned) <= np.pi).all()
 
 
-def test_axes_have_names() -> None:
-    for function, numbers in ((rotations.quaternion, np.zeros(3)), (rotations.rotation_vector, np.ones(4))):
-        with pytest.raises(ls.InputError, match="turns_about: got 'w', want one of: x, y, z"):
-            function(numbers, turns_about="w")
-
-
 @pytest.mark.parametrize("level", ["symbolic", "compiled", "plain"])
 def test_other_parameters_compile_nothing_and_change_what_they_are_in(level: str) -> None:
     def fall(x, u, p):

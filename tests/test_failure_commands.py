@@ -262,23 +262,6 @@ def test_a_given_solution_is_what_fails(own: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "says"),
-    [
-        ({"solution": 3}, "solution: got 3, want a Solution, the path of one"),
-        ({"scenario": 3}, "scenario: got 3"),
-        ({"sweep": ""}, "sweep: got"),
-        ({"strength": 0.0}, "strength: got 0"),
-        ({"policy": "open"}, "policy: got 'open', want .*open_loop"),
-        ({"failure": "crash"}, "failure: got 'crash', want .*collision"),
-        ({"goal_radius": -1.0}, "goal_radius: got -1"),
-    ],
-)
-def test_a_problem_that_is_not_one_is_refused(asked: dict[str, Any], says: str) -> None:
-    with pytest.raises(ls.InputError, match=says):
-        ls.stress.ReliabilityProblem(**{"scenario": "quadrotor", **asked})
-
-
-@pytest.mark.parametrize(
     ("options", "says"),
     [({"particles": 19}, "particles: got 19"), ({"repetitions": 1}, "repetitions: got 1"), ({"seed": -1}, "seed")],
 )

@@ -214,41 +214,9 @@ class TestSafeguard:
 
 
 class TestArguments:
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            ({"form": None}, "form: got None, want one of: dual, primal"),
-            ({"first_pass": None}, "first_pass: got None, want one of: forward, backward"),
-            ({"gap_tolerance": None}, "gap_tolerance: got None, want a finite number > 0"),
-            ({"safeguard": None}, "safeguard: got None, want True or False"),
-            ({"safeguard": np.array([1, 2])}, r"safeguard: got array\(\[1, 2\]\), want True or False"),
-            ({"stop": 3}, "stop: got 3, want one of: optimal, cost"),
-            ({"callback": 3}, "callback: got 3, want a function of an Iteration"),
-            ({"start": [[1.0, 2.0], [3.0]]}, r"start: got \[\[1.0, 2.0\], \[3.0\]\], want controls"),
-        ],
-    )
-    def test_one_line_for_each(self, differential_drive: ls.Scenario, options: dict, message: str) -> None:
-        with pytest.raises(ls.InputError, match=message):
-            ls.smooth(differential_drive.problem, **options)
-
     def test_numbers_of_numpy_are_numbers(self, differential_drive: ls.Scenario, tmp_path) -> None:
         options = {"max_iterations": np.int64(20), "tolerance": np.float32(1e-4), "safeguard": np.True_}
         solution = ls.smooth(differential_drive.problem, **options)
         loaded = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
         assert loaded.options["max_iterations"] == 20
         assert loaded.options["safeguard"] is True
-
-    @pytest.mark.parametrize(
-        ("fields", "message"),
-        [
-            ({"B": [[1.0], [2.0, 3.0]]}, "Stage: B: got"),
-            ({"B": np.ones((0, 2, 1))}, r"Stage: B: got shape \(0, 2, 1\), want at least one of each"),
-            ({"c": [[1.0], [2.0, 3.0]]}, "Stage: c: got"),
-            ({"A": None}, r"Stage: A: got None, want an array of shape \(2, 2\)"),
-            ({"R": None}, r"Stage: R: got None, want an array of shape \(1, 1\)"),
-        ],
-    )
-    def test_stages_too(self, fields: dict, message: str) -> None:
-        given: dict = {"A": np.eye(2), "B": np.ones((4, 2, 1)), "R": [[1.0]]}
-        with pytest.raises(ls.InputError, match=message):
-            ls.lq.Stage(**(given | fields))

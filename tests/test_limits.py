@@ -208,20 +208,3 @@ def _cost(scenario: ls.Scenario, plan: ls.Trajectory, controls: Array) -> Array:
         x[:, :2] += (speed * dt / 6)[:, None] * (along[0] + 4 * along[1] + along[2])
         x[:, 2] += dt * turn
     return total + 0.5 * ((x - ends[1].about) ** 2 @ np.diag(ends[1].weight))
-
-
-@pytest.mark.parametrize(
-    ("limits", "message"),
-    [
-        ((1.0, 1.0), "control_limits: got 1 to 1 for u0, want the first below the second"),
-        ((-1.0, np.nan), "control_limits: got -1 to nan for u0, want the first below the second"),
-        ((np.inf, np.inf), "control_limits: got inf to inf for u0, want the first below the second"),
-        (((-1.0, 1.0), (1.0, 0.5)), "control_limits: got 1 to 0.5 for u1, want the first below the second"),
-        ((1.0, 2.0, 3.0), r"control_limits: got \(1.0, 2.0, 3.0\), want \(lowest, highest\)"),
-        ((-1.0, (1.0, 2.0, 3.0)), r"control_limits: got .*, want \(lowest, highest\), each a number or \(2,\)"),
-        (("low", "high"), r"control_limits: got \('low', 'high'\), want \(lowest, highest\), each a number"),
-    ],
-)
-def test_limits_that_are_none_get_one_line(limits: Any, message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        replace(random_problem(0), control_limits=limits)

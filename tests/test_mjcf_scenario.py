@@ -179,8 +179,3 @@ def test_what_does_not_fit_is_named(cart: Path, settings: str, message: str) -> 
         resolve(f"{cart},{settings}")
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_a_file_that_is_not_there_is_named() -> None:
-    with pytest.raises(InputError, match=r"scene: got 'nowhere.xml', want a file that exists"):
-        resolve("nowhere.xml")

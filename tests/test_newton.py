@@ -244,16 +244,6 @@ class TestOptions:
             assert {one.method for one in solution.iterations} == {"smooth"}
             assert solution.options["tolerance"] == 1e-4
 
-    @pytest.mark.parametrize("finish", ["gauss", "", False, 0])
-    def test_what_it_does_not_know(self, finish) -> None:
-        with pytest.raises(ls.InputError, match=rf"finish: got {finish!r}, want one of: newton"):
-            ls.smooth(swing_up(), finish=finish)
-
-    def test_only_smoothing_has_a_tolerance_of_its_own(self) -> None:
-        for solve in (ls.ilqr, lambda problem, tolerance: ls.ilqr_many([problem], tolerance=tolerance)):
-            with pytest.raises(ls.InputError, match="tolerance: got None, want"):
-                solve(swing_up(), tolerance=None)  # pyright: ignore[reportArgumentType]
-
     def test_a_deadline_leaves_the_best_plan_so_far(self) -> None:
         problem = random_problems.draw("acrobot", 3)
         found = []

@@ -278,10 +278,6 @@ def test_noise_without_bounds_is_never_left_out_of_the_cost(power: float, solver
     assert np.isfinite(loud.cost) or not loud.success
 
 
-def soft() -> ls.Problem:
-    return problem_of(draw(np.random.default_rng(0)), fixed=False)
-
-
 def of(noise: Any, *, risk: float = 0.0) -> ls.Problem:
     problem = problem_of(draw(np.random.default_rng(0)))
     return dataclasses.replace(problem, noise=noise, risk=risk)

@@ -154,7 +154,3 @@ class TestReplanner:
         assert log.summary().startswith(f"solved again {log.solved} times")
         assert f"kept the previous law {log.kept.total()} times" in log.summary()
         assert all(reason in log.summary() for reason in log.kept)
-
-    def test_a_rate_beyond_the_control_rate_is_refused(self, quadrotor: ls.Scenario, quadrotor_solution) -> None:
-        with pytest.raises(ls.InputError, match=r"Replanner: every: got 0\.01 s, want at least a control period"):
-            Replanner(quadrotor.problem, quadrotor_solution, every=0.01)

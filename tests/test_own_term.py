@@ -13,8 +13,6 @@ from huber_distance import HuberDistance
 import lqrsim as ls
 from lqrsim.codegen.compiled_module import module_of
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.sources import source_of
-from lqrsim.problem import quadratic_cost
 from lqrsim.solvers.multistart import passable
 from lqrsim.view.viewer import MovableGoal
 
@@ -156,16 +154,6 @@ class Half(ls.Constraint):
 def test_no_way_is_sought_round_convex_sets() -> None:
     kept = [Half(True), Half(False), ls.Clearance(WORLD, radius=0.1), ls.StateBounds(x=(-1.0, 9.0))]
     assert passable(stated(OWN, constraints=kept)) == [False, True, True, False]
-
-
-def test_sources_that_are_no_files_of_kernels_are_refused() -> None:
-    for module, constants, wanted in (
-        ("no_such_module", {}, "want a file that was imported"), ("sys", {}, "want a file that was imported"),
-        (7, {}, "want __name__"), (quadratic_cost, {"UNKNOWN": 1}, "UNKNOWN: got 1, want a number"),
-        (quadratic_cost, {"CONTROL": "no"}, "CONTROL: got 'no', want a number"),
-    ):  # fmt: skip
-        with pytest.raises(ls.InputError, match=wanted):
-            source_of(module, **constants)  # pyright: ignore[reportArgumentType]
 
 
 def test_what_else_a_file_says_is_no_part_of_the_problem(tmp_path: Path) -> None:

@@ -194,21 +194,6 @@ def test_controls_are_numbers_vectors_or_pairs_by_name(ends: list[float], seed: 
     assert min(np.abs(named.control - one).max() for one in controls) == 0
 
 
-@pytest.mark.parametrize(
-    ("controls", "message"),
-    [
-        (2.0, "controls: got 2.0, want \\(lowest, highest\\), each a number or \\(2,\\), or such pairs by name"),
-        (([0.0, 0.0, 0.0], 1.0), "controls: got .*, want \\(lowest, highest\\)"),
-        ({"lft": (0, 1)}, "controls: got 'lft'.* left"),
-        ({"left": 1.0}, "controls: 'left': got "),
-        ((0.4, -0.4), "want the lowest first"),
-    ],
-)
-def test_controls_that_are_no_ranges_are_refused(controls: Any, message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        ls.check_plant(ls.DifferentialDrive(), ls.load_scene("arena"), controls=controls)
-
-
 def test_contacts_that_stay_are_named() -> None:
     """What can move is not taken away, here a heavy box on the way of the arm's fist."""
     box = '<body pos="0.3 0 0"><freejoint/><geom type="box" size="0.12 0.3 0.3" mass="50"/></body>'

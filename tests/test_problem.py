@@ -447,13 +447,6 @@ def test_wrong_names_get_one_line(make: Callable[[], dict], message: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_numbers_by_name_are_in_no_order_before_a_problem() -> None:
-    with pytest.raises(ls.InputError, match="QuadraticCost: got numbers by name, want the cost from a Problem"):
-        ls.QuadraticCost({"x": 1.0}, about={}).weight.any()
-    with pytest.raises(ls.InputError, match="FixedState: got numbers by name, want the state from a Problem"):
-        ls.FixedState(x=1.0).numbers.any()
-
-
 SHUFFLED = st.permutations(["count", "index", "names", "v", "x"])  # attributes of tuples are names, too
 
 

@@ -5,7 +5,6 @@ horizons up to 12), and two ways of solving the same linear system differ by rou
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -142,47 +141,6 @@ def test_a_control_that_costs_nothing_and_does_nothing_is_refused(form: str) -> 
     assert solution.status is ls.Status.NOT_POSITIVE_DEFINITE
     assert solution.detail == "backward pass, step 3 of 4"
     assert not solution.iterations
-
-
-END = ls.types.Quadratic(np.eye(2), np.zeros(2), np.array(0.0))
-FLAT = ls.types.Quadratic(np.diag([1.0, 0.0]), np.zeros(2), np.array(0.0))
-STEP = ls.lq.Stage(A=np.eye(2), B=np.ones((4, 2, 1)), R=[[1.0]])
-
-
-def lq(stage: ls.lq.Stage = STEP, *, initial: Any = END, final: Any = END, form: str = "dual", dt: float = 1.0) -> Any:
-    return ls.lq.smooth_lq(stage, initial=initial, final=final, form=form, dt=dt)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (lambda: lq(form="both"), "form: got 'both', want one of: dual, primal"),
-        (lambda: lq(dt=0.0), "dt: got 0.0, want a finite number > 0"),
-        (lambda: lq(initial=FLAT), "initial: hessian: got smallest eigenvalue 0, want"),
-        (lambda: lq(initial=ls.FixedState([0, 0]), form="primal"), "initial: got a FixedState, want"),
-        (lambda: lq(initial=ls.FixedState([0])), r"initial: state: got shape \(1,\), want \(2,\)"),
-        (lambda: lq(final=np.eye(2)), r"final: got array\(.*, want a Quadratic"),
-        (
-            lambda: lq(ls.lq.Stage(A=FLAT.hessian, B=np.ones((4, 2, 1)), R=[[1.0]]), form="primal"),
-            r'stage: A: got a singular matrix at step 0, want an invertible one, or form="dual"',
-        ),
-        (
-            lambda: lq(ls.lq.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])),
-            "stage: got a single stage, want one stage per step",
-        ),
-        (
-            lambda: ls.lq.Stage(A=np.eye(3), B=np.ones((4, 2, 1)), R=[[1.0]]),
-            r"Stage: A: got shape \(4, 3, 3\), want \(4, 2, 2\)",
-        ),
-        (
-            lambda: ls.lq.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]], Q=[[0, 1], [0, 0]]),
-            r"Stage: Q: got 1 at \[0, 1\] and 0 at \[1, 0\], want a symmetric matrix",
-        ),
-    ],
-)
-def test_bad_problems_get_one_line(wrong, message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        wrong()
 
 
 @settings(max_examples=examples(40))

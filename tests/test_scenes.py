@@ -299,13 +299,6 @@ def test_a_file_with_nearly_that_name_is_offered(tmp_path: Path) -> None:
         load_scene(tmp_path / "excavater.xml")
 
 
-def test_an_unknown_scene_is_told_the_names():
-    with pytest.raises(InputError, match=r"^scene: got 'aren', want one of: arena, cage .*or the path of an .xml"):
-        load_scene("aren")
-    with pytest.raises(InputError, match=r"^scene: got '.*nowhere.xml', want a file that exists, or one of: arena"):
-        load_scene("somewhere/nowhere.xml")
-
-
 @pytest.mark.skipif(mujoco.__version__ != "4.0.0", reason="the bug is in 4.0.0 alone")
 def test_a_sparse_model_is_refused_where_mujoco_solves_it_wrongly(scene_of):
     text = '<mujoco><option jacobian="sparse"/><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'

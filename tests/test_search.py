@@ -313,41 +313,6 @@ class TestWithoutAWay:
             with pytest.raises(ls.InputError, match=r"problems\[1\]: starts: got 2"):
                 ls.smooth_many([nowhere, problem], starts=2)
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            ({"starts": 0}, "starts: got 0, want a whole number >= 1"),
-            ({"starts": 2.5}, "starts: got 2.5, want a whole number >= 1"),
-            ({"starts": 3, "start": (0.0, 0.0)}, "starts: got 3 beside a start, want one of the two"),
-            ({"threads": 0}, "threads: got 0, want a whole number >= 1"),
-            ({"start": lambda problem: "there"}, "start: got 'there', want controls"),
-        ],
-    )
-    def test_what_is_refused(self, options: dict[str, Any], message: str) -> None:
-        with pytest.raises(ls.InputError, match=message):
-            ls.smooth(in_the_plane(), **options)
-
-    @pytest.mark.parametrize(
-        ("fields", "message"),
-        [
-            ({"obstacles": 0.5}, r"InitialPrior: obstacles: got shape \(\), want \(any,\)"),
-            ({"obstacles": (0.0, 1.5)}, "InitialPrior: obstacles: got .*, want numbers from 0 to 1"),
-            ({"about": [[0.0, 0.0], [1.0]]}, "InitialPrior: about: got .*"),
-            ({"controls": "none"}, "InitialPrior: controls: got 'none', want .*"),
-            ({"weight": (-1.0, 0.0)}, r"InitialPrior: weight: got \[-1.0, 0.0\], want numbers >= 0"),
-        ],
-    )
-    def test_priors_that_are_none_get_one_line(self, fields: dict[str, Any], message: str) -> None:
-        given: dict[str, Any] = {"weight": (1.0, 1.0), "about": (0.0, 0.0)}
-        with pytest.raises(ls.InputError, match=message):
-            ls.InitialPrior(**given | fields)
-
-    def test_ilqr_has_no_prior_whoever_makes_it(self) -> None:
-        prior = ls.InitialPrior((1.0, 1.0, 1.0), about=(0.0, 0.0, 0.0))
-        for start in (prior, lambda problem: prior):
-            with pytest.raises(ls.InputError, match="start: got an InitialPrior, want controls"):
-                ls.ilqr(in_the_plane(), start=start)
-
 
 @pytest.mark.long
 def test_where_no_control_helps_by_itself_some_do_together() -> None:

@@ -183,11 +183,6 @@ def test_a_scenario_runs_in_its_simulator(page: dict[str, Any]) -> None:
         dataclasses.replace(scenario, simulator="exact")
 
 
-def test_factors_of_an_effect_are_checked() -> None:
-    with pytest.raises(ls.InputError, match=r"^Effect: factors: got 'masses', want one of: mass, inertia, thrust"):
-        Effect(factors={"masses": np.ones((1, 1))})
-
-
 def test_a_missing_package_is_named_with_its_extra() -> None:
     with pytest.raises(ls.InputError, match=r"^no_such_simulator: got no such package, want it .*'lqrsim\["):
         package("no_such_simulator.vehicles", "rotorpy")
@@ -232,12 +227,6 @@ def test_a_quadrotor_with_two_inertias_turns_as_euler_says() -> None:
     )
     same = ls.Quadrotor(inertia=0.02, yaw_inertia=0.02).dynamics.rate(np.concatenate([np.zeros(9), w]), u)
     np.testing.assert_allclose(same, ls.Quadrotor(inertia=0.02).dynamics.rate(np.r_[np.zeros(9), w], u), atol=1e-12)
-
-
-@pytest.mark.parametrize("wrong", [{"yaw_inertia": 0.0}, {"min_force": 4.0}, {"min_force": -1.0}])
-def test_impossible_quadrotors_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ls.InputError, match=f"^Quadrotor: {next(iter(wrong))}: got"):
-        ls.Quadrotor(**wrong)
 
 
 @pytest.fixture(scope="module")

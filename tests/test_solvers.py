@@ -475,32 +475,6 @@ def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_d
         ls.smooth(differential_drive.problem, callback=interrupt)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"stop": "soon"}, "stop: got 'soon', want one of: optimal, cost"),
-        ({"tolerance": 0.0}, "tolerance: got 0.0, want a finite number > 0"),
-        ({"gap_tolerance": -1.0}, "gap_tolerance: got -1.0, want a finite number > 0"),
-        ({"max_iterations": 0}, "max_iterations: got 0, want a whole number >= 1"),
-        ({"start": (0.1,) * 3}, r"start: got shape \(3,\), want controls \(2,\) or \(150, 2\), an InitialPrior"),
-        ({"start": (np.inf, 0)}, r"start: got inf at index \[0, 0\], want finite numbers"),
-        ({"start": "hover"}, r"start: got 'hover', want controls \(2,\) or \(150, 2\), an InitialPrior"),
-        ({"form": "Dual"}, r"form: got 'Dual', want one of: dual, primal \(did you mean dual\?\)"),
-        ({"first_pass": "back"}, "first_pass: got 'back', want one of: forward, backward"),
-        ({"safeguard": "yes"}, "safeguard: got 'yes', want True or False"),
-    ],
-)
-def test_bad_options_get_one_line(differential_drive: ls.Scenario, options: dict, message: str) -> None:
-    with pytest.raises(ls.InputError, match=message):
-        ls.smooth(differential_drive.problem, **options)
-
-
-def test_the_primal_form_wants_a_soft_start(differential_drive: ls.Scenario) -> None:
-    problem = dataclasses.replace(differential_drive.problem, initial=ls.FixedState((0, -2.5, np.pi)))
-    with pytest.raises(ls.InputError, match="initial: got a FixedState, want an initial cost"):
-        ls.smooth(problem, form="primal")
-
-
 def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
     text = str(drive_solution)
     assert len(text.splitlines()) <= 15

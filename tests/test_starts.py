@@ -124,20 +124,6 @@ def test_ilqr_has_no_prior_and_begins_with_its_controls(own: Path) -> None:
     assert found.goal_radius == scenario.target_radius()
 
 
-@pytest.mark.parametrize(
-    ("start", "says"),
-    [
-        (np.zeros(3), r"start: got shape \(3,\), want controls \(2,\)"),
-        ("left", "start: got 'left', want controls"),
-        (ls.InitialPrior((1.0, 1.0), about=(0.0, 0.0)), "start: InitialPrior: weight"),
-        (ls.Trajectory(np.zeros((10, 3)), np.zeros((9, 2)), 0.1), "start: states"),
-    ],
-)
-def test_a_start_that_does_not_fit_is_refused(start: Any, says: str, differential_drive: ls.Scenario) -> None:
-    with pytest.raises(ls.InputError, match=says):
-        dataclasses.replace(differential_drive, start=start)
-
-
 # From a file.
 
 

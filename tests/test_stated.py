@@ -228,14 +228,6 @@ def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, d
     assert (problem.score(numbers) < 0).all()  # they do not collide
 
 
-def test_searches_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(InputError, match=r"^design_disturbances: got them with smooth, want track or offset_free"):
-        ls.stress.ReliabilityProblem("differential_drive", design_disturbances="light")
-    problem = ls.stress.ReliabilityProblem("differential_drive", policy="track", design_disturbances="gale")
-    with pytest.raises(InputError, match=r"^disturbances: got 'gale', want .*light"):
-        _ = problem.score
-
-
 # The command line.
 
 

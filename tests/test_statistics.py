@@ -1,6 +1,5 @@
 """Intervals and tests against closed forms, brute force, and how often they cover what is known."""
 
-from collections.abc import Callable
 from itertools import product
 from math import comb
 
@@ -220,23 +219,3 @@ def test_bootstrap_covers() -> None:
     found = [bootstrap(lambda x, axis: np.median(x, axis), draw, resamples=500) for draw in draws]
     covered = sum(one.low <= np.log(2) <= one.high for one in found)
     assert covered >= 200 * 0.95 - 3 * np.sqrt(200 * 0.95 * 0.05)
-
-
-@pytest.mark.parametrize(
-    ("call", "field"),
-    [
-        (lambda: rate(3, 2), "successes: got 3"),
-        (lambda: rate(0, 0), "trials: got 0"),
-        (lambda: rate(1, 2, confidence=1.0), "confidence: got 1.0"),
-        (lambda: compare([True], [True, False]), "second: got 2 trials"),
-        (lambda: compare([], []), "first: got"),
-        (lambda: paired_difference(0, 0, 0), "trials: got 0"),
-        (lambda: paired_difference(3, 2, 4), "trials: got 4, want at least the 5"),
-        (lambda: paired_difference(-1, 2, 4), "only_first: got -1"),
-        (lambda: independent_difference((3, 2), (1, 2)), "successes: got 3"),
-        (lambda: mean([1.0]), "sample: got 1 numbers"),
-    ],
-)
-def test_bad_input_is_named(call: Callable[[], object], field: str) -> None:
-    with pytest.raises(ls.InputError, match=field):
-        call()

@@ -310,14 +310,3 @@ def test_those_of_ones_own(cage):
     wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("forse_x", 0.2)])
     with pytest.raises(InputError, match=r"^Uncertainty: unknowns: got 'forse_x', want .*force_x"):
         ls.uncertainty_of(cage, [OwnInNumbers(wrong)])
-
-
-def test_what_does_not_fit_is_refused(cage, arena):
-    with pytest.raises(InputError, match=r"^MeanWind: got robot differential_drive, which wind cannot push"):
-        ls.uncertainty_of(arena, [ls.disturbances.MeanWind((1.0, 0.0, 0.0))])
-    with pytest.raises(InputError, match=r"^MeasurementNoise: std: got 3 numbers, want 1 or 12"):
-        ls.uncertainty_of(cage, [ls.disturbances.MeasurementNoise([0.1] * 3)])
-    with pytest.raises(InputError, match=r"^disturbances: got 'light'"):
-        ls.uncertainty_of(cage, "light")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match=r"^plant: got "):
-        ls.uncertainty_of("cage", [])  # pyright: ignore[reportArgumentType]

@@ -128,13 +128,6 @@ def test_seen_from_above() -> None:
     assert world.seen_by("xyz") is world
 
 
-def test_what_has_no_outline_from_above_is_refused_by_name() -> None:
-    tilted = Rotation.from_euler("x", 30, degrees=True).as_matrix()
-    world = ls.World([ls.Obstacle("ramp", "box", np.zeros(3), tilted, np.ones(3))])
-    with pytest.raises(ls.InputError, match="'ramp': got a tilted box, want it upright"):
-        world.seen_by("xy")
-
-
 def test_a_row_is_as_long_as_said() -> None:
     assert ls.World([obstacle("box")]).table.shape == (1, ROW)
     assert ls.World().distance(np.zeros((7, 3))).tolist() == [np.inf] * 7
