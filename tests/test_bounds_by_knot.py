@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import constraints
 from sampling import examples
-from scipy.optimize import nnls
+from shooting import Shooting
 from systems import linear
 
 import lqrsim as ls
@@ -31,80 +31,43 @@ def cart(steps: int = 20, **changed: Any) -> ls.Problem:
     return dataclasses.replace(stated, **changed)
 
 
-@dataclasses.dataclass(frozen=True)
-class Drawn:
-    """A linear problem with bounds at some knots, and what it is in the controls alone."""
-
-    problem: ls.Problem
-    onto: Array  # ((T+1) n, T m): states from controls
-    free: Array  # ((T+1) n,): states without controls
-    low: Array  # (T+1, n)
-    high: Array
-
-    @classmethod
-    def of(cls, seed: int, steps: int, n: int, m: int) -> "Drawn":
-        rng = np.random.default_rng(seed)
-        a, b, start = rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.normal(size=n)
-        step, whole = np.eye(n + m), np.eye(n + m)  # Runge and Kutta's step has the first four powers
-        for k in range(1, 5):
-            step = step @ np.block([[a, b], [np.zeros((m, n + m))]]) * DT / k
-            whole = whole + step
-        onto, free = np.zeros((steps + 1, n, steps, m)), np.zeros((steps + 1, n))
-        free[0] = start
-        for t in range(steps):
-            free[t + 1] = whole[:n, :n] @ free[t]
-            onto[t + 1] = np.einsum("ij,jsk->isk", whole[:n, :n], onto[t])
-            onto[t + 1, :, t] += whole[:n, n:]
-        # A feasible plan, about which some states have bounds at some knots.
-        there = free + np.einsum("tisk,sk->ti", onto, 0.5 * rng.normal(size=(steps, m)))
-        acts = rng.random((2, steps + 1, n)) < 0.4
-        low = np.where(acts[0], there - rng.uniform(0.01, 0.3, there.shape), -np.inf)
-        high = np.where(acts[1], there + rng.uniform(0.01, 0.3, there.shape), np.inf)
-        acting = [i for i in range(n) if np.isfinite([low[:, i], high[:, i]]).any()]
-        sides: dict[str, tuple[Any, Array]] = {f"x{i}": (low[:, i], high[:, i]) for i in acting}
-        if n > 1 and rng.random() < 0.5 and "x0" in sides:  # a bound that holds at all knots beside
-            low[:, 0], least = there[:, 0].min() - 0.1, float(there[:, 0].min() - 0.1)
-            sides["x0"] = (least, sides["x0"][1])
-        problem = ls.Problem(
-            dynamics=linear(a, b), dt=DT, steps=steps, initial=ls.FixedState(start),
-            stage_cost=ls.QuadraticCost(np.eye(n), about=np.zeros(n)) + ls.ControlCost(0.1 * np.ones(m)),
-            final_cost=ls.QuadraticCost(10 * np.eye(n), about=np.zeros(n)),
-            constraints=[ls.StateBounds(sides)] if sides else [],
-        )  # fmt: skip
-        return cls(problem, onto.reshape((steps + 1) * n, steps * m), free.ravel(), low, high)
-
-    def residual(self, controls: Array) -> float:
-        """What is left of the cost's slope after the best pull of the bounds that are touched, relative to the slope.
-
-        The problem is convex: a plan that keeps the bounds is the optimum if this is zero.
-        """
-        n, u = len(self.low[0]), controls.ravel()
-        weight = np.ones(len(self.free))
-        weight[-n:] = 10.0
-        x = self.free + self.onto @ u
-        pull = self.onto.T @ (weight * x)
-        slope = pull + 0.1 * u
-        touched = [
-            sign * self.onto[n:][np.abs(x - bound.ravel())[n:] < 1e-5]
-            for sign, bound in ((1.0, self.low), (-1.0, self.high))
-        ]
-        _, left = nnls(np.vstack(touched).T, slope) if sum(map(len, touched)) else (None, np.linalg.norm(slope))
-        return float(left / (np.linalg.norm(pull) + 0.1 * np.linalg.norm(u)))
+def drawn(seed: int, steps: int, n: int, m: int) -> tuple[ls.Problem, Array, Array]:
+    """A linear problem with bounds at some knots, and these bounds (T+1, n)."""
+    rng = np.random.default_rng(seed)
+    a, b, start = rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.normal(size=n)
+    problem = ls.Problem(
+        dynamics=linear(a, b), dt=DT, steps=steps, initial=ls.FixedState(start),
+        stage_cost=ls.QuadraticCost(np.eye(n), about=np.zeros(n)) + ls.ControlCost(0.1 * np.ones(m)),
+        final_cost=ls.QuadraticCost(10 * np.eye(n), about=np.zeros(n)),
+    )  # fmt: skip
+    # A feasible plan, about which some states have bounds at some knots.
+    there = Shooting(problem).points(0.5 * rng.normal(size=steps * m))[:, :n]
+    acts = rng.random((2, steps + 1, n)) < 0.4
+    low = np.where(acts[0], there - rng.uniform(0.01, 0.3, there.shape), -np.inf)
+    high = np.where(acts[1], there + rng.uniform(0.01, 0.3, there.shape), np.inf)
+    acting = [i for i in range(n) if np.isfinite([low[:, i], high[:, i]]).any()]
+    sides: dict[str, tuple[Any, Array]] = {f"x{i}": (low[:, i], high[:, i]) for i in acting}
+    if n > 1 and rng.random() < 0.5 and "x0" in sides:  # a bound that holds at all knots beside
+        low[:, 0], least = there[:, 0].min() - 0.1, float(there[:, 0].min() - 0.1)
+        sides["x0"] = (least, sides["x0"][1])
+    return dataclasses.replace(problem, constraints=[ls.StateBounds(sides)] if sides else []), low, high
 
 
 @settings(max_examples=examples(25))
 @given(seed=st.integers(0, 2**31), steps=st.integers(1, 8), size=st.sampled_from([(1, 1), (2, 1), (3, 2)]))
 def test_plans_meet_the_conditions_of_an_optimum(seed: int, steps: int, size: tuple[int, int]) -> None:
-    """By nonnegative least squares. The cost is right to 1e-10, and the slope to the root of that."""
-    drawn = Drawn.of(seed, steps, *size)
-    solution = ls.smooth(drawn.problem, tolerance=1e-10)
+    """The problem is convex, so that this is the optimum. The cost is right to 1e-10, and the slope to its root."""
+    problem, low, high = drawn(seed, steps, *size)
+    solution = ls.smooth(problem, tolerance=1e-10)
     assert solution.success
     states = solution.trajectory.states[1:]
-    assert (states >= drawn.low[1:] - 1e-9).all()
-    assert (states <= drawn.high[1:] + 1e-9).all()
-    assert drawn.residual(solution.trajectory.controls) < 1e-4
-    for one in constraints.of(drawn.problem):  # by the code that judges plans elsewhere
-        assert one.violation(constraints.points(solution.trajectory)) <= 1e-9
+    assert (states >= low[1:] - 1e-9).all()
+    assert (states <= high[1:] + 1e-9).all()
+    found = Shooting(problem).conditions(solution)
+    assert found.slope < 1e-4
+    assert found.sign == 0
+    assert found.spare < 1e-7  # a product of what is right to 1e-9 and multipliers of some tens
+    assert found.violation <= 1e-9
 
 
 @pytest.mark.parametrize("finish", ["newton", None])

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import systems
-from bounded import DT, bounded, matrices, random_problem
+from bounded import DT, bounded, random_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from linear_quadratic import LinearQuadratic, solve_dense
+from linear_quadratic import matrices_of, solve_dense
 from sampling import examples
 
 import lqrsim as ls
@@ -55,29 +55,21 @@ class TestLinearQuadratic:
     def test_what_is_held_has_no_gain_and_the_rest_those_of_the_reduced_problem(self, seed: int) -> None:
         """Gains as differences of dense KKT solutions of what is left of the horizon, held controls being constants."""
         problem = random_problem(seed, limit=0.4)
-        solution, (A, B) = ls.smooth(problem, **TIGHT), matrices(problem)
+        solution, of = ls.smooth(problem, **TIGHT), matrices_of(problem)
         plan, gain = solution.trajectory, solution.policy.gain
         held = np.abs(plan.controls) == 0.4
         assert held.any()
         assert not held.all()
         np.testing.assert_array_equal(held, (gain == 0).all(axis=2))
-        effort, wish, _ = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
-        end: Any = problem.final_cost
-        constants = held * plan.controls
-        H = np.zeros((problem.steps, 5, 5))
-        H[:, :3, :3], H[:, [3, 4], [3, 4]] = wish.weight, np.where(held, 1.0, np.diag(effort.weight))
-        h = np.zeros((problem.steps, 5))
-        h[:, :3], h[:, 3:] = -wish.weight @ wish.about, np.where(held, 0.0, -effort.weight @ effort.about)
+        of.H[:, [3, 4], [3, 4]] = np.where(held, 1.0, of.H[:, [3, 4], [3, 4]])
+        of.h[:, 3:][held] = 0
+        free = replace(of, B=of.B * ~held[:, None], c=held * plan.controls @ of.B[0].T)
         for t in range(problem.steps):
-            count = problem.steps - t
+            left = {name: getattr(free, name)[t:] for name in ("A", "B", "c", "H", "h", "k")}
             found = [
-                solve_dense(LinearQuadratic(
-                    A=np.tile(A, (count, 1, 1)), B=B * ~held[t:, None], c=constants[t:] @ B.T, H=H[t:], h=h[t:],
-                    k=np.zeros(count), Q0=np.zeros((3, 3)), q0=np.zeros(3), k0=0.0, QT=end.weight,
-                    qT=-end.weight @ end.about, kT=0.0, fixed=plan.states[t] + moved,
-                ))[1][0]
+                solve_dense(replace(free, **left, fixed=plan.states[t] + moved))[1][0]
                 for moved in np.vstack([np.zeros(3), np.eye(3)])
-            ]  # fmt: skip
+            ]
             np.testing.assert_allclose(gain[t], np.array(found[1:]).T - found[0][:, None], rtol=0, atol=1e-9)
             np.testing.assert_allclose(~held[t] * plan.controls[t], found[0], rtol=0, atol=1e-8)
 

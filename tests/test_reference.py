@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear_quadratic import matrices_of, solve_dense
 from sampling import examples
-from scipy.linalg import expm
 from systems import linear
 
 import lqrsim as ls
@@ -57,35 +57,7 @@ class Numbers:
 
     def least(self) -> tuple[Array, Array, float]:
         """States, controls and cost of the optimum, by one dense KKT system of all states and controls."""
-        steps, m = self.controls.shape
-        n = len(self.start)
-        # The exact step of a linear system; the package's Runge-Kutta step has its first four powers.
-        powers, step, whole = np.zeros((n + m, n + m)), np.eye(n + m), np.eye(n + m)
-        powers[:n] = DT * np.hstack([self.a, self.b])
-        for k in range(1, 5):
-            step = step @ powers / k
-            whole = whole + step
-        np.testing.assert_allclose(whole, expm(powers), atol=2e-2)
-        size = steps * (n + m) + n
-        hessian, gradient = np.zeros((size, size)), np.zeros(size)
-        matrix, right = np.zeros(((steps + 1) * n, size)), np.zeros((steps + 1) * n)
-        matrix[:n, :n], right[:n] = np.eye(n), self.start
-        constant = 0.0
-        for t in range(steps + 1):
-            x, u = slice(t * (n + m), t * (n + m) + n), slice(t * (n + m) + n, (t + 1) * (n + m))
-            parts = [(x, self.end_weight if t == steps else self.state_weights[t], self.states[t])]
-            if t < steps:
-                parts.append((u, self.control_weights[t], self.controls[t]))
-                rows = slice((t + 1) * n, (t + 2) * n)
-                matrix[rows, x], matrix[rows, u] = -whole[:n, :n], -whole[:n, n:]
-                matrix[rows, (t + 1) * (n + m) : (t + 1) * (n + m) + n] = np.eye(n)
-            for place, weight, about in parts:
-                hessian[place, place], gradient[place] = weight, weight @ about
-                constant += 0.5 * about @ weight @ about
-        zero = np.zeros((len(matrix), len(matrix)))
-        z = np.linalg.solve(np.block([[hessian, matrix.T], [matrix, zero]]), np.concatenate([gradient, right]))[:size]
-        padded = np.concatenate([z, np.zeros(m)]).reshape(steps + 1, n + m)
-        return padded[:, :n], padded[:-1, n:], float(0.5 * z @ hessian @ z - gradient @ z + constant)
+        return solve_dense(matrices_of(self.problem()))
 
 
 class TestPlans:

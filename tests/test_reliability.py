@@ -10,13 +10,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from linear_quadratic import LinearQuadratic, solve_dense
+from linear_quadratic import matrices_of, solve_dense
 from oracle import kkt
 from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import terms_of
 from lqrsim.results.solution_parts import Status
 
 # Six of the eleven kinds, of each family some: each is compiled where nothing is cached, some 5 seconds, before the
@@ -178,7 +177,7 @@ class TestOracle:
                 problem = problems.draw(kind, index)
                 if isinstance(problem.initial, ls.FixedState):
                     continue
-                states, controls, cost = solve_dense(discretise(problem))
+                states, controls, cost = solve_dense(matrices_of(problem))
                 # From anywhere at all: the model of such a problem is the problem.
                 report = kkt.check(problem, ls.smooth(problem, max_iterations=1, safeguard=False))
                 np.testing.assert_allclose(report.states, states, rtol=0, atol=1e-8 * max(1.0, np.abs(states).max()))
@@ -211,43 +210,6 @@ class TestOracle:
         rate = dynamics.rate(x, u)
         front = rate[:2] + axles * rate[2] * np.array([-np.sin(x[2]), np.cos(x[2])])
         np.testing.assert_allclose(front, x[3] * np.array([np.cos(x[2] + u[0]), np.sin(x[2] + u[0])]), atol=1e-12)
-
-
-def discretise(problem: ls.Problem) -> LinearQuadratic:
-    """A soft-started problem of reliability/linear.py as matrices, its cross terms included."""
-    n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
-    entries = np.array(list(problem.dynamics.parameters.values())).reshape(n, n + m + 1)
-    a, power, integral = entries[:, :n] * problem.dt, np.eye(n), np.zeros((n, n))
-    A = np.zeros((n, n))
-    for order in range(1, 6):
-        A += power
-        if order < 5:
-            integral += problem.dt * power / order
-        power = power @ a / order
-    H, h, k = np.zeros((n + m, n + m)), np.zeros(n + m), 0.0
-    for term in terms_of(problem.stage_cost):
-        if isinstance(term, ls.SymbolicCost):
-            upper = np.zeros((n + m, n + m))
-            upper[np.triu_indices(n + m)] = list(term.parameters.values())
-            H += upper + np.triu(upper, 1).T
-        elif isinstance(term, ls.QuadraticCost | ls.ControlCost):
-            place = slice(0, n) if isinstance(term, ls.QuadraticCost) else slice(n, n + m)
-            H[place, place] += term.weight
-            h[place] -= term.weight @ term.about
-            k += 0.5 * term.about @ term.weight @ term.about
-    start, end = problem.initial, problem.final_cost
-    assert isinstance(start, ls.QuadraticCost)
-    assert isinstance(end, ls.QuadraticCost)
-
-    def every(what: Array | float) -> Array:
-        return np.broadcast_to(what, (steps, *np.shape(what)))
-
-    return LinearQuadratic(
-        A=every(A), B=every(integral @ entries[:, n:-1]), c=every(integral @ entries[:, -1]),
-        H=every(H), h=every(h), k=every(k),
-        Q0=start.weight, q0=-start.weight @ start.about, k0=float(0.5 * start.about @ start.weight @ start.about),
-        QT=end.weight, qT=-end.weight @ end.about, kT=float(0.5 * end.about @ end.weight @ end.about),
-    )  # fmt: skip
 
 
 def pendulum_energy(x: Array, p: dict[str, float]) -> Array:

@@ -77,9 +77,13 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
     if isinstance(constraint, ls.StateBounds):
         bounds = constraint.state_bounds(dynamics).items()
         rows = [(i, sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for i, bound in bounds]
-        rows = [(i, sign, np.broadcast_to(bound, steps + 1)) for i, sign, bound in rows if np.isfinite(bound).any()]
+        rows = [
+            (i, sign, np.broadcast_to(bound, steps + 1))
+            for i, sign, bound in rows
+            if np.ndim(bound) or np.isfinite(bound)
+        ]
         indices, signs = (np.array([row[column] for row in rows]) for column in (0, 1))
-        numbers = np.stack([bound for *_, bound in rows], axis=1)
+        numbers = np.stack([np.broadcast_to(bound, steps + 1) for *_, bound in rows], axis=1)
         goals = [one for one in problem.constraints if isinstance(one, ls.GoalState)]
         fixed = {i for one in goals for i in one.final_states(dynamics)}
         acts = np.stack([changeable & ~(at_end & (i in fixed)) for i in indices], axis=1) & np.isfinite(numbers)

@@ -1,10 +1,10 @@
 """Linear-quadratic problems with limits of the controls, and their solution by bounded least squares."""
 
-from math import factorial
 from typing import Any
 
 import numpy as np
 import systems
+from linear_quadratic import matrices_of
 from scipy.optimize import lsq_linear
 
 import lqrsim as ls
@@ -30,18 +30,10 @@ def random_problem(seed: int, *, steps: int = 10, limit: float = 0.5, fixed: boo
     )  # fmt: skip
 
 
-def matrices(problem: ls.Problem) -> tuple[Array, Array]:
-    """The Runge-Kutta step of the linear system, as a Taylor polynomial."""
-    both = np.array(list(problem.dynamics.parameters.values())).reshape(N, N + M + 1)  # the constant is zero
-    a, b = both[:, :N] * DT, both[:, N:-1] * DT
-    powers = [np.linalg.matrix_power(a, k) for k in range(5)]
-    terms = [(powers[k] / factorial(k), powers[k] / factorial(k + 1) * (k < 4)) for k in range(5)]
-    return np.sum([one for one, _ in terms], axis=0), np.sum([one for _, one in terms], axis=0) @ b
-
-
 def bounded(problem: ls.Problem) -> tuple[float, Array]:
     """Least cost and controls by SciPy's bounded-variable least squares; with a soft start the first state is free."""
-    A, B = matrices(problem)
+    of = matrices_of(problem)
+    A, B = of.A[0], of.B[0]
     effort, wish, _ = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
     fixed = isinstance(problem.initial, ls.FixedState)
     free, steps = 0 if fixed else N, problem.steps

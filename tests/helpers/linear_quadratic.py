@@ -1,10 +1,14 @@
 """Random linear-quadratic problems and their exact solution by one dense linear system: the oracle of the tests."""
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
+from oracle import kkt
 
+import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.problem.costs import terms_of
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,38 @@ def random_problem(seed: int, n: int, m: int, steps: int) -> LinearQuadratic:
         qT=rng.normal(size=n),
         kT=float(rng.normal()),
     )
+
+
+def matrices_of(problem: ls.Problem) -> LinearQuadratic:
+    """A problem of `systems.linear`; its step is that of Runge and Kutta, the first powers of the exponential."""
+    n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
+    rates = np.zeros((n + m + 1, n + m + 1))
+    rates[:n] = problem.dt * np.array(list(problem.dynamics.parameters.values())).reshape(n, n + m + 1)
+    step = sum((np.linalg.matrix_power(rates, k) / factorial(k) for k in range(5)), np.zeros_like(rates))[:n]
+    H, h, k = np.zeros((steps, n + m, n + m)), np.zeros((steps, n + m)), np.zeros(steps)
+    for term in terms_of(problem.stage_cost):
+        if isinstance(term, ls.SymbolicCost):  # systems.cross_cost
+            upper = np.zeros((n + m, n + m))
+            upper[np.triu_indices(n + m)] = list(term.parameters.values())
+            H += upper + np.triu(upper, 1).T
+        elif isinstance(term, ls.QuadraticCost | ls.ControlCost):
+            place = slice(0, n) if isinstance(term, ls.QuadraticCost) else slice(n, n + m)
+            about, weight = kkt.quadratic_at(term, steps)
+            pull = (weight @ about[..., None])[..., 0]
+            H[:, place, place] += weight
+            h[:, place] -= pull
+            k += 0.5 * (about * pull).sum(axis=-1)
+
+    def of_end(cost: ls.QuadraticCost, at: int) -> tuple[Array, Array, float]:
+        weight, about = (part[at] if part.ndim > size else part for part, size in ((cost.weight, 2), (cost.about, 1)))
+        return weight, -weight @ about, float(0.5 * about @ weight @ about)
+
+    fixed = problem.initial.numbers if isinstance(problem.initial, ls.FixedState) else None
+    none = ls.QuadraticCost(np.zeros(n), about=np.zeros(n))
+    Q0, q0, k0 = of_end(problem.initial if fixed is None else none, 0)  # pyright: ignore[reportArgumentType]
+    QT, qT, kT = of_end(problem.final_cost, -1)  # pyright: ignore[reportArgumentType]
+    A, B, c = (np.tile(part, (steps, *[1] * part.ndim)) for part in (step[:, :n], step[:, n:-1], step[:, -1]))
+    return LinearQuadratic(A, B, c, H, h, k, Q0, q0, k0, QT, qT, kT, fixed)
 
 
 def solve_dense(problem: LinearQuadratic) -> tuple[Array, Array, float]:
