@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from sampling import rarely
+from sampling import is_short, rarely
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -188,7 +188,7 @@ def test_a_killed_driver_is_resumed(reference: Results, tmp_path: Path) -> None:
     folder, draws = tmp_path / "killed", random.Random(3)
     command = [sys.executable, "-m", "lqrsim.cli", "stress", *COMMAND, "--workers", "2", "--out", str(folder)]
     counts = []
-    for _ in range(2):
+    for _ in range(1 if is_short() else 2):
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
         ) as driver:

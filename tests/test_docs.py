@@ -144,6 +144,7 @@ def test_wheels_as_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert errors[name] == pytest.approx(float(number) * (1 if unit == "cm" else 100), rel=0.25)
 
 
+@pytest.mark.long
 def test_the_gear_that_the_plan_chooses_is_that_of_the_formula() -> None:
     names = run_page("gradients.md")
     assert names["best"].x[0] == pytest.approx(20.0, rel=1e-4)  # BFGS stops at slopes of 1e-5
@@ -156,6 +157,7 @@ def test_the_gear_that_the_plan_chooses_is_that_of_the_formula() -> None:
     assert float(names["teeth"]) == pytest.approx((above - below) / 0.2, rel=1e-4)
 
 
+@pytest.mark.long
 def test_least_time_is_that_of_the_formula() -> None:
     names = run_page("least_time.md")
     assert names["fast"].trajectory.horizon == pytest.approx(2 * np.sqrt(2), rel=1e-4)

@@ -6,19 +6,21 @@ import re
 import signal
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from interrupting import interrupted
-from sampling import rarely
+from sampling import is_short, rarely
 from scipy import stats
 
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.references import resolve
+from lqrsim.stress import multilevel_splitting
 from lqrsim.stress.trial_score import TrialScore
 
 # One random number decides: how far towards the wall behind it the robot begins.
@@ -231,12 +233,13 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
 def test_the_search_for_first_failures_has_the_given_number_of_particles(own: str, seed: int) -> None:
     """More particles, more trials; 200 are the default. All find the same failure, to a tenth."""
     problem = ls.stress.ReliabilityProblem(f"{own}:shifted", strength=2, policy="open_loop")
-    given: list[dict[str, Any]] = [{"particles": 20}, {"particles": 60}, {}]
+    given: list[dict[str, Any]] = [{"particles": 20}, {"particles": 60}, *[{}] * (not is_short())]
     found = [problem.smallest_failure(rounds=1, seed=seed, **more) for more in given]
-    few, some, many = (one.simulations for one in found)
-    assert some - few > 2 * 40 - 1  # two repetitions, of at least one level
-    assert many - some > 2 * 140 - 1
-    assert [one.options["particles"] for one in found] == [20, 60, 200]
+    sizes = [one.options["particles"] for one in found]
+    assert sizes == [20, 60, 200][: len(given)]
+    for one, other in pairwise(found):
+        more = other.options["particles"] - one.options["particles"]
+        assert other.simulations - one.simulations > 2 * more - 1  # two repetitions, of at least one level
     for one in found:
         assert one.point.distance == pytest.approx(found[-1].point.distance, rel=0.1)
 
@@ -274,8 +277,9 @@ def test_options_are_refused_before_anything_is_solved(options: dict[str, Any], 
 
 @pytest.mark.parametrize("command", ["rare", *rarely("break")])
 def test_where_there_is_no_failure_it_says_so(
-    command: str, own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(multilevel_splitting, "MOST_BATCHES", 4)
     small = ["--particles", "20", *(["--repetitions", "2"] if command == "rare" else ["--rounds", "3"])]
     words = [command, f"{own}:shifted,most=0.2", *OPEN, *small, "--out", str(tmp_path / "out")]
     assert main(words) == 1

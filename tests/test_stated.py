@@ -96,21 +96,20 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
     np.testing.assert_array_equal(again.states, wanted.states)
 
 
-def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.stress.Results, tmp_path: Path) -> None:
+def test_what_is_stated_is_written_down_and_part_of_the_digest(tmp_path: Path) -> None:
     assert ls.stress.Campaign.from_json(CAMPAIGN.as_json(), ls.scenarios.quadrotor()) == CAMPAIGN
-    assert results.manifest["campaign"]["design_disturbances"][2] == {
+    small = replace(CAMPAIGN, policies=("track",), strengths=(1.0,), trials=1)
+    manifests = []
+    for number, stated in enumerate((None, (ControlNoise(0.1), MeasurementNoise(0.01)), LIGHT)):
+        ls.stress.run_campaign(replace(small, design_disturbances=stated), tmp_path / str(number), workers=0)
+        manifests.append(read_manifest(tmp_path / str(number)))
+    assert len({manifest["digest"] for manifest in manifests}) == 3
+    with pytest.raises(InputError, match=r"^design_disturbances: got .*want .* or another folder"):
+        ls.stress.run_campaign(replace(small, design_disturbances=LIGHT), tmp_path / "1", workers=0)
+    assert manifests[-1]["campaign"]["design_disturbances"][2] == {
         "kind": "AxleMismatch",
         "settings": {"std": 0.01, "factor": None},
     }
-    other = replace(CAMPAIGN, design_disturbances=(ControlNoise(0.1), MeasurementNoise(0.01)), trials=1)
-    with pytest.raises(InputError, match=r"^design_disturbances: got .*want .* or another folder"):
-        ls.stress.run_campaign(replace(other, trials=2), results.folder, workers=0)
-    small = replace(other, policies=("track",), strengths=(1.0,))
-    digests = []
-    for number, stated in enumerate((None, LIGHT, other.design_disturbances)):
-        ls.stress.run_campaign(replace(small, design_disturbances=stated), tmp_path / str(number), workers=0)
-        digests.append(read_manifest(tmp_path / str(number))["digest"])
-    assert len(set(digests)) == 3
 
 
 def test_by_default_the_preset_in_the_middle_is_stated(

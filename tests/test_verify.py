@@ -177,7 +177,7 @@ def off(view: str, axis: int) -> Callable[[Camera, object, float], None]:
     return elsewhere
 
 
-@pytest.mark.parametrize(("view", "axis"), [("top", 0), ("top", 1), ("side", 2)])
+@pytest.mark.parametrize(("view", "axis"), [("top", 0), ("side", 2), *rarely(("top", 1))])
 def test_a_camera_that_is_off_by_2_cm_is_told(
     view: str, axis: int, case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -357,7 +357,7 @@ def verified_as_rod(
 
 
 @pytest.mark.parametrize(
-    ("thickness", "seed"), [(0.3, 0), (2.3, None), (17.0, None), *rarely((0.8, 1), (5.0, 3), (7.4, None))]
+    ("thickness", "seed"), [(0.3, 0), (17.0, None), *rarely((0.8, 1), (2.3, None), (5.0, 3), (7.4, None))]
 )
 def test_a_thin_rod_is_seen_as_well_as_a_ball(
     thickness: float, seed: int | None, short: ls.Rollout, monkeypatch: pytest.MonkeyPatch
