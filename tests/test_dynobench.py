@@ -76,17 +76,6 @@ def test_boxes_are_as_far_apart_as_a_minimiser_finds_them() -> None:
         assert max(check.apart(box, other), 0.0) == pytest.approx(np.sqrt(found.fun), abs=1e-6)
 
 
-def test_a_plan_is_right_in_exact_time_and_by_euler_steps() -> None:
-    plan = ls.smooth(statements.in_least_time(EMPTY, right=True), threads=1).trajectory
-    assert plan.horizon <= 0.96  # the published
-    assert not check.failures(check.exactly(EMPTY, plan.controls, plan.dt), check.RIGHT)
-    problem, start = statements.by_euler_steps(EMPTY, plan, 96)  # the published time, in its steps of 0.01 s
-    found = ls.smooth(problem, start=start, threads=1)
-    assert found.status is ls.Status.CONVERGED
-    stepped = found.trajectory
-    assert not check.failures(check.by_euler(EMPTY, stepped.states, stepped.controls), check.ACCEPTED)
-
-
 @pytest.mark.parametrize("case", rarely(EMPTY, PARKING))
 def test_all_statements_pass_and_none_is_slower_than_the_published(case: Case) -> None:
     row = dynobench.solve(case, statements=["exact", "euler"])
