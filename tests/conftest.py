@@ -1,11 +1,15 @@
 import logging
 import signal
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
 
 import lqrsim as ls
+
+TESTS = Path(__file__).resolve().parent
 
 # Machines may be busy, so examples have no time limit. Where long tests are left out, families are drawn less often
 # (tests/helpers/sampling.py) and always the same, and the predictions of runs have fewer trials, unless a test says how
@@ -16,6 +20,12 @@ hypothesis.settings.register_profile("short", deadline=None, derandomize=True, d
 
 def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.load_profile("short" if is_short(config) else "whole")
+    # Processes that share all tests begin with other files each, so that in a fresh clone each file is compiled by one.
+    asked: dict[str, Any] = getattr(config, "workerinput", {})
+    if asked and [Path(name).resolve() for name in config.args] == [TESTS]:
+        files = sorted(str(path) for path in TESTS.glob("test_*.py"))
+        first = len(files) * int(asked["workerid"].removeprefix("gw")) // asked["workercount"]
+        config.args[:] = files[first:] + files[:first]
 
 
 def is_short(config: pytest.Config) -> bool:
@@ -34,15 +44,15 @@ def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
 # The slowest files start first: a file is not divided among processors, and one that starts last keeps all waiting.
 # In this order the first three files do not compile the same code at the same time.
 LONGEST = (
-    "kernels", "campaign", "failure_commands", "render", "parking", "process", "docs", "verify", "offset_free",
-    "robustness_api", "whole_problems", "mjcf_robot", "demo", "experiments", "approaches", "stated", "given_solutions",
-    "viewer", "smoother", "site", "report", "comparison", "splitting",
+    "kernels", "campaign", "failure_commands", "render", "parking", "process", "whole_problems", "docs", "verify",
+    "robustness_api", "belief", "mjcf_robot", "cli", "stated", "endings", "offset_free", "demo", "experiments",
+    "approaches", "given_solutions", "viewer", "cache", "smoother", "site", "report", "comparison", "splitting",
 )  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     names = [f"test_{name}.py" for name in LONGEST]
-    items.sort(key=lambda item: names.index(item.path.name) if item.path.name in names else len(names))
+    items.sort(key=lambda item: (names.index(item.path.name) if item.path.name in names else len(names), item.path))
 
 
 @pytest.fixture(scope="session", autouse=True)

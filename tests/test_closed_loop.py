@@ -3,9 +3,9 @@
 import inspect
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import mujoco
@@ -306,11 +306,40 @@ def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
 # Bad input
 
 
-@pytest.mark.parametrize(("part", "name"), [("body", "sled"), ("joint", "across"), ("actuator", "steer")])
-def test_a_robot_that_lacks_a_part_is_told_which(tmp_path, part, name):
-    (tmp_path / "ice.xml").write_text(SLED.replace(f'"{name}"', f'"other_{name}"'))
-    with pytest.raises(InputError, match=f"^scene ice: got no robot sled in it, want its {part} '{name}';.*other_"):
-        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+def fitted(was: str = "", instead: str = "", **fields: object) -> Plant:
+    """A plant of a sled with other fields, in a scene with another text."""
+    robot = Sled()
+    vars(robot).update(fields)
+    return Plant(robot, scene_from_xml(re.sub(was, instead, SLED) if was else SLED, "ice"))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        *[(partial(fitted, f'"{name}"', f'"other_{name}"'),
+           f"^scene ice: got no robot sled in it, want its {part} '{name}';.*other_")
+          for part, name in (("body", "sled"), ("joint", "across"), ("actuator", "steer"))],
+        (lambda: fitted(r' name="across"|<\w+ [^<]*joint="across"[^<]*/>'),
+         r"want its joint 'across'; it has: along, 1 without a name \(joint \d has none, counted from 0: name"),
+        (lambda: fitted(' name="steer"'),
+         r"want its actuator 'steer'; it has: push, 1 without a name \(actuator \d has none, counted from 0"),
+        (lambda: fitted(joints="across"), "robot sled: joints: got 'across', want names of the MJCF in a tuple"),
+        (lambda: fitted(joints=("across", "")), r"robot sled: joints: got \('across', ''\), want names"),
+        (lambda: fitted(joints=("across", "across")), "robot sled: joints: got a name twice in across, across"),
+        (lambda: fitted(drag=-1.0), "robot sled: drag: got -1.0, want a finite number >= 0"),
+        (lambda: fitted(actuators=()), r"robot sled: actuation: got shape \(2,\), want \(0,\) for no actuators"),
+        (lambda: fitted(radius=-1.0), "robot sled: radius: got -1.0, want a finite number >= 0"),
+        (lambda: fitted(radius=None),
+         "robot sled: radius: got none, want a number >= 0, in m: .* its size in pictures"),
+        (lambda: fitted("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>'),
+         "scene ice: got an MJCF that cannot be run in batches: sleep and IPC"),
+        (lambda: fitted('timestep="[^"]*"', 'timestep="3e-8"').substeps(0.09),
+         "control period: got 0.09 s, 3,000,000 physics steps of scene ice, want at most 20,000"),
+    ],
+)  # fmt: skip
+def test_a_robot_that_does_not_fit_is_told_why(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()
 
 
 def test_a_control_period_that_is_no_multiple_of_the_physics_step_is_told_both(cage):
@@ -334,77 +363,6 @@ def test_what_the_plant_adds_has_names_of_its_own(tmp_path):
     named = [plant.model.sensor(number).name for number in range(plant.model.nsensor)]
     assert named[:2] == ["contact with wall", "contact with box 0"]
     assert len(named) == len(set(named)) == 2 + len(plant.world)
-
-
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        (
-            "joint",
-            r"want its joint 'across'; it has: along, 1 without a name \(joint \d has none, counted from 0: name",
-        ),
-        (
-            "actuator",
-            r"want its actuator 'steer'; it has: push, 1 without a name \(actuator \d has none, counted from 0",
-        ),
-    ],
-)
-def test_what_has_no_name_is_told_by_its_number(tmp_path, kind, message):
-    (tmp_path / "ice.xml").write_text(SLED.replace(' name="across"' if kind == "joint" else ' name="steer"', ""))
-    if kind == "joint":
-        text = (tmp_path / "ice.xml").read_text()
-        (tmp_path / "ice.xml").write_text(re.sub(r'<(\w+) [^<]*joint="across"[^<]*/>', "", text))
-    with pytest.raises(InputError, match=message):
-        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"joints": "across"}, "robot sled: joints: got 'across', want names of the MJCF in a tuple"),
-        ({"joints": ("across", "")}, r"robot sled: joints: got \('across', ''\), want names"),
-        ({"joints": ("across", "across")}, "robot sled: joints: got a name twice in across, across"),
-        ({"drag": -1.0}, "robot sled: drag: got -1.0, want a finite number >= 0"),
-        ({"actuators": ()}, r"robot sled: actuation: got shape \(2,\), want \(0,\) for no actuators"),
-    ],
-)
-def test_a_robot_whose_names_are_none_is_told(tmp_path, fields, message):
-    (tmp_path / "ice.xml").write_text(SLED)
-    robot = type("Odd", (Sled,), fields)()
-    with pytest.raises(InputError, match=message):
-        Plant(robot, load_scene(tmp_path / "ice.xml"))
-
-
-@pytest.mark.parametrize(
-    ("radius", "message"),
-    [
-        (-1.0, "robot sled: radius: got -1.0, want a finite number >= 0"),
-        (None, "robot sled: radius: got none, want a number >= 0, in m: .* its size in pictures"),
-    ],
-)
-def test_a_robot_without_a_radius_is_told_what_it_is_for(tmp_path, radius, message):
-    (tmp_path / "ice.xml").write_text(SLED)
-    robot = Sled()
-    vars(robot)["radius"] = radius
-    with pytest.raises(InputError, match=message):
-        Plant(robot, load_scene(tmp_path / "ice.xml"))
-
-
-def test_a_model_that_sleeps_is_told(tmp_path):
-    (tmp_path / "ice.xml").write_text(
-        SLED.replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', 1)
-    )
-    with pytest.raises(InputError, match="scene ice: got an MJCF that cannot be run in batches: sleep and IPC"):
-        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
-
-
-def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
-    (tmp_path / "ice.xml").write_text(re.sub(r'timestep="[^"]*"', 'timestep="3e-8"', SLED))
-    plant = Plant(Sled(), load_scene(tmp_path / "ice.xml"))
-    with pytest.raises(
-        InputError, match=r"control period: got 0.09 s, 3,000,000 physics steps of scene ice, want at most 20,000"
-    ):
-        plant.substeps(0.09)
 
 
 def test_a_saved_policy_runs_as_the_one_that_was_saved(
