@@ -15,7 +15,6 @@ from typing import Any, get_args, get_type_hints
 import av
 import numpy as np
 import pytest
-from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -202,12 +201,6 @@ def test_simulate_predicts_where_the_run_will_be_or_says_why_not(
     assert line.startswith("the predicted tube leaves out push of (1, 0, 0) N s at 2.5 s")
     assert simulate(solved, tmp_path).tube is None
     assert "tube" not in capsys.readouterr().out
-
-
-def test_simulate_with_another_seed_is_another_run(solved: Path, tmp_path: Path) -> None:
-    runs = [simulate(solved, tmp_path / seed, "--control-noise", "0.05", "--seed", seed) for seed in ("1", "1", "2")]
-    np.testing.assert_array_equal(runs[0].states, runs[1].states)
-    assert not np.array_equal(runs[0].states, runs[2].states)
 
 
 def test_render_writes_a_video_of_a_rollout(solved: Path, tmp_path: Path) -> None:
@@ -533,19 +526,9 @@ def test_too_little_memory_is_one_line(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
-@pytest.mark.parametrize(
-    ("what", "largest"),
-    [("robot", 0), ("video", 40_000), ("policy", 4096), ("table", 4096), *rarely(("video", 0), ("policy", 0))],
-)
-def test_a_full_disk_is_one_line(what: str, largest: int, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     """In another process, for a video that could not even be begun ended it by a fault of memory."""
-    lines = {
-        "robot": "main(['new', 'robot']) == 2 or None",
-        "policy": "ls.save(policy, 'a.npz')",
-        "video": "video()",
-        "table": "write(bytes(50_000), Path('a.parquet'))",
-    }
-    program = f"""
+    program = """
 import resource
 from fractions import Fraction
 from pathlib import Path
@@ -566,17 +549,21 @@ def video():
         for number in range(60):
             put(np.random.default_rng(number).integers(0, 255, (64, 64, 3), dtype=np.uint8))
 
-resource.setrlimit(resource.RLIMIT_FSIZE, ({largest}, {largest}))
-try:
-    {lines[what]}
-except ls.InputError as error:
-    print(f"lqrsim: error: {{error}}")
+save = lambda: ls.save(policy, "a.npz")
+table = lambda: write(bytes(50_000), Path("a.parquet"))
+new = lambda: main(["new", "robot"])
+for largest, work in ((0, new), (40_000, video), (4096, save), (4096, table), (0, save), (0, video)):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.RLIM_INFINITY))
+    try:
+        work()
+    except ls.InputError as error:
+        print(f"lqrsim: error: {error}")
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=600)
     said = [line for line in (done.stdout + done.stderr).splitlines() if line.startswith("lqrsim: error")]
     assert done.returncode == 0, done.stderr
-    assert len(said) == 1
-    assert said[0].endswith("want a file that can be written (File too large)")
+    assert len(said) == 6
+    assert all(line.endswith("want a file that can be written (File too large)") for line in said)
     assert "Traceback" not in done.stderr
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(("a.", ".unfinished"))]
 
