@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_name, excerpt, vectors_of
+from lqrsim.errors import Array, InputError, check_items, check_memory, check_name, excerpt, vectors_of
 from lqrsim.kernels.rotation_ratios import cosine_ratio, cotangent_ratio, sine_ratio
 
 Vector = Sequence[Any] | npt.NDArray[Any]
@@ -148,6 +148,8 @@ def _three(field: str, vector: Vector) -> tuple[Any, ...]:
     if len(found) != 3 or too_large or any(isinstance(one, str) for one in found):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
     if all(_numeric(one) for one in found):
+        for one in found:
+            check_memory(field, np.size(one), 32, "arrays made from it")  # a broadcast array takes little memory itself
         return found
     import sympy
 

@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from lqrsim import kernels
+from lqrsim.annotations import checked
 from lqrsim.codegen.language import CONSTANTS, MATH, SubsetError
 from lqrsim.errors import InputError, check_kind, excerpt
 from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
@@ -33,6 +34,7 @@ PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
 Constant = bool | int | float | tuple[Any, ...]
 
 
+@checked
 @dataclass(frozen=True)
 class Source:
     """Functions in the kernels' subset; `source_of` and `text_source` make it.
@@ -49,6 +51,11 @@ class Source:
     constants: tuple[tuple[str, Constant], ...] = ()
     fills: tuple[tuple[str, "Source", str], ...] = ()
     what: str = field(default="source", compare=False)
+
+    def __post_init__(self) -> None:
+        for name, number in self.constants:
+            if not _is_constant(number):
+                raise InputError(f"source: {name}: got {excerpt(number)}, want a number or a tuple of numbers")
 
     def __hash__(self) -> int:
         return self._hash
@@ -234,7 +241,7 @@ class Scope:
         if name in self._imports:
             return self._imported(*self._imports[name])
         if self.source.module:
-            value = getattr(importlib.import_module(self.source.module), name, None)
+            value = getattr(_imported(self.source.module), name, None)
             if _is_constant(value):
                 return value
         elif (found := self._at_hand(name)) is not None:
@@ -299,9 +306,16 @@ def _is_kernels(module: str) -> bool:
     return module.startswith(f"{kernels.__name__}.")
 
 
+def _imported(module: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except (ImportError, ValueError):
+        raise InputError(f"source: module: got {excerpt(module)}, want the name of one that can be imported") from None
+
+
 @functools.cache
 def _module_text(module: str) -> str:
-    return inspect.getsource(importlib.import_module(module))
+    return inspect.getsource(_imported(module))
 
 
 @functools.cache
@@ -311,7 +325,7 @@ def _text_of(module: str) -> str:
     """
     if module.startswith(__name__.partition(".")[0] + "."):
         return _module_text(module)
-    home, parsed = importlib.import_module(module), _parsed_module(module)
+    home, parsed = _imported(module), _parsed_module(module)
     names = {node.id for own in parsed.functions.values() for node in ast.walk(own) if isinstance(node, ast.Name)}
     constants = ((name, getattr(home, name, None)) for name in sorted(names))
     return "\n".join([parsed.text, *(f"{name} = {value!r}" for name, value in constants if _is_constant(value))])

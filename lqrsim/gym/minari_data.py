@@ -98,7 +98,7 @@ def _checked(task: Task, rollouts: Iterable[Any]) -> Iterator[Rollout]:
     """The runs. Raises InputError unless each is a run of the task's plan."""
     wanted = "a Rollout, or several, such as simulate(...) returns"
     plan, system = task.solution.trajectory, spaces_of(task.plant.robot.dynamics)
-    if not isinstance(rollouts, Iterable):
+    if not isinstance(rollouts, Iterable) or isinstance(rollouts, np.ndarray):
         raise InputError(f"rollouts: got {excerpt(rollouts)}, want {wanted}")
     for rollout in rollouts:
         own = check_kind("rollouts", rollout, Rollout, wanted).plan

@@ -201,6 +201,7 @@ class Belief(Dynamics):
           parameters: name -> value, as in `SymbolicConstraint`.
           name: as in `SymbolicConstraint`.
         """
+        parameters = check_kind("chance_constraint: parameters", parameters or {}, Mapping, "a dictionary by name")
         n, names = self.size, tuple(self.robot.state_coordinates.names)
         quantile = -NormalDist().inv_cdf(chance)
 
@@ -216,7 +217,7 @@ class Belief(Dynamics):
                 margins.append(entry - p.deviations * sqrt(spread))
             return margins
 
-        return SymbolicConstraint(margin, parameters={**(parameters or {}), "deviations": quantile}, name=name)
+        return SymbolicConstraint(margin, parameters={**parameters, "deviations": quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
         """The beliefs (K, N) of the extended Kalman filter one period later.

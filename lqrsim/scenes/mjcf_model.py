@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
+from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_name, excerpt
 from lqrsim.scenes import mjcf_text
 from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, UNNAMED, mujoco
@@ -129,6 +130,7 @@ class Actuator:
     bias: tuple[float, ...] | None
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class MjcfModel:
     """An MJCF: its text, and what MuJoCo compiles from it, once, when it is first asked for.

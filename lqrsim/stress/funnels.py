@@ -379,7 +379,8 @@ def check_funnel(
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
         raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
-    if between[0] >= between[1]:
+    between = check_array("between", between, (2,)).tolist()
+    if not 0 <= between[0] < between[1]:
         raise InputError(f"between: got {excerpt(between)}, want two shares of the level, in order, from 0 on")
     if seed == funnel.seed:
         raise InputError(f"seed: got {seed}, the funnel's own, want another one, for new trials")

@@ -115,6 +115,8 @@ class Setup:
         keep(self, scenario=from_anywhere(self.scenario))  # workers and reports may run in other folders
         kinds = (Solution, str, os.PathLike, type(None))
         check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
+        if not isinstance(design := self.design_disturbances, str | None):
+            keep(self, design_disturbances=check_items("design_disturbances", design, Disturbance, "disturbances"))
 
     @cached_property
     def resolved(self) -> Scenario:
