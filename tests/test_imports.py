@@ -91,7 +91,7 @@ FLOORS_WITHIN = {
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.
 ALLOWED = {
-    "mujoco": ("scenes", "simulation", "view", "verify"),
+    "mujoco": ("scenes", "robots", "simulation", "view", "verify"),
     "matplotlib": ("view", "reports"),
     "av": ("view", "verify"),
     "jax": ("codegen",),
