@@ -96,9 +96,8 @@ from lqrsim.problem.last_command import LastCommand
 from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.problem.within_periods import WithinPeriods
 from lqrsim.results.archive import sha256
-from lqrsim.robots.force_limits import ForceLimits
+from lqrsim.robots.force_limits import ForceLimit, ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.scenes.mjcf_holding import ForceLimit
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget

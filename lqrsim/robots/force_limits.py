@@ -8,7 +8,9 @@ never clips, and both models are the same along it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from lqrsim.codegen.sources import source_of
@@ -18,11 +20,41 @@ from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.scenes.mjcf_holding import ForceLimit
+from lqrsim.scenes.mjcf_holding import without_limits
+from lqrsim.scenes.mjcf_model import MjcfModel
+from lqrsim.scenes.mujoco_log import unlogged
 
 # Fraction of its range that a plan keeps a force from its limits: MuJoCo's implicit integrators step differently where
 # a force is clipped, by however little.
 SPARED = 1e-3
+_PROBES, _LINEAR = 4, 1e-9  # random states at which a force is compared with its slopes, and the relative error
+
+
+class ForceLimit(NamedTuple):
+    """A limited force that is linear in state and control.
+
+    Attributes:
+      name, unit: of the force, as "of actuator" or "on joint". low, high: its limits.
+      slopes: (1+n+m,) its value at zero, and its slopes.
+      of_joint: whether the limit is that of a joint, on the sum of all actuators, or of an actuator. id: its id.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    slopes: Array
+    of_joint: bool
+    id: int
+
+    def can_be_kept(self, state: Array, low: Array, high: Array) -> bool:
+        """Whether some control (m,) between `low` and `high` keeps it in a state (n,)."""
+        n = len(state)
+        slopes = self.slopes[1 + n :]
+        moved = slopes != 0
+        ends = np.stack([slopes[moved] * side[moved] for side in (low, high)])
+        force = self.slopes[0] + self.slopes[1 : 1 + n] @ state
+        return bool(force + ends.min(axis=0).sum() <= self.high and force + ends.max(axis=0).sum() >= self.low)
 
 
 class ForceLimits(Constraint):
@@ -118,6 +150,50 @@ class ForceLimits(Constraint):
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
             uses_control=True, convex=True, ranges=np.tile(ranges, 2), linear=True, yields=True, names=names,
         )  # fmt: skip
+
+
+def limited_forces(mjcf: MjcfModel) -> tuple[tuple[ForceLimit, ...], tuple[str, ...]]:
+    """The limited forces of an MJCF that are linear, and the names of the others.
+
+    A force is linear if its differences about zero predict it at random states.
+    """
+    model = without_limits(mjcf.model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    data, nv, n = mujoco.MjData(model), model.nv, 2 * model.nv + model.na
+    units = {one.name: "N m" if one.kind == "hinge" else "N" for one in mjcf.joints}
+    limited = [
+        (f"of {one.name}", units.get(one.joint or "", "N"), one.forces, one.outputs.start, False, i)
+        for i, one in enumerate(mjcf.actuators)
+    ]
+    limited += [
+        (f"on {one.name}", units[one.name], one.forces, model.nout + one.dof, True, i)
+        for i, one in enumerate(mjcf.joints)
+    ]
+    limited = [one for one in limited if np.isfinite(one[2]).any()]
+    if not limited:
+        return (), ()
+
+    def forces(z: Array) -> Array:
+        """Of all actuators' outputs and on all joints, (nout+nv,)."""
+        data.qpos[:], data.qvel[:] = mjcf.qpos_of(z[:nv]), z[nv : 2 * nv]
+        data.act[:], data.ctrl[:] = z[2 * nv : n], z[n:]
+        for part in (mujoco.mj_fwdPosition, mujoco.mj_fwdVelocity, mujoco.mj_fwdActuation):
+            part(model, data)
+        return np.concatenate([data.actuator_force, data.qfrc_actuator])
+
+    with unlogged():
+        slopes = np.stack([(forces(one) - forces(-one)) / 2 for one in np.eye(n + model.nu)])
+        zero, linear = forces(np.zeros(n + model.nu)), np.ones(slopes.shape[1], dtype=bool)
+        for z in np.random.default_rng(0).normal(size=(_PROBES, n + model.nu)):
+            size = np.abs(zero) + np.abs(z) @ np.abs(slopes)
+            linear &= np.abs(forces(z) - zero - z @ slopes) <= _LINEAR * size
+    slopes = np.vstack([zero, slopes])
+    kept = tuple(
+        ForceLimit(name, unit, *sides, slopes[:, place].copy(), of_joint, number)
+        for name, unit, sides, place, of_joint, number in limited
+        if linear[place]
+    )
+    return kept, tuple(name for name, _, _, place, _, _ in limited if not linear[place])
 
 
 # The kernel. `data` has the numbers of steps and rows, and for each step and row its value at zero and its slopes.

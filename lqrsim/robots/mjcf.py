@@ -33,11 +33,11 @@ from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.problem.state_bounds import StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
-from lqrsim.robots.force_limits import ForceLimits
+from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms, SelfClearance
 from lqrsim.rotations import AXES
-from lqrsim.scenes.mjcf_holding import ForceLimit, Holding, efforts, holding, limited_forces, settled
+from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of

@@ -1,21 +1,29 @@
 """Sensors of a robot's MJCF, with their errors and their timing."""
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Annotated
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Bounds, NonNegative, Positive, Want, checked
-from lqrsim.errors import Array, InputError, check_items
+from lqrsim.errors import Array, InputError, check_items, check_name
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.robots.base import Robot, indices_in
-from lqrsim.scenes.mjcf_sensors import NO_HIT, QUATERNIONS, SensorReader, file_sensor
 from lqrsim.scenes.scene import Scene
 
+_TYPES = mujoco.mjtSensor
+# What these read jumps, has no number in the state, or is of another program: no filter can be linearised about it.
+_REFUSED = {
+    getattr(_TYPES, f"mjSENS_{name}")
+    for name in ("TOUCH", "CONTACT", "TACTILE", "INSIDESITE", "CLOCK", "USER", "PLUGIN", "GEOMNORMAL", "GEOMFROMTO")
+}
+_NO_HIT = -1.0  # what a rangefinder reads if its ray meets nothing
+_QUATERNIONS = _TYPES.mjSENS_FRAMEQUAT, _TYPES.mjSENS_BALLQUAT  # a reading of these and its negative mean the same
 # Of a period: a time that is a knot, up to rounding, is that knot.
 _ROUNDING = 1e-9
 
@@ -70,27 +78,29 @@ class RobotSensors:
             raise InputError(f"sensors: got {[one.name for one in given]}, want at least one, each at most once")
         self._robot, self._scene = robot, scene
         self.drag = robot.drag
-        found = [file_sensor(scene.model, one.name, "sensors") for one in given]
-        self.sensors = tuple(
-            replace(
-                one, noise=said.noise if one.noise is None else one.noise,
-                rate=1 / said.interval if one.rate is None and said.interval else one.rate,
-                delay=said.delay if one.delay is None else one.delay,
+        model, sensors, places, far = scene.model, list[Sensor](), list[npt.NDArray[np.intp]](), list[Array]()
+        columns, names, quaternions, count = list[slice](), list[str](), list[bool](), 0
+        for one in given:
+            number = _number_of(model, one.name)
+            kind, size = _TYPES(model.sensor_type[number]), int(model.sensor_dim[number])
+            interval = float(model.sensor_interval[number, 0])  # 0 for each physics step
+            sensors.append(
+                replace(
+                    one,
+                    noise=float(model.sensor_noise[number]) if one.noise is None else one.noise,
+                    rate=1 / interval if one.rate is None and interval else one.rate,
+                    delay=float(model.sensor_delay[number]) if one.delay is None else one.delay,
+                )
             )
-            for one, said in zip(given, found, strict=True)
-        )  # fmt: skip
-        sizes = [said.columns.stop - said.columns.start for said in found]
-        ends = np.cumsum([0, *sizes]).tolist()
-        self.columns = tuple(slice(first, end) for first, end in pairwise(ends))
-        self.names = tuple(
-            f"{one.name}[{i}]" if size > 1 else one.name
-            for one, size in zip(given, sizes, strict=True)
-            for i in range(size)
-        )
-        self.quaternions = tuple(said.kind in QUATERNIONS for said in found)
-        self._places = np.concatenate([np.arange(said.columns.start, said.columns.stop) for said in found])
-        far = [np.full(size, said.kind == "rangefinder") for size, said in zip(sizes, found, strict=True)]
-        self._far = np.concatenate(far)
+            columns.append(slice(count, count + size))
+            names += [f"{one.name}[{i}]" for i in range(size)] if size > 1 else [one.name]
+            quaternions.append(kind in _QUATERNIONS)
+            places.append(int(model.sensor_adr[number]) + np.arange(size))
+            far.append(np.full(size, kind == _TYPES.mjSENS_RANGEFINDER))
+            count += size
+        self.sensors, self.columns, self.names = tuple(sensors), tuple(columns), tuple(names)
+        self.quaternions = tuple(quaternions)
+        self._places, self._far = np.concatenate(places), np.concatenate(far)
 
     def __repr__(self) -> str:
         return f"RobotSensors({', '.join(one.name for one in self.sensors)})"
@@ -124,23 +134,47 @@ class RobotSensors:
     def readings(self, sensordata: Array) -> Array:
         """The readings (K, Y) in MuJoCo's `sensordata` (K, any); NaN where a rangefinder meets nothing."""
         found = sensordata[:, self._places]
-        found[(found == NO_HIT) & self._far] = np.nan
+        found[(found == _NO_HIT) & self._far] = np.nan
         return found
 
     def reader(self) -> Reader:
-        """A function that computes exact readings by MuJoCo, for one thread; see `Reader`."""
-        robot, model = self._robot, self._scene.model
+        """A function that computes exact readings by MuJoCo, for one thread; see `Reader`.
+
+        Each row is computed from nothing but its own numbers.
+        """
+        robot, model = self._robot, copy.copy(self._scene.model)
+        at_once(model)
+        data, body = mujoco.MjData(model), int(model.body(robot.body).id)
         in_qpos, in_qvel, in_ctrl = indices_in(robot, model)
-        reader = SensorReader(model, int(model.body(robot.body).id))
 
         def read(states: Array, controls: Array, wrench: Array) -> Array:
-            count, first = len(states), states.shape[1] - robot.activations
-            qpos, qvel = np.tile(model.qpos0, (count, 1)), np.zeros((count, model.nv))
-            ctrl, act = np.zeros((count, model.nu)), np.zeros((count, model.na))
-            qpos[:, in_qpos], qvel[:, in_qvel] = robot.configuration(states)
-            ctrl[:, in_ctrl] = robot.actuation(controls)
-            if robot.activations:
-                act[:] = states[:, first:]
-            return self.readings(reader.read(qpos, qvel, act, ctrl, wrench))
+            qpos, qvel, ctrl = *robot.configuration(states), robot.actuation(controls)
+            found = np.empty((len(states), model.nsensordata))
+            for k, state in enumerate(states):
+                mujoco.mj_resetData(model, data)
+                data.qpos[in_qpos], data.qvel[in_qvel], data.ctrl[in_ctrl] = qpos[k], qvel[k], ctrl[k]
+                if robot.activations:
+                    data.act[:] = state[len(state) - robot.activations :]
+                data.xfrc_applied[body] = wrench[k]
+                mujoco.mj_forward(model, data)
+                found[k] = data.sensordata
+            return self.readings(found)
 
         return read
+
+
+def _number_of(model: mujoco.MjModel, name: str) -> int:
+    """The id of a sensor. Raises InputError if there is none of this name, or its kind has no smooth reading."""
+    names = [model.sensor(i).name for i in range(model.nsensor)]
+    if not any(names):
+        raise InputError(f"sensors: got {name!r}, want a named element of <sensor>, of which the MJCF has none")
+    number = names.index(check_name("sensors", name, [one for one in names if one]))
+    if (kind := _TYPES(model.sensor_type[number])) in _REFUSED:
+        tag = kind.name.removeprefix("mjSENS_").lower()
+        raise InputError(f"sensors: got {name!r} of the kind {tag}, which has no smooth reading, want another sensor")
+    return number
+
+
+def at_once(model: mujoco.MjModel) -> None:
+    """Let MuJoCo's `sensordata` be the readings of the present: delays and intervals are the closed loop's."""
+    model.sensor_delay[:], model.sensor_interval[:] = 0.0, 0.0

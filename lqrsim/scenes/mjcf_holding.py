@@ -4,7 +4,6 @@ import copy
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_kinematics import Equalities
-from lqrsim.scenes.mjcf_model import MjcfModel, Side, control_ranges, input_names, ranges
+from lqrsim.scenes.mjcf_model import MjcfModel, control_ranges, input_names, ranges
 from lqrsim.scenes.mujoco_log import unlogged
 
 _HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
@@ -27,7 +26,6 @@ _SCALES = 10.0 ** np.arange(13)  # relative lengths of a step that bounds make
 _NEAR = 0.1  # 1 / (1 + square) of a right one
 _END = 1e-9  # relative distance from the end of its range within which an activation is there
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
-_PROBES, _LINEAR = 4, 1e-9  # random states at which a force is compared with its slopes, and the relative error
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
 _FALLS = 200  # heights at which a body that is let down may touch: thinner supports are not found
 
@@ -79,7 +77,7 @@ class _AtRest:
     """
 
     def __init__(self, model: mujoco.MjModel, qpos: Array) -> None:
-        self.model, self._free = model, _unlimited(model)
+        self.model, self._free = model, without_limits(model)
         self.data = data = mujoco.MjData(model)
         data.qpos[:] = qpos
         mujoco.mj_inverse(model, data)
@@ -423,7 +421,7 @@ def _least_squares(
     return start + ways @ solve_triangular(corner, nearest)
 
 
-def _unlimited(model: mujoco.MjModel) -> mujoco.MjModel:
+def without_limits(model: mujoco.MjModel) -> mujoco.MjModel:
     """The model without limits of forces, and of what integrates errors of position."""
     free = copy.copy(model)
     free.actuator_forcelimited[:] = 0
@@ -551,78 +549,3 @@ def efforts(mjcf: MjcfModel) -> Array:
             own = np.abs([mjcf.controls[k].low, mjcf.controls[k].high])
             found[k] = next((size for side in (own, *sides) if 0 < (size := float(side.max())) < np.inf), 1.0)
     return found
-
-
-class ForceLimit(NamedTuple):
-    """A limited force that is linear in state and control.
-
-    Attributes:
-      name, unit: of the force, as "of actuator" or "on joint". low, high: its limits.
-      slopes: (1+n+m,) its value at zero, and its slopes.
-      of_joint: whether the limit is that of a joint, on the sum of all actuators, or of an actuator. id: its id.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    slopes: Array
-    of_joint: bool
-    id: int
-
-    def can_be_kept(self, state: Array, low: Array, high: Array) -> bool:
-        """Whether some control (m,) between `low` and `high` keeps it in a state (n,)."""
-        n = len(state)
-        slopes = self.slopes[1 + n :]
-        moved = slopes != 0
-        ends = np.stack([slopes[moved] * side[moved] for side in (low, high)])
-        force = self.slopes[0] + self.slopes[1 : 1 + n] @ state
-        return bool(force + ends.min(axis=0).sum() <= self.high and force + ends.max(axis=0).sum() >= self.low)
-
-
-def limited_forces(mjcf: MjcfModel) -> tuple[tuple[ForceLimit, ...], tuple[str, ...]]:
-    """The limited forces of an MJCF that are linear, and the names of the others.
-
-    A force is linear if its differences about zero predict it at random states.
-    """
-    limited = list[tuple[str, str, Side, int, bool, int]]()
-    units = {one.name: "N m" if one.kind == "hinge" else "N" for one in mjcf.joints}
-    for i, one in enumerate(mjcf.actuators):
-        unit = units.get(one.joint or "", "N")
-        limited.append((f"of {one.name}", unit, one.forces, one.outputs.start, False, i))
-    for i, one in enumerate(mjcf.joints):
-        limited.append((f"on {one.name}", units[one.name], one.forces, mjcf.model.nout + one.dof, True, i))
-    limited = [one for one in limited if np.isfinite(one[2]).any()]
-    if not limited:
-        return (), ()
-    slopes, linear = _slopes(mjcf)
-    kept = tuple(
-        ForceLimit(name, unit, *sides, slopes[:, place].copy(), of_joint, number)
-        for name, unit, sides, place, of_joint, number in limited
-        if linear[place]
-    )
-    return kept, tuple(name for name, _, _, place, _, _ in limited if not linear[place])
-
-
-def _slopes(mjcf: MjcfModel) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Forces of all actuators' outputs and on all joints: their values at zero and slopes, (1+n+m, nout+nv), and
-    whether they are linear.
-    """
-    model = _unlimited(mjcf.model)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
-    data, nv, n = mujoco.MjData(model), model.nv, 2 * model.nv + model.na
-
-    def forces(z: Array) -> Array:
-        data.qpos[:], data.qvel[:] = mjcf.qpos_of(z[:nv]), z[nv : 2 * nv]
-        data.act[:], data.ctrl[:] = z[2 * nv : n], z[n:]
-        for part in (mujoco.mj_fwdPosition, mujoco.mj_fwdVelocity, mujoco.mj_fwdActuation):
-            part(model, data)
-        return np.concatenate([data.actuator_force, data.qfrc_actuator])
-
-    with unlogged():
-        slopes = np.stack([(forces(one) - forces(-one)) / 2 for one in np.eye(n + model.nu)])
-        zero, linear = forces(np.zeros(n + model.nu)), np.ones(slopes.shape[1], dtype=bool)
-        for z in np.random.default_rng(0).normal(size=(_PROBES, n + model.nu)):
-            size = np.abs(zero) + np.abs(z) @ np.abs(slopes)
-            linear &= np.abs(forces(z) - zero - z @ slopes) <= _LINEAR * size
-    return np.vstack([zero, slopes]), linear

@@ -20,11 +20,10 @@ from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot, indices_in
-from lqrsim.robots.sensors import RobotSensors, Sensor
+from lqrsim.robots.sensors import RobotSensors, Sensor, at_once
 from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
-from lqrsim.scenes.mjcf_sensors import at_once
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
