@@ -14,7 +14,7 @@ import re
 import sys
 import sysconfig
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -371,6 +371,13 @@ def _bytes(count: int) -> str:
             return f"{count:.3g} {unit}"
         count = count / 1000  # pyright: ignore[reportAssignmentType]
     return f"{count:.3g} PB" if count < 1e6 else f"{count:.1e} PB"
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """The name, with underscores appended if it is taken."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def printable(text: str) -> str:

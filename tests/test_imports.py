@@ -62,12 +62,10 @@ FLOORS_WITHIN = {
         ("collision_shape",),
         ("costs",),
         ("constraints",),
-        ("at_knots",),
         (
             "clearance",
             "control_rate",
             "formulas",
-            "limit_cost",
             "obstacle_cost",
             "plain_term",
             "quadratic_cost",

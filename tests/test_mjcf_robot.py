@@ -24,7 +24,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
 from lqrsim.problem.costs import terms_of
-from lqrsim.problem.limit_cost import LimitCost
+from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenes.scene import scene_from_xml
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -57,11 +57,7 @@ class CompiledModule:
 
     `module.name(...)` calls the function of that name, with numbers, C-ordered float64 arrays, tuples and records of
     these, and structured arrays. The shape of an array's blocks is part of its type; the first dimension is not, and
-    indices are not checked against it.
-
-    Args:
-      source: the functions. sizes: name -> number, for sizes in `kernels/declarations.py`.
-      what: purpose of the module, for progress messages and `lqrsim cache`.
+    indices are not checked against it. `what` is its purpose, for progress messages and `lqrsim cache`.
     """
 
     def __init__(self, source: Source, sizes: Mapping[str, int], what: str) -> None:
@@ -130,15 +126,9 @@ class CompiledModule:
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
         kept = disk.load(key)
-        found = None if kept is None else _unpacked(*kept)
-        if found is None:
-            found = self._compiled(what, write, long, key)
-        self._loaded.append(found[0])
-        return found
-
-    def _compiled(
-        self, what: str, write: Callable[[Program, Scope], list[Type | None]], long: bool, key: str
-    ) -> tuple[Loaded, list[Type | None]]:
+        if kept is not None and (found := _unpacked(*kept)) is not None:
+            self._loaded.append(found[0])
+            return found
         compilations.append(what)
         # It is a warning, because scripts show warnings without setting up logging: a long silence would be worse.
         log, timed = logger.warning if long else logger.debug, f"{what} on {instruction_set()[1]}"
@@ -150,6 +140,7 @@ class CompiledModule:
         returns = write(program, Scope(self._source, self._sizes))
         code, libraries = object_code(program.text), tuple(program.libraries)
         loaded = Loaded(code, libraries)
+        self._loaded.append(loaded)
         if long:
             disk.note(timed, time.perf_counter() - clock)
         disk.save(key, code, what, libraries=libraries, returns=[_encoded(kind) for kind in returns])
@@ -162,11 +153,7 @@ def _module_of(source: Source, sizes: tuple[tuple[str, int], ...], what: str) ->
 
 
 def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
-    """The CompiledModule of a source and sizes, one per process.
-
-    Args:
-      source: the functions. what: as for CompiledModule. **sizes: sizes in `kernels/declarations.py`.
-    """
+    """The CompiledModule of a source and sizes, those of `kernels/declarations.py`, one per process."""
     with compiling:  # a further reason: Python 3.11 cannot parse in two threads at once
         return _module_of(source, tuple(sizes.items()), what)
 
@@ -181,11 +168,7 @@ def _signature(name: str, sizes: Mapping[str, int]) -> Group:
 
 
 class Entry:
-    """A compiled function that Python calls.
-
-    Args:
-      types: types of the arguments. address: address of the machine code. returns: type of the result.
-    """
+    """A compiled function that Python calls, with the types of its arguments and of its result."""
 
     def __init__(self, types: tuple[Type, ...], address: int, returns: Type | None) -> None:
         self.returns = returns
@@ -238,7 +221,7 @@ class Call:
             if argument is not old:
                 if part.parts:
                     self._lay_changes(part, argument, old, place)
-                elif not (part.vectors and _same_vectors(argument, old)):
+                elif not (part.vectors and isinstance(argument, tuple) and [*map(id, argument)] == [*map(id, old)]):
                     self._lay(part, argument, place)
             place += part.size
 
@@ -287,11 +270,6 @@ class _Layout:
         self.vectors = isinstance(kind, Pointers)
         self.row = np.dtype([(name, np.float64) for name in kind.fields]) if isinstance(kind, StructArray) else None
         self.what = (kind.record or "a tuple") if isinstance(kind, Group) else ""
-
-
-def _same_vectors(one: Any, other: tuple[Array, ...]) -> bool:
-    """Whether two tuples hold the same arrays."""
-    return isinstance(one, tuple) and len(one) == len(other) and all(map(operator.is_, one, other))
 
 
 _FLOAT64 = np.dtype(np.float64)

@@ -32,7 +32,7 @@ _ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
 
 @dataclass(frozen=True)
 class Item:
-    """One item of the cache: its description, its size in bytes, and the time of its last use (seconds since 1970)."""
+    """An item of the cache: its description, its size in bytes, and the time of its last use (seconds since 1970)."""
 
     what: str
     path: Path

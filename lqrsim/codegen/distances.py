@@ -47,7 +47,6 @@ def hull_distances(
     """Distances of convex polygons to each obstacle, and their derivatives in the polygons' corners.
 
     Args:
-      world_seen: the obstacles, in the plane of the places.
       places: (..., B, 2 or 3), the corners, polygon by polygon.
       hulls: number of corners of each of H polygons.
       displaced: (K, O, 3) displacements of the obstacles; the first axis of the places is then K.

@@ -147,12 +147,10 @@ def weighted_hessian(
     Args:
       formulas: real SymPy expressions, without kinks as SymPy writes them; see `without_kinks`.
       weights: a symbol for each formula, which is in none of them.
-      variables: symbols.
-      most: largest number of steps.
 
     Returns:
       Steps (symbol, operation), in order, and in terms of these the second derivatives by variables i <= j that are not
-      always zero, as (i, j) -> expression. None if there would be more steps.
+      always zero, as (i, j) -> expression. None if there would be more than `most` steps.
     """
     operations = Operations()
     results = operations.of(formulas)

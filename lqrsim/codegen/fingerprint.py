@@ -104,17 +104,12 @@ def _parts(value: Any) -> Iterator[tuple[str, Any]]:
             yield "call", type(value).__call__
 
 
-def _version(name: str) -> str:
-    """The version of a package. If numba or JAX is missing, no function refers to it."""
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
-
-
 @functools.cache
 def _versions() -> tuple[str, ...]:
-    installed = (f"{name} {_version(name)}" for name in _PACKAGES if name != "math")
+    installed = list[str]()
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # no function refers to it then
+            installed.append(f"{name} {importlib.metadata.version(name)}")
     return sys.version, *installed, *map(inspect.getsource, (outlines, rotations, rotation_ratios))
 
 

@@ -42,11 +42,7 @@ def object_code(text: str, level: int = 3) -> bytes:
 
 
 def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[str]]:
-    """Compile IR to an object file that exports only the function `name`, as `symbol`.
-
-    Returns:
-      The object file, and the names that it needs from elsewhere.
-    """
+    """An object file that exports only the function `name` of the IR, as `symbol`, and the names that it needs."""
     module = _binding().parse_assembly(text)
     needed = []
     for part in (*module.functions, *module.global_variables):
@@ -77,13 +73,9 @@ def _emitted(module: Any, level: int = 3) -> bytes:
 
 
 class Loaded:
-    """An object file in memory; keep it alive as long as its functions are called.
+    """An object file in memory, and the C library functions that it calls; keep it alive as long as it is in use.
 
-    Args:
-      contents: the object file. libraries: names of the C library functions that it calls.
-
-    Raises:
-      RuntimeError: the contents are no object file for this processor, or a function is not found.
+    Raises RuntimeError if the contents are no object file for this processor, or a function is not found.
     """
 
     def __init__(self, contents: bytes, libraries: tuple[str, ...]) -> None:

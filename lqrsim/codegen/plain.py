@@ -27,15 +27,11 @@ def plain_functions(
     functions: Sequence[Callable[..., None]] = (),
     caller: Caller | None = None,
 ) -> dict[str, Callable[..., Any]]:
-    """Functions of a source as plain Python functions.
+    """Functions of a source, by name, as plain Python functions.
 
     Args:
-      source: source of the kernels. sizes: as for a `Scope`. names: names of the functions.
       functions: Python functions that kernels call by their index here, in place of an address.
       caller: if given, calls each kernel: `caller(kernel, run, arguments)`.
-
-    Returns:
-      Name -> function.
     """
     scope, made = Scope(source, sizes), {}
     return {name: _run(scope.function(name), _words(functions), made, caller) for name in names}

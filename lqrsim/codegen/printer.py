@@ -7,6 +7,7 @@ compile.
 """
 
 import ast
+import functools
 import itertools
 import math
 import operator
@@ -105,7 +106,6 @@ class Program:
 
     @property
     def text(self) -> str:
-        """The IR."""
         kinds = "attributes #0 = { nounwind }\nattributes #1 = { nounwind alwaysinline }\n"
         kinds += "attributes #2 = { nounwind noinline }\nattributes #3 = { nounwind noinline optsize }\n"
         return "\n".join([*self._declared.values(), *self._texts, kinds])
@@ -117,21 +117,26 @@ class Program:
 
     def instance(self, function: ScopedFunction, types: tuple[Type, ...]) -> tuple[str, Type | None]:
         """LLVM's name of a function for arguments of these types, and the type of its result."""
-        key = id(function.scope), function.node.name, types
+        key, result = (id(function.scope), function.node.name, types), None
         if key not in self._instances:
             if any(running[:2] == key[:2] for running in self._running):
                 raise SubsetError(f"{where(function, function.node)}: got a function that calls itself, want a loop")
             self._running.append(key)
             plain = function.node.name if function.node.name.isascii() else "function"
             name = f"@{plain}.{len(self._instances) + len(self._running)}"  # unique: the number of functions begun
-            try:
-                text, result = _print(self, function, types, name)
-            except RecursionError:
-                place = where(function, function.node)
-                raise SubsetError(f"{place}: got expressions nested too deeply, want less nesting") from None
+            widened, body = dict[str, Type](), None
+            while body is None:
+                body = _Body(self, function, types, widened, result)
+                try:
+                    body.run()
+                except _Retyped:
+                    result, body = body.result, None
+                except RecursionError:
+                    place = where(function, function.node)
+                    raise SubsetError(f"{place}: got expressions nested too deeply, want less nesting") from None
             self._running.pop()
-            self._texts.append(text)
-            self._instances[key] = name, result
+            self._texts.append(body.text(name))
+            self._instances[key] = name, body.result
         return self._instances[key]
 
     def library(self, name: str, count: int) -> str:
@@ -205,19 +210,6 @@ class Program:
 def where(function: ScopedFunction, node: ast.AST) -> str:
     """The position of a node, for messages."""
     return f"{function.scope.source.what}: {function.node.name}, line {getattr(node, 'lineno', 0)}"
-
-
-def _print(program: Program, function: ScopedFunction, types: tuple[Type, ...], name: str) -> tuple[str, Type | None]:
-    widened: dict[str, Type] = {}
-    result: Type | None = None
-    while True:
-        body = _Body(program, function, types, widened, result)
-        try:
-            body.run()
-        except _Retyped:
-            result = body.result
-            continue
-        return body.text(name), body.result
 
 
 class _Body:
@@ -986,11 +978,8 @@ class _Body:
             total = Value(kind, self._emit(f"select i1 {better.name}, {of} {b.name}, {of} {a.name}"))
         return total
 
-    def _word_min(self, given: list[Value], node: ast.AST) -> Value:
-        return self._extreme(given, node, ast.Lt(), min)
-
-    def _word_max(self, given: list[Value], node: ast.AST) -> Value:
-        return self._extreme(given, node, ast.Gt(), max)
+    _word_min = functools.partialmethod(_extreme, op=ast.Lt(), plainly=min)
+    _word_max = functools.partialmethod(_extreme, op=ast.Gt(), plainly=max)
 
     def _word_abs(self, given: list[Value], node: ast.AST) -> Value:
         if given[0].type in (INT, BOOL):

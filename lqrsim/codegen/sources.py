@@ -37,10 +37,9 @@ Constant = bool | int | float | tuple[Any, ...]
 @checked
 @dataclass(frozen=True)
 class Source:
-    """Functions in the kernels' subset; `source_of` and `text_source` make it.
+    """Functions in the kernels' subset, of a module or a text; `source_of` and `text_source` make it.
 
     Attributes:
-      module: name of a module; empty for a text. text: text that defines functions.
       constants: (name, number or tuple of numbers), which replace the module's.
       fills: (name, source, name there) of functions that fill declarations of the module or its imports, or replace
         their functions.
@@ -96,9 +95,6 @@ def source_of(module: ModuleType | str, **constants: Constant) -> Source:
     Args:
       module: `__name__`, in the file of a cost or constraint; or a module.
       **constants: numbers and tuples of numbers, in place of the module's.
-
-    Raises:
-      InputError: the module is no file that was imported, or declares no such constant.
     """
     check_kind("source_of: module", module, (str, ModuleType), "__name__, in the file of a cost or constraint")
     name = module if isinstance(module, str) else module.__name__
@@ -118,13 +114,9 @@ def text_source(text: str, what: str = "source") -> Source:
 
 
 def check_source(field: str, source: object, functions: Mapping[str, int]) -> Source:
-    """The Source of a text; a Source is returned as it is.
+    """The Source of a text, which must define these functions of that many arguments; a Source is returned as it is.
 
     Functions of math are named without a module in it: cos, not math.cos or np.cos.
-
-    Args:
-      field: its name in messages. source: text or Source. functions: name -> number of arguments, for each function
-        that it must define.
     """
     if isinstance(source, Source):
         return source
@@ -207,7 +199,7 @@ class Scope:
 
     def __init__(self, source: Source, sizes: Mapping[str, int]) -> None:
         self.source, self.sizes = source, {"W": sizes.get("N", 0) + sizes.get("M", 0), **sizes}
-        parsed = _parsed_module(source.module) if source.module else _parsed_text(source.text)
+        parsed = _parsed_module(source.module) if source.module else _parse(source.text)
         self._functions, self._imports = parsed.functions, parsed.imports
         self._constants = dict(source.constants)
         self._fills = {name: (filled, there) for name, filled, there in source.fills}
@@ -254,7 +246,8 @@ class Scope:
         if module == declarations.__name__:
             return self._declared(name)
         if module == records.__name__:
-            return _record(name)
+            kind = getattr(records, name, None)
+            return Record(name, kind._fields) if isinstance(kind, type) and hasattr(kind, "_fields") else None
         return self._module(module).find(name) if _is_kernels(module) else None
 
     def _declared(self, name: str) -> Meaning | None:
@@ -297,11 +290,6 @@ def _is_constant(value: object) -> bool:
     return isinstance(value, bool | int | float)
 
 
-def _record(name: str) -> Record | None:
-    kind = getattr(records, name, None)
-    return Record(name, kind._fields) if isinstance(kind, type) and hasattr(kind, "_fields") else None
-
-
 def _is_kernels(module: str) -> bool:
     return module.startswith(f"{kernels.__name__}.")
 
@@ -314,17 +302,12 @@ def _imported(module: str) -> ModuleType:
 
 
 @functools.cache
-def _module_text(module: str) -> str:
-    return inspect.getsource(_imported(module))
-
-
-@functools.cache
 def _text_of(module: str) -> str:
     """What defines a module's kernels: its functions, and the constants in them, for what else stands in a user's file
     changes no compiled code. Of a module of the package it is the whole text, which need not be parsed.
     """
     if module.startswith(__name__.partition(".")[0] + "."):
-        return _module_text(module)
+        return inspect.getsource(_imported(module))
     home, parsed = _imported(module), _parsed_module(module)
     names = {node.id for own in parsed.functions.values() for node in ast.walk(own) if isinstance(node, ast.Name)}
     constants = ((name, getattr(home, name, None)) for name in sorted(names))
@@ -333,12 +316,7 @@ def _text_of(module: str) -> str:
 
 @functools.cache
 def _parsed_module(module: str) -> _Parsed:
-    return _parse(_module_text(module))
-
-
-@functools.lru_cache(maxsize=256)
-def _parsed_text(text: str) -> _Parsed:
-    return _parse(text)
+    return _parse(inspect.getsource(_imported(module)))
 
 
 @functools.cache
@@ -353,6 +331,7 @@ def _left_open(module: str) -> frozenset[str]:
 _WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__)
 
 
+@functools.lru_cache(maxsize=256)
 def _parse(text: str) -> _Parsed:
     functions, imports, lines, texts = {}, {}, text.splitlines(), []
     try:

@@ -73,14 +73,9 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
 def kept(
     function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]], **kinds: type
 ) -> dict[str, Any]:
-    """The result of `make` for a user's function, if possible from the cache, without importing SymPy.
+    """The result of `make`, JSON values by name of these kinds, if possible from the cache, without importing SymPy.
 
-    A function without a fingerprint is not cached.
-
-    Args:
-      function: the user's function. details: everything else that the result depends on. make: returns names and JSON
-        values.
-      **kinds: the types of the values.
+    `details` are all that it depends on beside the user's function. A function without a fingerprint is not cached.
     """
     print_of_it = fingerprint(function)
     if print_of_it is None:
@@ -121,14 +116,11 @@ def trace(
     """Call `function(x, u, p)` with symbols.
 
     Args:
-      function: the user's function. states: names of x. controls: names of u; None for a `function(x, p)`.
-      parameters: names in p. constants: further attributes of p, with numbers in place of symbols.
+      states, controls, parameters: names; without controls, of a `function(x, p)`.
+      constants: further attributes of p, with numbers in place of symbols.
 
     Returns:
       The expressions that it returned, the symbols of x, and the symbols of u.
-
-    Raises:
-      InputError: the function failed with symbols, or did not return expressions.
     """
     import sympy
 
@@ -300,14 +292,11 @@ def write_function(
     """Source of a function that evaluates SymPy expressions.
 
     Args:
-      name, arguments: signature of the function. data: the argument with the parameters p0, p1, ....
+      data: the argument with the parameters p0, p1, ....
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
       of: the name of the user's function in messages.
       returns: the target, among `assignments`, whose value is returned.
       steps: (symbol, expression), in order, which the expressions share; by default their common subexpressions.
-
-    Raises:
-      InputError: an expression cannot be printed.
     """
     import sympy
     from sympy.printing.codeprinter import PrintMethodNotImplementedError

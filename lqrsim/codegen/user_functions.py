@@ -43,18 +43,14 @@ _loaded: dict[str, tuple[Any, int]] = {}
 def compiled(
     function: Callable[..., Any], adapter: str, names: dict[str, Any], pointers: int, what: str
 ) -> tuple[Any, int]:
-    """Compile a function to a C function of this number of pointers to float64.
+    """Compile a function, numba's or one for it, to a C function of this number of pointers to float64.
 
     Args:
-      function: a numba function, or one that numba can compile.
       adapter: source of `adapter`, which calls the function by the name `function`.
       names: other names that the adapter uses, among them the named tuple `Parameters`. what: name in messages.
 
     Returns:
       The object that must be kept alive, and the address.
-
-    Raises:
-      InputError: numba is missing, or cannot compile it.
     """
     try:
         import numba
@@ -191,7 +187,7 @@ class UserFunction:
       states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
       unused: (index, name) of the entries of (x, u) on which the value does not depend, according to the user.
-      held: the object to keep alive and the address, once there is an address.
+      held: the object to keep alive and the address, once there is one.
       stopped: setting it ends the solves that call the function, in any thread.
       entries: names of the returned values in messages; empty for a single number.
       columns: size of the rows in which the values are returned; 0 for a flat list.
@@ -223,7 +219,6 @@ class UserFunction:
 
     @property
     def name(self) -> str:
-        """The name in messages."""
         of = "x, u, p" if self.with_control else "x, p"
         return f"{name_of(self.function)}({of}{', ...' if self.writes else ''})"
 
@@ -234,13 +229,9 @@ class UserFunction:
         return fingerprint(self.function) or f"{name_of(self.function)} {getattr(code, 'co_code', b'').hex()}"
 
     def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
-        """Call the function in plain Python.
+        """Call the function in plain Python: the returned values as one vector, or the arrays that it wrote.
 
-        Returns:
-          The returned values as one vector, or the arrays that it wrote.
-
-        Raises:
-          InputError: the function fails, or returns an unsuitable result.
+        Raises InputError if it fails, or returns an unsuitable result.
         """
         plain = self.function if self.level == "jax" else getattr(self.function, "py_func", self.function)
         if not self.held:  # before the first call compiles its helpers
@@ -492,7 +483,7 @@ def raised_by(functions: Sequence[UserFunction]) -> str:
 
 
 def check_depends_on(who: str, names: object, of: str) -> tuple[str, ...] | None:
-    """The names that a user's function depends on; None for all. Raises InputError for anything else."""
+    """The names that a user's function depends on; None for all."""
     if names is None:
         return None
     if isinstance(names, str):
@@ -503,7 +494,7 @@ def check_depends_on(who: str, names: object, of: str) -> tuple[str, ...] | None
 def axes_of(
     who: str, depends_on: Sequence[str] | None, names: Sequence[str]
 ) -> tuple[tuple[int, ...], tuple[tuple[int, str], ...]]:
-    """The indices of the names that a function depends on, and the other names with indices. Raises InputError."""
+    """The indices of the names that a function depends on, and the other names with indices."""
     wanted = names if depends_on is None else depends_on
     axes = tuple(sorted({names.index(check_name(f"{who}: depends_on", name, names)) for name in wanted}))
     return axes, tuple((i, name) for i, name in enumerate(names) if i not in axes)
@@ -519,17 +510,8 @@ def check_derivative(field: str, derivative: Any, function: Any, level: str, arg
     check_signature(derivative, arguments.split(", "))
 
 
-def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:
-    """The functions for `plain_functions`."""
-    return [function.plain_call(parameters) for function in functions]
-
-
 def address_of(function: UserFunction) -> float:
-    """The address of a user's function, for compiled code.
-
-    Raises:
-      InputError: numba is missing, or cannot compile it.
-    """
+    """The address of a user's function, for compiled code."""
     with compiling:
         if not function.held:
             if function.level == "compiled":
@@ -553,7 +535,7 @@ def first_numbers(x: Array) -> str:
 
 
 def check_signature(function: Any, wanted: Sequence[str]) -> None:
-    """Check that a function takes these arguments. Raises InputError."""
+    """Raises InputError unless a function takes these arguments."""
     plain = getattr(function, "py_func", function)
     try:
         inspect.signature(plain).bind(*wanted)

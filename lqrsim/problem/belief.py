@@ -131,12 +131,7 @@ class Belief(Dynamics):
         return len(self.robot.state_coordinates)
 
     def state(self, mean: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
-        """The belief (N,) with this mean and covariance.
-
-        Args:
-          mean: (n,).
-          covariance: (n, n), positive definite; or (n,) standard deviations.
-        """
+        """The belief (N,) with a mean (n,) and a covariance (n, n), positive definite; or (n,) standard deviations."""
         n = self.size
         given = real("covariance", covariance)
         full = np.diag(check_array("covariance", given, (n,)) ** 2) if given.ndim == 1 else given
@@ -147,11 +142,7 @@ class Belief(Dynamics):
         return np.concatenate([check_array("mean", mean, (n,)), root[np.tril_indices(n)]])
 
     def covariance(self, states: npt.ArrayLike) -> Array:
-        """The covariances (..., n, n) of beliefs (..., N).
-
-        Args:
-          states: (..., N).
-        """
+        """The covariances (..., n, n) of beliefs (..., N)."""
         n = self.size
         given = vectors_of("states", states, len(self.state_coordinates))
         root = np.zeros((*given.shape[:-1], n, n))
@@ -198,8 +189,6 @@ class Belief(Dynamics):
         Args:
           function: as in `SymbolicConstraint`, with x the robot's state. Each of its entries has the chance.
           chance: largest chance that an entry is negative, below a half.
-          parameters: name -> value, as in `SymbolicConstraint`.
-          name: as in `SymbolicConstraint`.
         """
         parameters = check_kind("chance_constraint: parameters", parameters or {}, Mapping, "a dictionary by name")
         n, names = self.size, tuple(self.robot.state_coordinates.names)
@@ -220,13 +209,7 @@ class Belief(Dynamics):
         return SymbolicConstraint(margin, parameters={**parameters, "deviations": quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
-        """The beliefs (K, N) of the extended Kalman filter one period later.
-
-        Args:
-          states: (K, N).
-          controls: (K, m), held over the period.
-          readings: (K, Y), taken at its end.
-        """
+        """The beliefs (K, N) of the extended Kalman filter one period later, with readings (K, Y) at its end."""
         size = len(self.state_coordinates)
         states = shaped("states", states, (None, size))
         controls = shaped("controls", controls, (len(states), len(self.control_coordinates)))
@@ -234,11 +217,7 @@ class Belief(Dynamics):
         return self._each("corrected", size, states, controls, readings)
 
     def read(self, states: Array) -> tuple[Array, Array]:
-        """The exact readings (K, Y) in states of the robot, and the standard deviations of their noise.
-
-        Args:
-          states: (K, n), of the robot.
-        """
+        """The exact readings (K, Y) in states (K, n) of the robot, and the standard deviations of their noise."""
         found = self._each("read", 2 * self.readings, shaped("states", states, (None, self.size)))
         return found[:, ::2], found[:, 1::2]
 

@@ -47,7 +47,12 @@ class Clearance(KeepsClear, Constraint):
         margin: float | npt.ArrayLike = 0.0,
     ) -> None:
         self._set_shape(world, radius, balls, geoms)
-        self.margin = _checked_margin(margin)
+        given = real("Clearance: margin", margin)
+        self.margin: float | Array = check_number("Clearance: margin", margin) if given.ndim == 0 else given
+        if given.ndim:
+            self.margin = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
+            if not self.margin.size:
+                raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
 
     @property
     def by_knot(self) -> bool:
@@ -93,17 +98,6 @@ class Clearance(KeepsClear, Constraint):
         own = np.array([*margins.shape, len(world), len(tables), *shape.parts, *margins.ravel(), *tables.ravel()])
         source, data, functions = shape.placed(__name__, own)
         return ConstraintTerm(source, data, len(rows), describe, shared=shared, functions=functions)
-
-
-def _checked_margin(margin: float | npt.ArrayLike) -> float | Array:
-    """A number, or numbers (T+1,) or (T+1, O). Raises InputError for anything else."""
-    given = real("Clearance: margin", margin)
-    if given.ndim == 0:
-        return check_number("Clearance: margin", margin)
-    margins = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
-    if not margins.size:
-        raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
-    return margins
 
 
 # The kernel: distances to obstacles minus the required distances. The robot is a point at its position, or a set of

@@ -36,13 +36,10 @@ class ConstraintTerm(Term):
     gradient)`, which *adds* its gradient (n+m,), states before controls.
 
     Attributes:
-      rows: number of entries at a step.
-      describe: returns the name of a row for messages.
+      describe: the name of a row for messages.
       names: a name of each row for `Problem.violations`, without numbers that may change; rows of one name count as
         one. By default rows have their indices.
       uses_control: whether the entries depend on u; if so, they do not act at the last step, which has no control.
-      equality: whether the entries must be zero.
-      final_only: whether the entries act only at the last step.
       shared: number of values that all rows share, such as the centres of balls; they are computed once per step. If it
         is not 0, the source must define `places` and `places_jacobian`, as in `SphereCenters`. Then `value` and `slope`
         get these values (shared,) and their derivatives (shared, n) in place of x and u.
@@ -93,12 +90,8 @@ class ConstraintTerm(Term):
         """The constraint that each row of a residual is at least some number, or with `equality` is that number.
 
         Args:
-          residual: the residual.
           least: the numbers, (K, L): of K steps, the last of which holds from its step on.
           columns: the index of each row's number among L.
-          describe: as in a ConstraintTerm.
-          equality: as in a ConstraintTerm.
-          final_only: as in a ConstraintTerm.
         """
         shared = max(1, residual.rows)
         return cls(
@@ -177,18 +170,14 @@ def _check_bounds(found: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dy
                 raise InputError(f"StateBounds: {names[i]}: got {len(side)} numbers, want {want}")
     for i in {i for one in found for i in one}:
         lows, highs = zip(*(one[i] for one in found if i in one), strict=True)
-        low, high = (np.broadcast_to(side, knots) for side in (_greatest(lows), -_greatest([-one for one in highs])))
+        sides = functools.reduce(np.maximum, lows), functools.reduce(np.minimum, highs)
+        low, high = (np.broadcast_to(side, knots) for side in sides)
         if crossed := np.flatnonzero(~(low < high)).tolist():
             t, each = crossed[0], "" if len(crossed) == knots else f" at knot {crossed[0]}"
             raise InputError(
                 f"constraints: got {names[i]} of at least {low[t]:g} and at most {high[t]:g}{each}, want bounds with"
                 " room between them"
             )
-
-
-def _greatest(sides: Sequence[Side]) -> Side:
-    """The greatest number, at each knot."""
-    return functools.reduce(np.maximum, sides)
 
 
 def names_of(constraint: Constraint, term: ConstraintTerm) -> list[str]:
@@ -215,7 +204,7 @@ def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = 
 def by_name(
     who: str, given: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
 ) -> dict[str, _Value]:
-    """The values given for states by name, in a dictionary or by keyword. Raises InputError."""
+    """The values given for states by name, in a dictionary or by keyword."""
     want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
     check_kind(who, given, (Mapping, type(None)), want)
     stated = dict(given or {})  # pyright: ignore[reportCallIssue, reportArgumentType]

@@ -40,10 +40,6 @@ class ControlRate:
         of name or unit of a control: r or (low, high). Infinite for no limit.
       previous: the command (m,) before the first step, or a dictionary of name or unit: number, with 0 for the rest.
         None: the first command is free, and has no rate.
-
-    Raises:
-      InputError: neither a weight nor limits, a negative weight, or limits without 0 inside. A problem refuses sizes
-        and names that are not those of its controls.
     """
 
     weight: PerEntry | None = None
@@ -81,10 +77,6 @@ class ControlRate:
         if limits is not None:
             limits = tuple(_each("ControlRate: limits", side, space) for side in limits)
         return ControlRate(weight=found["weight"], limits=limits, previous=found["previous"])
-
-    def _after(self, previous: npt.ArrayLike | None) -> "ControlRate":
-        """The same after another command (m,); None for one that is free."""
-        return ControlRate(weight=self.weight, limits=self.limits, previous=previous)
 
     def _numbers(self, dt: float, dynamics: Dynamics) -> Array:
         """What both kernels begin with."""
@@ -157,7 +149,7 @@ class RateCost(Cost):
 
 
 class RateLimits(Constraint):
-    """The limits of rates, for such dynamics."""
+    """Their limits, for such dynamics."""
 
     def __init__(self, rate: ControlRate, dt: float) -> None:
         self.rate, self.dt = rate, dt

@@ -66,12 +66,9 @@ class CostTerm(Term):
         """The sum of a loss of each row of a residual, whose second derivatives are left out.
 
         Args:
-          residual: the residual.
           loss: defines `loss(r, row, data)`, which returns the loss of a row and its first two derivatives in r.
-          numbers: what the loss reads; in its `data` they begin at `residual.numbers`.
+          numbers: what the loss reads; in its `data` they begin at `residual.numbers`. `factor` is an index in them.
           first: the first step at which it acts.
-          factor: as in a CostTerm, an index in `numbers`.
-          nonconvex_in: as in a CostTerm.
         """
         sizes = {"ROWS": max(1, residual.rows), "MOVED": residual.moved, "FIRST_STEP": first}
         return cls(
@@ -105,7 +102,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     @property
     def moving(self) -> bool:
-        """Whether the term changes with time."""
+        """Whether it changes with time."""
         return self.by_knot
 
     @property
@@ -170,7 +167,6 @@ class Cost(ProblemPart[CostTerm]):
 
     @property
     def name(self) -> str:
-        """The name in messages."""
         return type(self).__name__
 
     @property

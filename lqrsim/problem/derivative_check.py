@@ -5,7 +5,7 @@ doubt.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from lqrsim.problem.plain_term import PlainTerm
 from lqrsim.problem.problem import FixedState, Problem
 
 STEP = 6e-6  # step of difference quotients, relative to numbers above 1
+_Points = Sequence[tuple[Array, Array]]  # states (n,) and controls (m,)
 
 
 def functions_of(problem: Problem) -> list[UserFunction]:
@@ -96,12 +97,8 @@ class DerivativeCheck:
     Attributes:
       what: name of the derivative, such as `df/dx of ...`.
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
-      row: the name of the output at that entry.
-      column: the name of the input at that entry.
-      stated: the stated derivative there.
-      difference: the difference quotient there.
-      state: (n,), at that point.
-      control: (m,), at that point.
+      row, column: names of the output and the input at that entry; the other fields are there, too.
+      difference: the difference quotient.
       tolerance: the largest acceptable error.
     """
 
@@ -163,36 +160,18 @@ def check_derivatives(
     rng = np.random.default_rng(seed)
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
     found: dict[str, list[DerivativeCheck]] = {}
-    matrices = [_of_dynamics(dynamics, points)]
+    checks = [_of_dynamics(dynamics, points, tolerance)]
     if isinstance(subject, Problem):
-        matrices += [_of_costs(subject, points), _of_constraints(subject, points)]
+        checks += [_of_costs(subject, points, tolerance), _of_constraints(subject, points, tolerance)]
     with np.errstate(all="ignore"):
-        for matrix in itertools.chain(*matrices):
-            found.setdefault(matrix.what, []).append(_worst_entry(matrix, tolerance))
+        for check in itertools.chain(*checks):
+            found.setdefault(check.what, []).append(check)
     return [
         max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
     ]
 
 
-class _Derivative(NamedTuple):
-    """A matrix of derivatives at a point.
-
-    Attributes:
-      what: name of the matrix in messages. rows, columns: names.
-      stated: derivatives from the function that is checked. differences: the result of `_differences`.
-      x, u: the point.
-    """
-
-    what: str
-    rows: Sequence[str]
-    columns: Sequence[str]
-    stated: Array
-    differences: tuple[Array, Array]
-    x: Array
-    u: Array
-
-
-def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _of_dynamics(dynamics: Dynamics, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     n = len(states)
     if dynamics.by_mujoco:
@@ -200,11 +179,12 @@ def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> I
     for x, u in points:
         fx, fu = dynamics.rate_jacobian(x, u)
         joint, noise = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]))
-        yield _Derivative(f"df/dx of {dynamics.name}", states, states, fx, (joint[:, :n], noise[:, :n]), x, u)
-        yield _Derivative(f"df/du of {dynamics.name}", states, controls, fu, (joint[:, n:], noise[:, n:]), x, u)
+        for what, names, slopes, own in (("df/dx", states, fx, np.s_[:n]), ("df/du", controls, fu, np.s_[n:])):
+            differences = joint[:, own], noise[:, own]
+            yield _worst_entry(f"{what} of {dynamics.name}", states, names, slopes, differences, (x, u), tolerance)
 
 
-def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _of_costs(problem: Problem, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
     states, controls = problem.dynamics.state_coordinates.names, problem.dynamics.control_coordinates.names
     names = (*states, *controls)
     for cost, term in _terms(problem):
@@ -215,13 +195,13 @@ def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterat
             z = np.concatenate([x, u])
             _, gradient, hessian = plain.cost(z)
             slope = _differences(lambda z, plain=plain: np.array([plain.cost(z)[0]]), z)
-            yield _Derivative(f"gradient of {cost}", ("cost",), names, gradient[None], slope, x, u)
+            yield _worst_entry(f"gradient of {cost}", ("cost",), names, gradient[None], slope, (x, u), tolerance)
             if term.exact_hessian:
                 curvature = _differences(lambda z, plain=plain: plain.cost(z)[1], z)
-                yield _Derivative(f"Hessian of {cost}", names, names, hessian, curvature, x, u)
+                yield _worst_entry(f"Hessian of {cost}", names, names, hessian, curvature, (x, u), tolerance)
 
 
-def _of_constraints(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _of_constraints(problem: Problem, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
     states, controls = problem.dynamics.state_coordinates.names, problem.dynamics.control_coordinates.names
     names = (*states, *controls)
     for term in problem.constraint_terms:
@@ -230,20 +210,22 @@ def _of_constraints(problem: Problem, points: Sequence[tuple[Array, Array]]) -> 
             z = np.concatenate([x, u])
             differences = _differences(lambda z, of=plain, row=row: np.array([of.value(z, row)]), z)
             what, slope = f"slope of {term.describe(row)}", plain.slope(z, row)[None]
-            yield _Derivative(what, ("value",), names, slope, differences, x, u)
+            yield _worst_entry(what, ("value",), names, slope, differences, (x, u), tolerance)
 
 
-def _worst_entry(matrix: _Derivative, tolerance: float) -> DerivativeCheck:
-    """The entry of a matrix that is furthest from its difference, relative to the larger of the two."""
-    stated, (difference, noise) = matrix.stated, matrix.differences
+def _worst_entry(
+    what: str, rows: Sequence[str], columns: Sequence[str], stated: Array, differences: tuple[Array, Array],
+    point: tuple[Array, Array], tolerance: float,
+) -> DerivativeCheck:  # fmt: skip
+    """The entry of a matrix at a point that is furthest from its difference, relative to the larger of the two."""
+    difference, noise = differences
     size = np.maximum(np.abs(stated), np.abs(difference)) + noise / tolerance
     error = np.abs(stated - difference) / np.maximum(size, np.finfo(float).tiny)
     worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
     i, j = (int(k) for k in np.unravel_index(worst, error.shape))
     return DerivativeCheck(
-        what=matrix.what, error=float(error[i, j]), row=matrix.rows[i], column=matrix.columns[j],
-        stated=float(stated[i, j]), difference=float(difference[i, j]), state=matrix.x, control=matrix.u,
-        tolerance=tolerance,
+        what=what, error=float(error[i, j]), row=rows[i], column=columns[j], stated=float(stated[i, j]),
+        difference=float(difference[i, j]), state=point[0], control=point[1], tolerance=tolerance,
     )  # fmt: skip
 
 

@@ -25,7 +25,6 @@ from lqrsim.codegen.user_functions import (
     level_of,
     name_of,
     numbers_of,
-    plain_calls,
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, excerpt
@@ -91,9 +90,7 @@ class Dynamics:
         `rate_jacobian` are then f's value and derivatives. A map has no inverse and no state in between: solvers in
         continuous time, form="primal" and free durations are refused. Not with JAX. None for rates.
 
-    Raises:
-      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function, or JAX is
-        missing. The result of f is checked when it is first needed.
+    The result of f is checked when it is first needed.
     """
 
     _prefix = ""
@@ -163,7 +160,11 @@ class Dynamics:
         check_signature(f, ("x", "u", "p"))
         if jacobian is not None:
             check_derivative("jacobian", jacobian, f, self.level, "x, u, p, fx, fu")
-        self.parameters, self.disturbances = _parameters_of(parameters, disturbances, self.level)
+        self.parameters, self.disturbances = map(symbolic.check_parameters, (parameters, disturbances))
+        if twice := self.parameters.keys() & self.disturbances.keys():
+            raise InputError(f"disturbances: got {min(twice)!r}, which is also a parameter, want another name")
+        if self.level != "symbolic":  # constants gain nothing
+            self.parameters |= self.disturbances
         self.state_coordinates = Coordinates(
             names=names,
             units=tuple(states.values()),
@@ -189,7 +190,7 @@ class Dynamics:
 
     @property
     def name(self) -> str:
-        """The name of the dynamics in messages: the name of `f`."""
+        """The name of `f`."""
         return name_of(self.f)
 
     @property
@@ -223,9 +224,6 @@ class Dynamics:
         """The same dynamics with several Runge-Kutta steps of equal length in each control period, for accuracy.
 
         `Problem(accuracy=)` chooses their number. The control is still held over the period.
-
-        Raises:
-          InputError: dynamics that are not stated as a rate, such as those of an MJCF.
         """
         count = check_count("substeps", count)
         if self.discrete or self.level == "jax":
@@ -503,12 +501,7 @@ class Dynamics:
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
-        """A (n, n), B (n, m) and c (n,) of a step about a state and control: x' = A x + B u + c. Eqs. (24)-(25).
-
-        Args:
-          state: (n,).
-          control: (m,), held over the step of `dt` seconds.
-        """
+        """A (n, n), B (n, m) and c (n,) of a step about a state and control: x' = A x + B u + c. Eqs. (24)-(25)."""
         x, u = self._check(state, control)
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
@@ -523,23 +516,12 @@ class Dynamics:
 
     @cached_property
     def _plain(self) -> dict[str, Any]:
-        """The source that is compiled, run as plain Python."""
+        """What is compiled, as plain Python."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         names = ("rate", "rate_jacobian", "advance", "step_jacobian")
-        calls = plain_calls(self.functions, self.parameters)
+        calls = [one.plain_call(self.parameters) for one in self.functions]
         return plain_functions(self.step_source, {"N": n, "M": m}, names, calls)
 
     def _numbers(self) -> Array:
         """The `p` of the compiled functions, with places for the addresses of functions."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
-
-
-def _parameters_of(
-    parameters: Mapping[str, float] | None, disturbances: Mapping[str, float] | None, level: str
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Parameters and disturbances, checked. If constants gain nothing, disturbances become parameters."""
-    own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
-    twice = own.keys() & unknown.keys()
-    if twice:
-        raise InputError(f"disturbances: got {min(twice)!r}, which is also a parameter, want another name")
-    return (own if level == "symbolic" else own | unknown), unknown

@@ -1,9 +1,14 @@
-"""Costs and constraints that are stated as functions: formulas of symbols, and numba, JAX or plain Python functions."""
+"""Costs and constraints that are stated as functions: formulas of symbols, and numba, JAX or plain Python functions.
+
+The kernel is that of a formula at some knots, with numbers of its own at each.
+"""
 
 import copy
 import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from math import inf
 from typing import Any, Self
 
 import numpy as np
@@ -23,7 +28,7 @@ from lqrsim.codegen.user_functions import (
 )
 from lqrsim.errors import Array, InputError, check_kind, check_name, check_shape, check_text, excerpt, numbers_of
 from lqrsim.kernels import differences, user_functions
-from lqrsim.problem.at_knots import at_knots
+from lqrsim.kernels.declarations import constraint_slope, constraint_value, stack
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -41,7 +46,6 @@ class OfFunction:
 
     @property
     def name(self) -> str:
-        """The name in messages: by default that of its function."""
         return self._name or f"{name_of(self.function)}(x, u, p)"
 
     def _stated(self) -> Mapping[str, object]:
@@ -242,7 +246,12 @@ class SymbolicConstraint(OfFormula, Constraint):
             equality=self.equality,
             final_only=self.at == "final",
         )
-        return term if isinstance(self.at, str) else at_knots(term, np.array(self.at, dtype=np.intp), self._table)
+        if isinstance(self.at, str):
+            return term
+        kernel = source_of(__name__, COUNT=self._table.shape[1])
+        filled = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
+        numbers = np.concatenate([[len(self.at)], self.at, self._table.ravel()])
+        return replace(term, source=kernel.filled(**filled), data=numbers)
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
         if not isinstance(self.at, str) and self.at and self.at[-1] >= len(times):
@@ -360,3 +369,31 @@ def _knots(at: npt.ArrayLike) -> tuple[int, ...]:
 def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:
     name, arguments = signature.removesuffix(")").split("(")
     return symbolic.write_function(name, arguments, "data", assignments, of=of, returns=returns)
+
+
+# The kernel. `data` has the number of knots, the knots, and for each its COUNT numbers.
+COUNT = 0
+
+
+def value(x, u, t, row, data):
+    """The constraint; infinite at other knots."""
+    numbers = stack(COUNT + 1)
+    return constraint_value(x, u, t, row, numbers) if read_numbers(t, data, numbers) else inf
+
+
+def slope(x, u, t, row, data, gradient):
+    """Add its gradient (W,)."""
+    numbers = stack(COUNT + 1)
+    if read_numbers(t, data, numbers):
+        constraint_slope(x, u, t, row, numbers, gradient)
+
+
+def read_numbers(t, data, numbers):
+    """Write the numbers of a knot; return whether it has some."""
+    knots = int(data[0])
+    for k in range(knots):
+        if int(data[1 + k]) == t:
+            for i in range(COUNT):
+                numbers[i] = data[1 + knots + k * COUNT + i]
+            return True
+    return False

@@ -4,7 +4,7 @@ With `x = (y, z)`, `y_{t+1} = g(y_t, u_t)` and `z_{t+1} = u_t`, a rate is that o
 """
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import numbers_of
-from lqrsim.errors import Array
+from lqrsim.errors import Array, free_name
 from lqrsim.kernels import last_command as kernel
 from lqrsim.problem.constraints import bind_all
 from lqrsim.problem.control_rate import RateCost, RateLimits
@@ -39,7 +39,7 @@ class LastCommand(Dynamics):
         space, controls = of.state_coordinates, of.control_coordinates
         names = list(space.names)
         for name in controls.names:
-            names.append(unused(f"last_{name}", names))
+            names.append(free_name(f"last_{name}", names))
         self.control_coordinates = controls
         self.state_coordinates = Coordinates(
             names=tuple(names), units=(*space.units, *controls.units), position=space.position, plane=space.plane,
@@ -185,10 +185,3 @@ def with_last_command(problem: Problem) -> Problem:
     terms = {name: other._bound(terms_of(cost)) for name, cost in parts.items()}
     bound = bind_all(constraints, wide, problem.times)
     return other._with(_terms=terms, constraints=tuple(constraints), _constraint_terms=bound)
-
-
-def unused(name: str, names: Collection[str]) -> str:
-    """A name that is not among others: with underscores after it if it is."""
-    while name in names:
-        name += "_"
-    return name

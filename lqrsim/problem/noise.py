@@ -83,13 +83,10 @@ class Noise:
         formulas, whose derivatives follow. At the other levels they are numbers, whose derivatives are central
         differences. A constant M may be given as a matrix (n, k).
       size: k; not allowed with a matrix.
-      parameters: name -> value, as in `Dynamics`; they are attributes of p. Values are data.
+      parameters: name -> value, as in `Dynamics`.
       depends_on: names of the states and controls that M depends on, for other functions than formulas; all by
         default. The fewer, the faster. For formulas they are found automatically.
-      level: as in `Dynamics`; by default compiled for a numba function, and symbolic otherwise.
-
-    Raises:
-      InputError: an argument is not as described. The result of the function is checked when it is first needed.
+      level: as in `Dynamics`.
     """
 
     def __init__(
@@ -127,7 +124,6 @@ class Noise:
 
     @property
     def name(self) -> str:
-        """The name in messages."""
         return "a matrix" if self.matrix is not None else f"{name_of(self.function)}(x, u, p)"
 
     def __repr__(self) -> str:

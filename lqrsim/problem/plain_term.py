@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.user_functions import address_of, plain_calls
+from lqrsim.codegen.user_functions import address_of
 from lqrsim.errors import Array
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
@@ -21,7 +21,7 @@ class PlainTerm:
         first = term.functions[:1]
         parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
         wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
-        sizes, calls = {"N": states, "M": controls}, plain_calls(term.functions, parameters)
+        sizes, calls = {"N": states, "M": controls}, [one.plain_call(parameters) for one in term.functions]
         self._functions = plain_functions(term.code, sizes, wanted, calls)
         places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
         self._data = np.concatenate([places, term.data])

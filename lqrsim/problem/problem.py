@@ -105,8 +105,7 @@ class Problem(OneVersion):
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
 
     Attributes:
-      dynamics: the dynamics. g is their Runge-Kutta step over `dt` with the control held.
-      dt: the control period in seconds.
+      dynamics: g is their Runge-Kutta step over `dt` seconds, the control period, with the control held.
       steps: T, the number of control periods.
       initial: c_0, the cost of starting elsewhere than desired (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt. A QuadraticCost or ControlCost may follow a reference.
@@ -138,11 +137,6 @@ class Problem(OneVersion):
         steps in a period as that needs. By default it takes one.
       between_knots: whether inequalities are to hold between the knots, too; by default they hold at the knots. The
         dynamics must be a formula, and obstacles stand still. Re-plans keep them at the knots.
-
-    Raises:
-      InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
-        cost that depends on the control, control limits that are out of order or outside the actuators' range, or a
-        start that collides.
     """
 
     _prefix = ""
@@ -198,11 +192,20 @@ class Problem(OneVersion):
         controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
-            _check_within_reach(limited, controls)
+            sides = zip(limited.names, limited.low, limited.high, controls.low, controls.high, strict=True)
+            for name, low, high, lowest, highest in sides:
+                if not max(low, lowest) < min(high, highest):
+                    raise InputError(
+                        f"control_limits: got {low:g} to {high:g} for {name}, want a range that overlaps the"
+                        f" actuator's, {lowest:g} to {highest:g}"
+                    )
             keep(self, control_limits=(limited.low, limited.high), _controls=(limited, limited.within(controls)))
         else:
             keep(self, _controls=(controls, controls))
-        self._check_start_clear()
+        start, kept = self.start, [cost.kept_clear for cost in self.obstacle_costs]
+        if start is not None and (found := self._inside(kept, start, self.begin)) is not None:
+            where, advice = found
+            raise InputError(f"initial: got a start {where}, want it clear{advice}")
 
     @property
     def times(self) -> Array:
@@ -222,12 +225,11 @@ class Problem(OneVersion):
         )
 
     def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
-        """The rest of the problem after some steps, from a state that is given exactly.
+        """The rest of the problem after some steps, from a state (n,) that is given exactly.
 
         Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it.
 
         Args:
-          state: (n,).
           previous: (m,) the last command, from which a `control_rate` counts; by default the problem's own, and after
             some steps none.
         """
@@ -238,7 +240,12 @@ class Problem(OneVersion):
             term = about_state(self._terms["initial"][0], here)
         else:
             term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
-        rate = self._rate_after(previous) if after or previous is not None else self.control_rate
+        rate = self.control_rate
+        if rate is None and previous is not None:
+            raise InputError("previous: got a command for a problem without control_rate, want None")
+        if rate is not None and (after or previous is not None):
+            size = (len(self.dynamics.control_coordinates),)
+            rate = replace(rate, previous=None if previous is None else check_array("previous", previous, size))
         other = self._with(initial=start, control_rate=rate, _terms=self._terms | {"initial": (term,)})
         if not after:
             return other
@@ -247,14 +254,6 @@ class Problem(OneVersion):
         stage = self.stage_cost.ahead(after)
         left_over = {"constraints": left, "stage_cost": stage, "segments": segments}
         return other._with(steps=self.steps - after, begin=begin, **left_over)._bound_anew()
-
-    def _rate_after(self, previous: npt.ArrayLike | None) -> ControlRate | None:
-        """The `control_rate` after a command (m,), or None for one that is free. Raises InputError as `from_state`."""
-        if self.control_rate is None and previous is not None:
-            raise InputError("previous: got a command for a problem without control_rate, want None")
-        size = (len(self.dynamics.control_coordinates),)
-        known = None if previous is None else check_array("previous", previous, size)
-        return None if self.control_rate is None else self.control_rate._after(known)
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
         """The problem with other costs, None for the present ones. It may begin inside an obstacle if this one does."""
@@ -435,17 +434,15 @@ class Problem(OneVersion):
         return tuple(kept for part in parts if (kept := part.kept_clear) is not None)
 
     def terms(self, which: str) -> tuple[CostTerm, ...]:
-        """The bound terms of "initial", "stage_cost" or "final_cost"."""
+        """Those of "initial", "stage_cost" or "final_cost", bound."""
         return self._terms[check_name("which", which, self._terms)]
 
     @property
     def constraint_terms(self) -> tuple[ConstraintTerm, ...]:
-        """The bound constraints."""
         return self._constraint_terms
 
     @property
     def noise_term(self) -> NoiseTerm | None:
-        """The bound noise."""
         return self._noise_term
 
     def driven_by(self, noise: Noise | None, risk: float | None) -> "Problem":
@@ -560,14 +557,6 @@ class Problem(OneVersion):
         if self.between_knots and any(one.world.moving for one in self.kept_clear):
             raise InputError("between_knots: got True with obstacles that move, want False")
 
-    def _check_start_clear(self) -> None:
-        """Raises InputError if the robot starts inside an obstacle."""
-        kept = [cost.kept_clear for cost in self.obstacle_costs]
-        found = None if self.start is None else self._inside(kept, self.start, self.begin)
-        if found is not None:
-            where, advice = found
-            raise InputError(f"initial: got a start {where}, want it clear{advice}")
-
     @checked
     def violations(self, rollout: Rollout) -> dict[str, Array]:
         """By how much K runs of a plan violate each constraint, other than clearances, which a `Rollout` has itself.
@@ -622,14 +611,3 @@ class Problem(OneVersion):
         """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
         found = (one.in_world(self.dynamics, time).inside(state) for one in kept)
         return next((one for one in found if one is not None), None)
-
-
-def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:
-    """Raises InputError if the limits and the actuators' range have nothing in common."""
-    sides = zip(limits.names, limits.low, limits.high, actuators.low, actuators.high, strict=True)
-    for name, low, high, lowest, highest in sides:
-        if not max(low, lowest) < min(high, highest):
-            raise InputError(
-                f"control_limits: got {low:g} to {high:g} for {name}, want a range that overlaps the actuator's,"
-                f" {lowest:g} to {highest:g}"
-            )

@@ -1,4 +1,4 @@
-"""Bounds and goals of states: classes and kernel."""
+"""Bounds and goals of states, and soft limits: classes and kernels."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -8,10 +8,11 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import checked
+from lqrsim.annotations import NonNegative, checked
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_items, check_number, numbers_of
+from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, numbers_of
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, Side, by_name
+from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 
 Bounds = tuple[npt.ArrayLike, npt.ArrayLike]  # low and high, as given
@@ -142,6 +143,40 @@ class StateBounds(Constraint):
         )
 
 
+class LimitCost(Cost):
+    """`1/2 weight depth^2` for each state that is past a bound by some depth: a soft limit.
+
+    Args:
+      low, high: name of a state -> its bound.
+      weight: weight of the square of each depth.
+    """
+
+    @checked
+    def __init__(
+        self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None, *, weight: NonNegative
+    ) -> None:
+        self.weight = weight
+        self.bounds = [
+            (name, sign, check_number(f"LimitCost: bound of {name}", bound))
+            for sign, bounds in ((1.0, low), (-1.0, high))
+            for name, bound in (bounds or {}).items()
+        ]
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        names = dynamics.state_coordinates.names
+        rows = [
+            [names.index(check_name("LimitCost: state", name, names)), sign, bound, self.weight]
+            for name, sign, bound in self.bounds
+        ]
+        numbers = np.array([len(rows), *np.ravel(rows)], dtype=np.float64)
+        kernels = source_of(__name__)
+        soft = kernels.filled(value=(kernels, "soft"), derivatives=(kernels, "soft_derivatives"))
+        return CostTerm(soft, numbers, exact_hessian=False)
+
+
 def _bound(field: str, given: object) -> tuple[Side, Side]:
     """(low, high), each a number or numbers (K,), at least one of them finite."""
     want = "(low, high), each a number or one for each knot; infinite for no bound"
@@ -188,10 +223,10 @@ def _quantities(numbers: Array, unit: str) -> str:
     return _quantity(low, unit) if low == high else f"{low:g} to {_quantity(high, unit)}"
 
 
-# The kernel: the distance of a state to a bound, positive on the feasible side. `data` has the number of knots K with a
-# bound of their own, and then for each row the index of the state, 1 for a lower or -1 for an upper bound, the last
-# step at which it holds, the period in which the distance is taken, 0 for none, and K bounds, infinite at knots without
-# one. The last bound holds from its knot on.
+# The kernel of the others: the distance of a state to a bound, positive on the feasible side. `data` has the number of
+# knots K with a bound of their own, and then for each row the index of the state, 1 for a lower or -1 for an upper
+# bound, the last step at which it holds, the period in which the distance is taken, 0 for none, and K bounds, infinite
+# at knots without one. The last bound holds from its knot on.
 INDEX, SIGN, LAST, PERIOD, BOUNDS = 0, 1, 2, 3, 4
 
 
@@ -216,3 +251,30 @@ def slope(x, u, t, row, data, gradient):
 def row_at(row, data):
     """The index at which the numbers of a row begin."""
     return 1 + row * (BOUNDS + int(data[0]))
+
+
+# The kernel of a LimitCost. `data` has the number of bounds, and for each bound: the index of the state, 1 for a lower
+# bound or -1 for an upper one, the bound, and the weight.
+
+
+def soft(x, u, t, data):
+    """The cost."""
+    total = 0.0
+    for row in range(int(data[0])):
+        depth = data[4 * row + 2] * (data[4 * row + 3] - x[int(data[4 * row + 1])])
+        if depth > 0:
+            total += 0.5 * data[4 * row + 4] * depth * depth
+    return total
+
+
+def soft_derivatives(x, u, t, data, hessian, gradient):
+    """Add the Hessian (W, W) and the gradient (W,), and return the cost."""
+    total = 0.0
+    for row in range(int(data[0])):
+        state, sign, weight = int(data[4 * row + 1]), data[4 * row + 2], data[4 * row + 4]
+        depth = sign * (data[4 * row + 3] - x[state])
+        if depth > 0:
+            hessian[state, state] += weight
+            gradient[state] -= sign * weight * depth
+            total += 0.5 * weight * depth * depth
+    return total

@@ -73,22 +73,18 @@ class ForceLimits(Constraint):
 
     def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
         self.limits, self.later = tuple(limits), later
+        self._slopes = np.stack([one.slopes for one in self.limits]) if self.limits else np.zeros((0, 1))
         # Less than what is spared, so that forces of such a plan are within their limits.
         self._rough = 0.5 * SPARED * min((one.high - one.low for one in self.limits), default=0.0)
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
         actuators, joints = (tuple(one.id for one in self.limits if one.of_joint is joint) for joint in (False, True))
-        return dynamics.unlimited(actuators, joints)
+        return dynamics.stating(unlimited=(actuators, joints))
 
     def within(self, dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> "ForceLimits":
         """These limits at all physics steps of each period, predicted by the derivatives at a state."""
         return ForceLimits(self.limits, self._ahead(dynamics, state, control, round(dt / dynamics.period))[None])
-
-    @property
-    def _slopes(self) -> Array:
-        """(L, 1+n+m)."""
-        return np.stack([one.slopes for one in self.limits])
 
     def _ahead(self, dynamics: MjcfDynamics, x: Array, u: Array, count: int) -> Array:
         """The forces ((count-1) L, 1+n+m) at the physics steps of a period but the first, by its state and control."""

@@ -26,11 +26,10 @@ from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
 from lqrsim.problem.constraints import Constraint
 from lqrsim.problem.control_rate import ControlRate
 from lqrsim.problem.costs import Cost
-from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
-from lqrsim.problem.state_bounds import StateBounds
+from lqrsim.problem.state_bounds import LimitCost, StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
@@ -96,7 +95,7 @@ class MjcfRobot(Robot):
         them, and all geoms on which it stands and that a free joint or a slide moves it over.
       obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
         none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
-      turns_about: "x", "y" or "z", if free and ball joints turn about this axis on and on: of the world, or of a ball's
+      turns_about: whether free and ball joints turn about this axis on and on: of the world, or of a ball's
         parent body. The entry along it, such as `<name>_rz`, is then a turn about it, however many times, after a tilt,
         the rotation vector of the other two. Only a tilt of half a turn is singular, as upside down. By default all
         three are a rotation vector, which is singular at whole turns.
@@ -105,8 +104,6 @@ class MjcfRobot(Robot):
 
     Attributes:
       mjcf: its MJCF, with joints and actuators. scene: the scene that the robot moves in.
-      dynamics: MuJoCo's steps.
-      geoms: its colliding geoms. balls: an outline of it, or None.
     """
 
     @checked
@@ -236,17 +233,14 @@ class MjcfRobot(Robot):
 
     @cached_property
     def unlimited(self) -> MjcfDynamics:
-        """The dynamics without these limits. Raises InputError if there are none."""
+        """The dynamics without these limits."""
         return self.force_limits.removed_from(self.dynamics)
 
     def self_clearance(self, margin: float = 0.0) -> SelfClearance:
-        """The constraint that links which MuJoCo lets collide are some distance apart, at the steps of a plan.
+        """The constraint that links which MuJoCo lets collide are some metres apart, at the steps of a plan.
 
         MuJoCo does not let bodies collide that are fixed to each other, parent and child, or in an `<exclude>` of the
         MJCF. Links that touch in every position are left out, and so is what the robot handles.
-
-        Args:
-          margin: the least distance in metres.
         """
         found = SelfClearance(self.mjcf, self.body, margin)
         if not found.links:
@@ -270,10 +264,8 @@ class MjcfRobot(Robot):
 
         They are the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
         those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
-        which activations never rest, as an integrator's whose control cannot be 0.
-
-        Args:
-          state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
+        which activations never rest, as an integrator's whose control cannot be 0. Velocities of the state do not
+        count, nor do its activations, which are set to the values that hold it.
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
@@ -286,7 +278,7 @@ class MjcfRobot(Robot):
         """
         state = check_array("state", state, (len(self.dynamics.state_coordinates),))
         model = self.dynamics.physics.model
-        place, left = settled(model, self.configuration(state)[0])
+        place, left = settled(self.mjcf, model, self.configuration(state)[0])
         if left > _REST * float(model.body_mass.sum()):
             names = self.scene.world.names
             apart = f"; obstacles such as {names[0]} carry nothing: obstacles= chooses others" if names else ""
@@ -304,21 +296,19 @@ class MjcfRobot(Robot):
 
     def _drifting(self, held: Holding) -> list[str]:
         """Why each actuator that never rests does not, as text."""
-        model, found = self.dynamics.physics.model, []
-        space = self.dynamics.control_coordinates
+        found = list[str]()
         for number in np.flatnonzero(held.drifting).tolist():
-            first = int(model.actuator_ctrladr[number])
-            own = range(first, first + int(model.actuator_ctrlnum[number]))
-            ends = [("least", space.low, k) for k in own if held.controls[k] <= space.low[k]]
-            ends += [("most", space.high, k) for k in own if held.controls[k] >= space.high[k]]
+            actuator = self.mjcf.actuators[number]
+            own = list(zip(self.mjcf.controls[actuator.controls], held.controls[actuator.controls], strict=True))
+            ends = [(one, "least", one.low) for one, value in own if value <= one.low]
+            ends += [(one, "most", one.high) for one, value in own if value >= one.high]
             its = "its control" if len(own) == 1 else "{}"
-            why = ", ".join(f"{its.format(space.names[k])} is at {end} {side[k]:g}" for end, side, k in ends[:1])
-            found.append(f"the activation of {model.actuator(number).name} drifts" + (f": {why}" if why else ""))
+            why = "".join(f": {its.format(one.name)} is at {end} {side:g}" for one, end, side in ends[:1])
+            found.append(f"the activation of {actuator.name} drifts{why}")
         return found
 
     def _held(self, state: Array) -> Holding:
-        model = self.dynamics.physics.model
-        return holding(model, self.configuration(state)[0])
+        return holding(self.mjcf, self.dynamics.physics.model, self.configuration(state)[0])
 
     @checked
     def problem(
@@ -369,7 +359,7 @@ class MjcfRobot(Robot):
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
-        self._check_limits(start, goal)
+        bounds = self._bounds(start, goal)
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
         spent = efforts(self.mjcf) ** -2.0 if effort is None else effort
@@ -385,7 +375,6 @@ class MjcfRobot(Robot):
                 calm[model.nv : 2 * model.nv][turned] = 0.5 * attitude
         if calm.any():
             cost = cost + QuadraticCost(calm, about=about_state)
-        bounds = self._bounds(start, goal)
         if limits > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
         period = dynamics.period_near(_PERIOD) or dynamics.period if dt is None else dt
@@ -414,32 +403,26 @@ class MjcfRobot(Robot):
             constraints=kept, control_rate=control_rate,
         )  # fmt: skip
 
-    def _check_limits(self, start: Array, goal: Array) -> None:
-        """Raises InputError for a goal that moves a joint past its limits, or a start far past them.
+    def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
+        """Least and largest positions of joints, by name: at some distance from their limits, if both states are.
 
-        Limits are springs, and an MJCF may itself be past them at rest or in a keyframe.
+        Limits are springs, and an MJCF may itself be past them at rest or in a keyframe. Raises InputError for another
+        start far past them, and for a goal that moves a joint past them.
         """
-        model = self.scene.model
+        names, low, high, model = self.dynamics.state_coordinates.names, {}, {}, self.scene.model
         for one in self.mjcf.joints:
             if one.limits is None:
                 continue
+            begin, end = start[one.dof], goal[one.dof]
             stated = [model.qpos0[one.qpos.start], *model.key_qpos[:, one.qpos.start]]
-            if not np.isclose(start[one.dof], stated, rtol=0, atol=1e-9).any() and (
-                said := one.past_limits(start[one.dof], FAR_PAST)
-            ):
+            if not np.isclose(begin, stated, rtol=0, atol=1e-9).any() and (said := one.past_limits(begin, FAR_PAST)):
                 raise InputError(f"start: {said}")
-            if goal[one.dof] != start[one.dof] and (said := one.past_limits(goal[one.dof], _PAST)):
+            if end != begin and (said := one.past_limits(end, _PAST)):
                 raise InputError(f"goal: {said}")
-
-    def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
-        """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
-        names, low, high = self.dynamics.state_coordinates.names, {}, {}
-        for one in self.mjcf.joints:
-            if one.limits is not None:
-                least, most = one.limits
-                room, ends = min(_ROOM[0], _ROOM[1] * (most - least)), (start[one.dof], goal[one.dof])
-                low[names[one.dof]] = max(least, min(least + room, *ends))
-                high[names[one.dof]] = min(most, max(most - room, *ends))
+            least, most = one.limits
+            room = min(_ROOM[0], _ROOM[1] * (most - least))
+            low[names[one.dof]] = max(least, min(least + room, begin, end))
+            high[names[one.dof]] = min(most, max(most - room, begin, end))
         return low, high
 
     def __str__(self) -> str:

@@ -61,7 +61,7 @@ class MjcfPhysics:
     - an unstable simulation is not reset.
 
     Args:
-      mjcf: the MJCF. body: id of the body that is pushed.
+      body: id of the body that is pushed.
       actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
       softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
@@ -258,8 +258,7 @@ class MjcfDynamics(Dynamics):
         """MuJoCo's model, and memory for each thread, which are made when they are first asked for."""
         with _making:
             if self._physics is None:
-                loaded = bool(self.parameters)
-                self._physics = MjcfPhysics(self.mjcf, loaded=loaded, **self._stated)
+                self._physics = MjcfPhysics(self.mjcf, loaded=bool(self.parameters), **self._stated)
             return self._physics
 
     def __getstate__(self) -> dict[str, Any]:
@@ -291,9 +290,8 @@ class MjcfDynamics(Dynamics):
     def disturbed(self) -> "MjcfDynamics":
         if self.parameters:
             return self
-        other = copy.copy(self)
+        other = self.stating()  # with its own models, which carry the loads
         other.parameters = dict(self.disturbances)
-        other._set_mjcf(self.mjcf)  # with its own models, which carry the loads
         return other
 
     @property
@@ -375,7 +373,7 @@ class MjcfDynamics(Dynamics):
         if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):
             return
         for softness in SOFTER:
-            yield f"{softness:g}", self._stating(softness=softness)
+            yield f"{softness:g}", self.stating(softness=softness)
 
     def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
         nv = self.physics.model.nv
@@ -384,15 +382,11 @@ class MjcfDynamics(Dynamics):
             return
         found = Approaches(self.mjcf, states, wanted)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
-            other = self._stating(obstacles=(*self._stated["obstacles"], *found.thing))
+            other = self.stating(obstacles=(*self._stated["obstacles"], *found.thing))
             for words, positions in found:
                 yield words, other, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
 
-    def unlimited(self, actuators: tuple[int, ...], joints: tuple[int, ...]) -> "MjcfDynamics":
-        """The same without limits on the forces of these actuators and on the sums at these joints."""
-        return self._stating(unlimited=(actuators, joints))
-
-    def _stating(self, **stated: Any) -> "MjcfDynamics":
+    def stating(self, **stated: Any) -> "MjcfDynamics":
         """The same with other arguments of its `MjcfPhysics`."""
         other = copy.copy(self)
         other._stated = self._stated | stated
@@ -429,7 +423,7 @@ class MjcfDynamics(Dynamics):
 
     @property
     def period(self) -> float:
-        """The physics step in seconds."""
+        """The physics step."""
         return float(self.mjcf.model.opt.timestep)
 
     def _parts_of(self, dt: float, most: int) -> int:
@@ -438,11 +432,10 @@ class MjcfDynamics(Dynamics):
     @checked
     def check_period(self, dt: Positive) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""
-        timestep = float(self.physics.model.opt.timestep)
-        steps = dt / timestep
+        steps = dt / self.period
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
-                f"dt: got {dt:g} s, want a multiple of the physics step of {self.name}, {timestep:g} s;"
+                f"dt: got {dt:g} s, want a multiple of the physics step of {self.name}, {self.period:g} s;"
                 f' or set <option timestep="{float(dt / max(round(steps), 1))!r}"/> there'
             )
 
@@ -453,7 +446,7 @@ class MjcfDynamics(Dynamics):
         raise InputError(f"{self.name}: got MuJoCo's steps, which have no rate, want `linearize`")
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds, with the control held; NaN if it overflows."""
+        """As in `Dynamics`; NaN if it overflows."""
         x, u = self._check(state, control)
         self.check_period(dt)
         out = np.empty(len(x))
@@ -462,7 +455,6 @@ class MjcfDynamics(Dynamics):
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
-        """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c."""
         x, u = self._check(state, control)
         self.check_period(dt)
         n, m = len(x), len(u)

@@ -34,7 +34,7 @@ from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
-from lqrsim.scenes.mjcf_kinematics import axes_of, site_frame
+from lqrsim.scenes.mjcf_kinematics import axes_of
 
 _AXES = "xyz"
 
@@ -73,12 +73,11 @@ class _Pose:
         model = own.physics.model
         names = [model.site(number).name for number in range(model.nsite)]
         number = names.index(check_name(f"{self.what}: site", self.site, [name for name in names if name]))
-        body, offset, axes = site_frame(model, number)
-        position, wanted = np.zeros(3), np.eye(3)
-        position = position if self.position is None else self.position
-        wanted = wanted if self.axes is None else self.axes
+        position = np.zeros(3) if self.position is None else self.position
+        wanted = np.eye(3) if self.axes is None else self.axes
         source = source_of(__name__, PLACED=int(self.position is not None), TURNED=int(self.axes is not None))
-        data = np.concatenate([[body], offset, axes.ravel(), position, wanted.ravel()])
+        axes = axes_of(model.site_quat[number]).ravel()
+        data = np.concatenate([[model.site_bodyid[number]], model.site_pos[number], axes, position, wanted.ravel()])
         return Residual(source, data, tuple(self.rows), model.nv, functions=(MjcfMemory.of(own),))
 
 

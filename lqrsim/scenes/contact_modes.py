@@ -83,8 +83,7 @@ class ContactModes:
     """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
 
     Args:
-      model: model of the physics. actuators: ids of the controlled actuators. substeps: physics steps of a control
-        period.
+      actuators: ids of the controlled actuators. substeps: physics steps of a control period.
 
     Attributes:
       look: called before each part of a long computation, which its exception ends.
@@ -185,7 +184,10 @@ class ContactModes:
             both, sides, moved = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
             for share in _SMALLER:
                 moved = share * 1e-6 * max(1.0, abs(point[k]))
-                both = {sign: self._moved(point, k, sign * moved) for sign in (1, -1)}
+                for sign in (1, -1):
+                    other = point.copy()
+                    other[k] += sign * moved
+                    both[sign] = self.step(other[:n], other[n:])
                 sides = {sign: side for sign, side in both.items() if side[1].same_mode(switches)}
                 if sides:
                     break
@@ -196,13 +198,6 @@ class ContactModes:
             jacobian[:, k] = (high[0] - low[0]) / moved
             slopes[:, k] = (high[1].at(switches.names) - low[1].at(switches.names)) / moved
         return Period(end, jacobian, switches, slopes, certain)
-
-    def _moved(self, point: Array, k: int, by: float) -> tuple[Array, Switches]:
-        """The period from a state and control, joined, with one entry changed."""
-        other = point.copy()
-        other[k] += by
-        n = 2 * self._nv
-        return self.step(other[:n], other[n:])
 
 
 def _among(types: npt.NDArray[np.int32], kinds: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

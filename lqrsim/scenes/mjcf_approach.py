@@ -37,8 +37,8 @@ class Approaches:
     Positions are in the form of states, NaN where the robot is free to move otherwise.
 
     Args:
-      mjcf: the model. states: (T+1, n) of a plan in which nothing touches the body. moves: (nv,) by how much the
-        positions of the body are to change until the end.
+      states: (T+1, n) of a plan in which nothing touches the body. moves: (nv,) by how much the positions of the body
+        are to change until the end.
 
     Attributes:
       thing: ids of the geoms of the body that can collide. tools: ids of the driven geoms that can collide with them,
@@ -101,10 +101,13 @@ class Approaches:
         radii[1:-1] = np.maximum(radii[1:-1], _ROUND * touching)
         for words, directions in _paths(_unit(there), -ahead):
             spots = way - touching * ahead
-            spots[: begin + 1] = centre + radii[:, None] * _through(directions, begin)
+            knots = np.linspace(0, len(directions) - 1, begin + 1)
+            parts = [np.interp(knots, range(len(directions)), part) for part in np.transpose(directions)]
+            mixed = np.stack(parts, axis=1)
+            spots[: begin + 1] = centre + radii[:, None] * (mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
             positions, off = self._follow([tool], [point], spots[:, None])
             if off[:begin].max(initial=0.0) <= _OFF * touching:
-                yield f"a push by {self._called(tool)}{words}", positions
+                yield f"a push by {self._model.geom(tool).name}{words}", positions
 
     def _grasp(self, pair: tuple[int, int], pressed: float, way: Array, begin: int, end: int) -> tuple[str, Array]:
         """A grasp by two tools, from straight where they are, on both sides of the body's way."""
@@ -124,7 +127,8 @@ class Approaches:
         widths = np.interp(knots, [begin_closing, begin], [_OPEN, pressed])[:, None, None]
         targets = centres[:, None] + widths * (sides * np.array(touching)[:, None] * line)
         positions, _ = self._follow(pair, points, targets)
-        return f"a grasp by {self._called(pair[0])} and {self._called(pair[1])}", positions
+        first, second = (self._model.geom(tool).name for tool in pair)
+        return f"a grasp by {first} and {second}", positions
 
     def _pairs(self) -> list[tuple[int, int]]:
         """Pairs of tools that can close along the line between them, the nearest first."""
@@ -202,9 +206,6 @@ class Approaches:
             misses[t] = np.linalg.norm(target - spots, axis=1).max()
         return found, misses
 
-    def _called(self, geom: int) -> str:
-        return self._model.geom(geom).name
-
 
 def _below(model: mujoco.MjModel, body: int) -> npt.NDArray[np.bool_]:
     """Which bodies (nbody,) a body carries, with it and with those that are fixed to it."""
@@ -228,10 +229,3 @@ def _paths(first: Array, last: Array) -> Iterator[tuple[str, list[Array]]]:
     for words, other in others.items() if first @ last < 0.5 else ():
         if np.linalg.norm(other) > 0.1 and np.abs(np.array([first, last]) @ _unit(other)).max() < _ALONG:
             yield f", {words} the body", [first, _unit(other), last]
-
-
-def _through(directions: Sequence[Array], steps: int) -> Array:
-    """Directions (steps+1, 3) from one to the next."""
-    knots = np.linspace(0, len(directions) - 1, steps + 1)
-    mixed = np.stack([np.interp(knots, range(len(directions)), part) for part in np.transpose(directions)], axis=1)
-    return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)

@@ -4,6 +4,7 @@ import copy
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_kinematics import Equalities
-from lqrsim.scenes.mjcf_model import MjcfModel, control_ranges, input_names, ranges
+from lqrsim.scenes.mjcf_model import MjcfModel, ranges
 from lqrsim.scenes.mujoco_log import unlogged
 
 _HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
@@ -50,13 +51,8 @@ class Holding:
     held: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _Linear:
-    """Forces and rates about controls and activations z: their values, and their slopes by z.
-
-    Attributes:
-      forces: (nout,), of actuators, without limits. rates: (na,), of activations. forces_by, rates_by: their slopes.
-    """
+class _Linear(NamedTuple):
+    """Forces of actuators (nout,), without limits, and rates of activations (na,), about some z; and their slopes."""
 
     forces: Array
     rates: Array
@@ -76,8 +72,8 @@ class _AtRest:
         the robot is. of: (nz,), the actuator of each. slow: (nz,), which are targets of velocity.
     """
 
-    def __init__(self, model: mujoco.MjModel, qpos: Array) -> None:
-        self.model, self._free = model, without_limits(model)
+    def __init__(self, mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> None:
+        self.model, self._actuators, self._free = model, mjcf.actuators, without_limits(model)
         self.data = data = mujoco.MjData(model)
         data.qpos[:] = qpos
         mujoco.mj_inverse(model, data)
@@ -89,15 +85,16 @@ class _AtRest:
             mujoco.mju_sparse2dense(
                 self.moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
             )
-        self.of = np.concatenate([_owners(model.nu, model.actuator_ctrladr, model.actuator_ctrlnum),
-                                  _owners(model.na, model.actuator_actadr, model.actuator_actnum)])  # fmt: skip
-        acting = self.of[model.nu :]
+        numbers = np.arange(model.nactuator)
+        acting = np.repeat(numbers, model.actuator_actnum)
+        self.of = np.concatenate([np.repeat(numbers, model.actuator_ctrlnum), acting])
         act = ranges(model.actuator_actlimited[acting].astype(bool), model.actuator_actrange[acting])
         for number, entry, place in _integrals(model):
             if (most := model.actuator_dynprm[number, entry]) > 0:
                 act[0][place], act[1][place] = -most, most
-        self.low, self.high = (np.concatenate(side) for side in zip(control_ranges(model), act, strict=True))
-        inputs = [name for number in range(model.nactuator) for name in input_names(model, number)]
+        self.low = np.array([*(one.low for one in mjcf.controls), *act[0]])
+        self.high = np.array([*(one.high for one in mjcf.controls), *act[1]])
+        inputs = [name for one in mjcf.actuators for name in one.inputs]
         self.slow = np.array([*(name == "vel" for name in inputs), *np.zeros(model.na)], dtype=bool)
         self.neutral = np.clip(np.concatenate([self._targets(), np.zeros(model.na)]), self.low, self.high)
         self.neutral = np.clip(self.rested(self.neutral, np.arange(model.na)), self.low, self.high)
@@ -106,18 +103,16 @@ class _AtRest:
 
     def _targets(self) -> Array:
         """Controls (nu,) of 0, or for targets of position those of the actuators' lengths."""
-        model, found = self.model, np.zeros(self.model.nu)
-        for number in range(model.nactuator):
-            first, out = int(model.actuator_ctrladr[number]), int(model.actuator_outadr[number])
-            names = input_names(model, number)
-            lengths = self.data.actuator_length[out : out + int(model.actuator_outnum[number])]
-            if names == ["rx", "ry", "rz"]:
-                found[first : first + 3] = lengths
-            elif names == ["qw", "qx", "qy", "qz"]:
+        found = np.zeros(self.model.nu)
+        for one in self._actuators:
+            own, lengths = found[one.controls], self.data.actuator_length[one.outputs]
+            if one.inputs == ("rx", "ry", "rz"):
+                own[:] = lengths
+            elif one.inputs == ("qw", "qx", "qy", "qz"):
                 turn = np.linalg.norm(lengths)
-                mujoco.mju_axisAngle2Quat(found[first : first + 4], lengths / max(turn, 1e-300), turn)
-            elif "pos" in names:
-                found[first + names.index("pos")] = lengths[0]
+                mujoco.mju_axisAngle2Quat(own, lengths / max(turn, 1e-300), turn)
+            elif "pos" in one.inputs:
+                own[one.inputs.index("pos")] = lengths[0]
         return found
 
     def rested(self, z: Array, which: npt.NDArray[np.intp]) -> Array:
@@ -176,12 +171,12 @@ class _AtRest:
 
 
 @unlogged()
-def holding(model: mujoco.MjModel, qpos: Array) -> Holding:
-    """The controls with which nothing accelerates at rest and activations stay, at positions (nq,).
+def holding(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> Holding:
+    """The controls with which nothing accelerates at rest and activations stay, by a model at positions (nq,).
 
     Of several, the smallest. If there are none, those with the least sum of squared remaining forces nearby.
     """
-    rest = _AtRest(model, qpos)
+    rest = _AtRest(mjcf, model, qpos)
     search = _Search(rest)
     # Targets of velocity are left at 0 if other controls can hold.
     low, high = (np.where(rest.slow, rest.neutral, side) for side in (rest.low, rest.high))
@@ -246,7 +241,8 @@ class _Search:
             first = False
             before, shorter = score, False
             for share in 0.5 ** np.arange(_HALVES):
-                tried = self._rested(z + share * (aim - z))
+                which = np.flatnonzero((self._modes == 0) & ~self._idle)
+                tried = rest.rested(np.clip(z + share * (aim - z), low, high), which).clip(low, high)
                 if (then := self._score(tried)) < score:
                     z, score, shorter = tried, then, share < 1
                     break
@@ -259,11 +255,6 @@ class _Search:
         drifting[rest.of[model.nu :][np.abs(moving) > _HELD * np.maximum(1.0, np.abs(z[model.nu :]))]] = True
         held = bool((np.abs(left) <= _HELD * rest.largest).all()) and not drifting.any()
         return Holding(z[: model.nu], z[model.nu :], missed, drifting, held)
-
-    def _rested(self, z: Array) -> Array:
-        """The same controls, with activations at rest and within the ranges."""
-        which = np.flatnonzero((self._modes == 0) & ~self._idle)
-        return np.clip(self._rest.rested(np.clip(z, self._low, self._high), which), self._low, self._high)
 
     def _turn(self, act: Array) -> bool:
         """Let activations that are at the ends of their ranges (na,) stay there; whether there are any."""
@@ -445,23 +436,15 @@ def _integrals(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
             yield number, limit, int(model.actuator_actadr[number]) + int(model.actuator_dynprm[number, slew] > 0)
 
 
-def _owners(size: int, first: npt.NDArray[np.int32], count: npt.NDArray[np.int32]) -> npt.NDArray[np.intp]:
-    """The actuator of each control or activation, (size,)."""
-    found = np.zeros(size, dtype=np.intp)
-    for number in np.flatnonzero(count):
-        found[first[number] : first[number] + count[number]] = number
-    return found
-
-
 @unlogged()
-def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
+def settled(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
     A free body that touches nothing is let down first. Then Newton's method with steps of least norm: contacts are
     springs, and nothing moves in a free direction, such as along a floor.
     """
     qpos = _let_down(model, qpos)
-    data, actuators = mujoco.MjData(model), _AtRest(model, qpos)
+    data, actuators = mujoco.MjData(model), _AtRest(mjcf, model, qpos)
     free = np.flatnonzero(~actuators.driven(actuators.linear(actuators.neutral)))
     if not len(free):
         return qpos.copy(), 0.0

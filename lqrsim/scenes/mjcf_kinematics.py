@@ -165,11 +165,6 @@ def in_axes_of_bodies(model: mujoco.MjModel, geoms: npt.NDArray[np.int64], vecto
     return x + y + z
 
 
-def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
-    """The body of a site, and the site's position (3,) and axes (3, 3) in the body's axes."""
-    return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])
-
-
 def axes_of(quaternion: Array) -> Array:
     """The rotation matrix (3, 3) of a quaternion (4,) of length 1."""
     axes = np.zeros(9)

@@ -115,6 +115,7 @@ class Actuator:
     Attributes:
       name: name of the actuator. joint: name of the joint that it acts on; None if it acts on something else.
       controls, activations, outputs: its indices in ctrl, act and actuator_force; it may have several of each.
+      inputs: MuJoCo's names of its controls, such as pos and vel; empty for one that is just a command.
       forces: limits of its force, in N or N m. gear: of its first output.
       gain, bias: three numbers each; None if the force has another form, as of muscles, `pid` and `dcmotor`.
     """
@@ -124,6 +125,7 @@ class Actuator:
     controls: slice
     activations: slice
     outputs: slice
+    inputs: tuple[str, ...]
     forces: Side
     gear: float
     gain: tuple[float, ...] | None
@@ -174,22 +176,58 @@ class MjcfModel:
 
     @cached_property
     def joints(self) -> tuple[Joint, ...]:
-        return tuple(_joint(self.model, number) for number in range(self.model.njnt))
+        model, found = self.model, list[Joint]()
+        for number in range(model.njnt):
+            kind, name = _KINDS[mujoco.mjtJoint(model.jnt_type[number])], _joint_name(model, number)
+            firsts = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
+            qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
+            single = kind in ("slide", "hinge")
+            limited = model.jnt_limited[number] and single
+            stated = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{name}{SPEED_LIMIT}") if single else -1
+            found.append(
+                Joint(
+                    name=name, kind=kind, qpos=qpos, dofs=dofs,
+                    limits=_side(limited, model.jnt_range[number]) if limited else None,
+                    forces=_side(model.jnt_actfrclimited[number], model.jnt_actfrcrange[number]),
+                    speed=math.inf if stated < 0 else float(model.numeric(stated).data[0]),
+                )
+            )  # fmt: skip
+        return tuple(found)
 
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
-        return tuple(_actuator(self.model, number) for number in range(self.model.nactuator))
+        model, found = self.model, list[Actuator]()
+        places = (
+            (model.actuator_ctrladr, model.actuator_ctrlnum), (model.actuator_actadr, model.actuator_actnum),
+            (model.actuator_outadr, model.actuator_outnum),
+        )  # fmt: skip
+        for number in range(model.nactuator):
+            starts = [(max(0, int(first[number])), int(count[number])) for first, count in places]  # -1 without any
+            controls, activations, outputs = (slice(first, first + count) for first, count in starts)
+            of_joint = mujoco.mjtTrn(model.actuator_trntype[number]) in _OF_JOINTS
+            gain, bias = _affine(model, number)
+            found.append(
+                Actuator(
+                    name=model.actuator(number).name, controls=controls, activations=activations, outputs=outputs,
+                    inputs=tuple(mujoco.mj_actuatorInputName(model, number, i) or "" for i in range(starts[0][1])),
+                    joint=_joint_name(model, int(model.actuator_trnid[number, 0])) if of_joint else None,
+                    forces=_side(model.actuator_forcelimited[number], model.actuator_forcerange[number]),
+                    gear=float(model.actuator_gear[outputs.start, 0]), gain=gain, bias=bias,
+                )
+            )  # fmt: skip
+        return tuple(found)
 
     @cached_property
     def controls(self) -> tuple[Control, ...]:
         """All controls, in MuJoCo's order: named as their actuator, `<actuator>_<input>` if it has several, or none."""
-        ranges_of = zip(*(side.tolist() for side in control_ranges(self.model)), strict=True)
-        joints, found = {one.name: one for one in self.joints}, list[Control]()
+        model, joints, found = self.model, {one.name: one for one in self.joints}, list[Control]()
+        low, high = ranges(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange)
         for number, one in enumerate(self.actuators):
-            inputs, joint = input_names(self.model, number), joints.get(one.joint or "")
-            for name in inputs:
-                full = f"{one.name}_{name}" if len(inputs) > 1 else one.name
-                found.append(Control(full, _unit(one, joint, name), *next(ranges_of)))
+            if model.actuator_dyntype[number] == mujoco.mjtDyn.mjDYN_MUSCLE.value:  # MuJoCo passes on what is in 0..1
+                low[one.controls], high[one.controls] = (side[one.controls].clip(0, 1) for side in (low, high))
+            for place, name in zip(range(one.controls.start, one.controls.stop), one.inputs, strict=True):
+                full, unit = f"{one.name}_{name}" if len(one.inputs) > 1 else one.name, _unit(one, joints, name)
+                found.append(Control(full, unit, float(low[place]), float(high[place])))
         return tuple(found)
 
     @cached_property
@@ -303,11 +341,11 @@ class MjcfModel:
         return found
 
     def with_numbers(self, values: Mapping[str, float], what: str) -> "MjcfModel":
-        """The same with other `numbers`. Raises InputError as `mjcf_text.with_numbers` does."""
+        """The same with other `numbers`."""
         return replace(self, xml=mjcf_text.with_numbers(self.xml, self.model, values, what))
 
     def with_obstacles(self, world: World) -> "MjcfModel":
-        """The same with these obstacles as further geoms. Raises InputError as `mjcf_text.with_obstacles` does."""
+        """The same with these obstacles as further geoms."""
         return replace(self, xml=mjcf_text.with_obstacles(self.xml, world))
 
 
@@ -341,40 +379,8 @@ def _spec_of(xml: str) -> mujoco.MjSpec:
     return spec
 
 
-def _joint(model: mujoco.MjModel, number: int) -> Joint:
-    kind = _KINDS[mujoco.mjtJoint(model.jnt_type[number])]
-    firsts = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
-    qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
-    single, name = kind in ("slide", "hinge"), _joint_name(model, number)
-    limited = model.jnt_limited[number] and single
-    stated = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{name}{SPEED_LIMIT}") if single else -1
-    return Joint(
-        name=name, kind=kind, qpos=qpos, dofs=dofs,
-        limits=_side(limited, model.jnt_range[number]) if limited else None,
-        forces=_side(model.jnt_actfrclimited[number], model.jnt_actfrcrange[number]),
-        speed=math.inf if stated < 0 else float(model.numeric(stated).data[0]),
-    )  # fmt: skip
-
-
 def _joint_name(model: mujoco.MjModel, number: int) -> str:
     return model.joint(number).name or f"generated_joint_{number}"  # such as those of a flexcomp
-
-
-def _actuator(model: mujoco.MjModel, number: int) -> Actuator:
-    places = (
-        (model.actuator_ctrladr, model.actuator_ctrlnum), (model.actuator_actadr, model.actuator_actnum),
-        (model.actuator_outadr, model.actuator_outnum),
-    )  # fmt: skip
-    starts = [(max(0, int(first[number])), int(count[number])) for first, count in places]  # -1 without activations
-    controls, activations, outputs = (slice(first, first + count) for first, count in starts)
-    of_joint = mujoco.mjtTrn(model.actuator_trntype[number]) in _OF_JOINTS
-    gain, bias = _affine(model, number)
-    return Actuator(
-        name=model.actuator(number).name, controls=controls, activations=activations, outputs=outputs,
-        joint=_joint_name(model, int(model.actuator_trnid[number, 0])) if of_joint else None,
-        forces=_side(model.actuator_forcelimited[number], model.actuator_forcerange[number]),
-        gear=float(model.actuator_gear[outputs.start, 0]), gain=gain, bias=bias,
-    )  # fmt: skip
 
 
 def _side(limited: Any, side: Array) -> Side:
@@ -394,27 +400,15 @@ def _affine(model: mujoco.MjModel, number: int) -> tuple[tuple[float, ...] | Non
     return first, second
 
 
-def input_names(model: mujoco.MjModel, actuator: int) -> list[str]:
-    """MuJoCo's names of an actuator's controls, such as pos and vel; empty for one that is just a command."""
-    count = int(model.actuator_ctrlnum[actuator])
-    return [mujoco.mj_actuatorInputName(model, actuator, i) or "" for i in range(count)]
-
-
 def ranges(limited: npt.NDArray[np.bool_], sides: Array) -> tuple[Array, Array]:
     """The least and the largest numbers (k,) of ranges (k, 2), infinite where there is no limit."""
     low, high = np.where(limited, sides.T, [[-np.inf], [np.inf]])
     return low, high
 
 
-def control_ranges(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """The least and the largest of each control, (nu,). To a muscle MuJoCo passes on only what is in 0..1."""
-    muscle = np.repeat(model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE.value, model.actuator_ctrlnum)
-    low, high = ranges(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange)
-    return np.where(muscle, np.clip(low, 0, 1), low), np.where(muscle, np.clip(high, 0, 1), high)
-
-
-def _unit(one: Actuator, joint: Joint | None, what: str) -> str:
+def _unit(one: Actuator, joints: Mapping[str, Joint], what: str) -> str:
     """The unit of an actuator's input, for plain motors and servos of joints; empty for others, which have none."""
+    joint = joints.get(one.joint or "")
     if joint is None or joint.kind not in ("slide", "hinge") or one.gear != 1:
         return ""
     force, length = ("N", "m") if joint.kind == "slide" else ("N m", "rad")

@@ -139,7 +139,12 @@ def named(xml: str) -> tuple[str, bool]:
     kinds = {"body": ("body",), "joint": ("joint", "freejoint"), "geom": ("geom",)}
     parts = {kind: [one for one in there if one.tag in tags] for kind, tags in kinds.items()}
     parts["actuator"] = [one for section in root.iter("actuator") for one in section]
-    free = [(body.get("name"), one) for body in parts["body"] for one in body if _is_free(one)]
+    free = [
+        (body.get("name"), one)
+        for body in parts["body"]
+        for one in body
+        if (one.tag == "freejoint" or (one.tag == "joint" and one.get("type") == "free")) and one.get("name") is None
+    ]
     for body, joint in free if len(free) > 1 else ():
         if body is not None and body not in {one.get("name") for one in parts["joint"]}:
             joint.set("name", body)
@@ -150,12 +155,6 @@ def named(xml: str) -> tuple[str, bool]:
             element.set("name", next(names))
     changed = len(free) > 1 or any(unnamed.values())
     return ElementTree.tostring(root, encoding="unicode") if changed else xml, any(one.tag == "light" for one in there)
-
-
-def _is_free(element: ElementTree.Element) -> bool:
-    """Whether it is a free joint without a name."""
-    free = element.tag == "freejoint" or (element.tag == "joint" and element.get("type") == "free")
-    return free and element.get("name") is None
 
 
 def with_obstacles(xml: str, world: World) -> str:
@@ -232,7 +231,8 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     """
     elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
     masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
-    if _bodies(model) == elements["body"].keys():  # otherwise the text has no place for some masses
+    names = {model.body(number).name for number in range(1, model.nbody)}
+    if names == elements["body"].keys():  # otherwise the text has no place for some masses
         found += [Number("mass", "", sum(masses.values()))] if masses else []
         found += [Number("mass", name, mass) for name, mass in masses.items()]
     for number in range(model.njnt):
@@ -269,60 +269,39 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
         elif one.what == "mass":
             scales[one.part] = ratio
         elif one.what in _OF_JOINTS:
-            _set(elements["joint"][one.part], one.what, [value, *_higher(model, one)])
+            joint = model.joint(one.part).id
+            # Damping and stiffness may be polynomials, of which this is the linear coefficient.
+            damping, stiffness = model.dof_dampingpoly[model.jnt_dofadr[joint]], model.jnt_stiffnesspoly[joint]
+            rest = {"damping": damping, "stiffness": stiffness}.get(one.what, ())
+            _set(elements["joint"][one.part], one.what, [value, *rest])
         elif one.what == "friction":
             _set(elements["geom"][one.part], "friction", [value, *model.geom(one.part).friction[1:]])
         elif one.what == "gear":
-            _set(
-                elements["actuator"][one.part],
-                "gear",
-                [*(ratio * np.reshape(model.actuator(one.part).gear, (-1, 6))[0])],
-            )
+            first = np.reshape(model.actuator(one.part).gear, (-1, 6))[0]
+            _set(elements["actuator"][one.part], "gear", ratio * first)
         else:
             _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last element takes precedence
-    if scales:
-        _state_masses(root, elements["body"], model, scales)
-    return ElementTree.tostring(root, encoding="unicode")
-
-
-def _state_masses(
-    root: ElementTree.Element,
-    bodies: Mapping[str, ElementTree.Element],
-    model: mujoco.MjModel,
-    scales: Mapping[str, float],
-) -> None:
-    """Write the compiled mass and inertia of each body, times its scale, in place of the elements they came from."""
-    for name, body in bodies.items():
+    for name, body in elements["body"].items() if scales else ():  # the compiled masses, for all that they came from
         for inertial in body.findall("inertial"):
             body.remove(inertial)
         compiled, scale = model.body(name), scales.get(name, 1.0)
         if compiled.mass[0] > 0:
             inertial = ElementTree.Element("inertial")
-            _set(inertial, "pos", [*compiled.ipos])
-            _set(inertial, "quat", [*compiled.iquat])
+            _set(inertial, "pos", compiled.ipos)
+            _set(inertial, "quat", compiled.iquat)
             _set(inertial, "mass", [scale * compiled.mass[0]])
-            _set(inertial, "diaginertia", [*(scale * compiled.inertia)])
+            _set(inertial, "diaginertia", scale * compiled.inertia)
             body.insert(0, inertial)
-    compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
-    ElementTree.SubElement(root, "compiler", compiler)
-
-
-def _bodies(model: mujoco.MjModel) -> set[str]:
-    return {model.body(number).name for number in range(1, model.nbody)}
+    if scales:
+        compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
+        ElementTree.SubElement(root, "compiler", compiler)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _heavy(model: mujoco.MjModel) -> list[str]:
     """The bodies with mass that move, by themselves or with others."""
     moves = (model.body_treeid >= 0) & (model.body_mass > 0)
     return [model.body(number).name for number in np.flatnonzero(moves)]
-
-
-def _higher(model: mujoco.MjModel, one: Number) -> list[float]:
-    """The rest of the attribute after its linear coefficient: damping and stiffness may be polynomials."""
-    joint = model.joint(one.part).id
-    if one.what == "stiffness":
-        return model.jnt_stiffnesspoly[joint].tolist()
-    return model.dof_dampingpoly[model.jnt_dofadr[joint]].tolist() if one.what == "damping" else []
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import Want, checked
-from lqrsim.errors import InputError, check_count, check_items, check_name, excerpt
+from lqrsim.errors import InputError, check_count, check_items, check_name, excerpt, free_name
 from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
@@ -119,7 +119,7 @@ def load_scene(
 
 
 def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
-    """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
+    """The scene of an MJCF given as text, without includes."""
     return _with_choice(MjcfModel(name, xml), obstacles)
 
 
@@ -157,13 +157,6 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
     geoms_of.pop("", None)
     found = {geom for name in listed for geom in geoms_of[check_name(f"{what}: obstacles", name, tuple(geoms_of))]}
     return sorted(found)
-
-
-def free_name(name: str, taken: Collection[str]) -> str:
-    """A name for an element without a name in the MJCF: the given name, with underscores appended if it is taken."""
-    while name in taken:
-        name += "_"
-    return name
 
 
 def obstacle_geoms(model: mujoco.MjModel) -> list[int]:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.annotations import checked
-from lqrsim.errors import Array, InputError, check_number, check_text, shaped, vectors_of
+from lqrsim.errors import Array, InputError, check_number, check_text, free_name, shaped, vectors_of
 from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
@@ -25,7 +25,7 @@ from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
 from lqrsim.scenes.mujoco_log import unlogged
-from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
+from lqrsim.scenes.scene import Scene, obstacle_geoms
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator

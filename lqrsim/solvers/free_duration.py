@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array
+from lqrsim.errors import Array, free_name
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
-from lqrsim.problem.last_command import unused
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
@@ -468,7 +467,7 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
     """The dynamics with the duration as last state; at the stated duration they are unchanged."""
     space, controls, n = dynamics.state_coordinates, dynamics.control_coordinates, len(dynamics.state_coordinates)
     names = space.names
-    state, parameter = unused(STATE, names), unused(STATED, (*dynamics.parameters, *dynamics.disturbances))
+    state, parameter = free_name(STATE, names), free_name(STATED, (*dynamics.parameters, *dynamics.disturbances))
 
     def f(x: Any, u: Any, p: Any) -> list[Any]:
         share = x[n] / getattr(p, parameter)

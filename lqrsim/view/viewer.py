@@ -15,7 +15,7 @@ import numpy as np
 from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun
 from lqrsim.control.replan_rule import ActivePlan
 from lqrsim.control.replanner import LiveReplanner
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, free_name
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, CostSum, terms_of
 from lqrsim.problem.problem import Problem
@@ -26,7 +26,6 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
 from lqrsim.scenes.mjcf_model import compiled
-from lqrsim.scenes.scene import free_name
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
