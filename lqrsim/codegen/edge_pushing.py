@@ -24,11 +24,7 @@ from lqrsim.codegen.symbolic import own_functions, without_kinks
 
 
 class Operations:
-    """Operations on symbols and numbers, in the order in which they can be done.
-
-    Attributes:
-      steps: (symbol, operation), each operation once.
-    """
+    """Operations on symbols and numbers, each once: `steps` (symbol, operation), as they can be done one by one."""
 
     def __init__(self) -> None:
         self.steps: list[tuple[Any, Any]] = []
@@ -182,8 +178,7 @@ def hessian_of(
 def jacobian_of(operations: Operations, results: Sequence[Any], variables: Sequence[Any]) -> dict[tuple[int, int], Any]:
     """The first derivatives of formulas that are operations, by one sweep forward; steps are added to the operations.
 
-    Returns:
-      (row, variable) -> the name of the derivative, where it is not always zero.
+    They are by (row, variable), where they are not always zero.
     """
     import sympy
 

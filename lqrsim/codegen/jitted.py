@@ -13,14 +13,6 @@ import numpy as np
 from lqrsim.errors import InputError
 
 
-def check_jax(name: str) -> None:
-    """Raises InputError, in the name of a function, if JAX is missing."""
-    try:
-        import jax  # noqa: F401
-    except ImportError as error:
-        raise InputError(f"{name}: level: got 'jax', which needs JAX, want pip install 'lqrsim[jax]'") from error
-
-
 @contextlib.contextmanager
 def in_double_precision() -> Iterator[None]:
     """The context of all calls of JAX."""
@@ -37,11 +29,7 @@ def in_double_precision() -> Iterator[None]:
 class Jitted:
     """`f(x, u, p)` or `f(x, p)` of NumPy arrays, which returns an array; compiled at its first call.
 
-    Args:
-      function: the user's function, of JAX arrays.
-
-    Attributes:
-      py_func: the same; the name is numba's.
+    The user's function, of JAX arrays, is `py_func`, as it is in numba.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

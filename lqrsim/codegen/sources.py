@@ -191,11 +191,7 @@ class _Parsed:
 
 
 class Scope:
-    """The meaning of each name in a source, for one set of sizes.
-
-    Args:
-      source: the functions. sizes: name -> number, of the sizes in `declarations.py`: N, M and so on; W is N + M.
-    """
+    """The meaning of each name in a source, for one set of the sizes in `declarations.py`: N, M, ...; W is N + M."""
 
     def __init__(self, source: Source, sizes: Mapping[str, int]) -> None:
         self.source, self.sizes = source, {"W": sizes.get("N", 0) + sizes.get("M", 0), **sizes}

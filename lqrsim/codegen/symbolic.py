@@ -346,10 +346,8 @@ def write_function(
 def write_chain(states: int, slopes: Iterable[str]) -> str:
     """Source of `chain` of `kernels/runge_kutta.py` for a sparse Jacobian.
 
-    Known zeros make an iteration faster than zeros that are found at run time.
-
-    Args:
-      states: N. slopes: the nonzero entries, `fx[0, 3]`, `fu[1, 0]`, ....
+    Known zeros make an iteration faster than zeros that are found at run time. `slopes` are the nonzero entries,
+    `fx[0, 3]`, `fu[1, 0]`, ....
     """
     entries = [(target[:2], *map(int, target[3:-1].split(", "))) for target in slopes]
     inner = [(i, k) for matrix, i, k in entries if matrix == "fx"]

@@ -24,7 +24,7 @@ import numpy as np
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.compiled_module import compilations, compiling
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
-from lqrsim.codegen.jitted import Jitted, JittedDerivatives, check_jax
+from lqrsim.codegen.jitted import Jitted, JittedDerivatives
 from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
 from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
@@ -152,7 +152,11 @@ def level_of(function: Any, asked: str | None) -> str:
     if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
         raise InputError(f"level: got {asked!r} for {name_of(function)}, want 'compiled' for a numba function")
     if asked == "jax":
-        check_jax(name_of(function))
+        try:
+            import jax  # noqa: F401
+        except ImportError as error:
+            got = "got 'jax', which needs JAX, want pip install 'lqrsim[jax]'"
+            raise InputError(f"{name_of(function)}: level: {got}") from error
     return asked
 
 
@@ -183,7 +187,6 @@ class UserFunction:
     or two arrays of those shapes, which are zero on entry.
 
     Attributes:
-      level: compiled, jax or plain.
       states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
       unused: (index, name) of the entries of (x, u) on which the value does not depend, according to the user.

@@ -6,6 +6,7 @@ constraint here are for such dynamics, `last_command.py`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -49,10 +50,13 @@ class ControlRate:
     def __post_init__(self) -> None:
         if self.weight is None and self.limits is None:
             raise InputError("ControlRate: got neither a weight nor limits, want one of the two at least")
-        for name, check in (("weight", _weight), ("previous", _finite)):
+        for name in ("weight", "previous"):
             given = getattr(self, name)
             if given is not None and not isinstance(given, Mapping):
-                keep(self, **{name: check(f"ControlRate: {name}", given)})
+                given = _sized(f"ControlRate: {name}", given, "a number, or one for each control")
+                if name == "weight" and (given < 0).any():
+                    raise InputError(f"ControlRate: weight: got {brief(given)}, want numbers >= 0")
+                keep(self, **{name: given})
         if self.limits is not None and not isinstance(self.limits, Mapping):
             keep(self, limits=_range("ControlRate: limits", self.limits))
 
@@ -63,15 +67,15 @@ class ControlRate:
     def _in(self, dynamics: Dynamics) -> "ControlRate":
         """The same with an array (m,) for all that is given. Raises InputError if it does not fit the controls."""
         space, found = dynamics.control_coordinates, dict[str, Any]()
-        for name, check in (("weight", _weight), ("previous", _finite)):
+        for name in ("weight", "previous"):
             given = getattr(self, name)
             if isinstance(given, Mapping):
-                given = check(f"ControlRate: {name}", space._numbers(f"ControlRate: {name}", given))
+                given = space._numbers(f"ControlRate: {name}", given)
             found[name] = None if given is None else _each(f"ControlRate: {name}", given, space)
         limits: Any = self.limits
         if isinstance(limits, Mapping):
             sides = np.tile([[-inf], [inf]], len(space))
-            for i, (low, high) in space._by_name("ControlRate: limits", limits, _range_of_one).items():
+            for i, (low, high) in space._by_name("ControlRate: limits", limits, partial(_range, single=True)).items():
                 sides[:, i] = low, high
             limits = sides[0], sides[1]
         if limits is not None:
@@ -85,25 +89,14 @@ class ControlRate:
         return np.concatenate([[float(known), dt], previous])
 
 
-def _weight(field: str, given: object) -> Array:
-    weight = _finite(field, given)
-    if (weight < 0).any():
-        raise InputError(f"{field}: got {brief(weight)}, want numbers >= 0")
-    return weight
-
-
-def _finite(field: str, given: object) -> Array:
-    return _sized(field, given, "a number, or one for each control")
-
-
 def _sized(field: str, given: object, want: str, *, infinite: bool = False) -> Array:
     """A number, (), or numbers (m,)."""
     numbers = numbers_of(field, given, want)
     return check_array(field, numbers, (None,) * min(numbers.ndim, 1), infinite=infinite)
 
 
-def _range(field: str, given: Any) -> tuple[Array, Array]:
-    """(low, high), each () or (m,), of r or (low, high). Raises InputError."""
+def _range(field: str, given: Any, *, single: bool = False) -> tuple[Array, Array]:
+    """(low, high), each () or (m,), of r or (low, high); of a single control, ()."""
     want = "a number, or (low, high), each a number or one for each control"
     if isinstance(given, (tuple, list)):
         sides = check_items(field, given, object, want)
@@ -115,13 +108,7 @@ def _range(field: str, given: Any) -> tuple[Array, Array]:
         low = -high
     if not ((low < 0).all() and (high > 0).all()):
         raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want a range with 0 inside")
-    return low, high
-
-
-def _range_of_one(field: str, given: Any) -> tuple[Array, Array]:
-    """As `_range`, for one control."""
-    low, high = _range(field, given)
-    if low.ndim or high.ndim:
+    if single and (low.ndim or high.ndim):
         raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want one range for a control")
     return low, high
 
@@ -134,11 +121,7 @@ def _each(field: str, numbers: Array, space: Coordinates) -> Array:
 
 
 class RateCost(Cost):
-    """The cost of rates, for dynamics whose last m states are the last command.
-
-    Args:
-      rate: weights and the command before the first step. dt: the control period in s.
-    """
+    """The cost of rates, for dynamics whose last m states are the last command."""
 
     def __init__(self, rate: ControlRate, dt: float) -> None:
         self.rate, self.dt = rate, dt

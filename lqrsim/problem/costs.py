@@ -113,9 +113,6 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
     def with_added_state(self, dynamics: Dynamics) -> Self:
         """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
         each control with a `control_rate`. `dynamics` are those without that state.
-
-        Raises:
-          InputError: its kind cannot be stated for one more state.
         """
         raise InputError(
             f"duration and control_rate: got a {type(self).__name__} beside one of them, which cannot have one more"
@@ -126,9 +123,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
     def ahead(self, steps: Index, *, horizon: Horizon = "shrinking") -> Self:
         """The same for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
 
-        Args:
-          horizon: "shrinking" for the rest of the plan, without the first rows; or "moving" for a plan of the same
-            length, which repeats the last row.
+        The rest of a plan, with a "shrinking" horizon, is without the first rows; a plan of the same length, with a
+        "moving" one, repeats the last row.
         """
         filled = horizon == "moving"
         if not self.by_knot:
@@ -241,11 +237,7 @@ def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
 
 
 def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
-    """The cost with numbers by name in the order of a system; the same object if it has no numbers by name.
-
-    Raises:
-      InputError: a term does not fit the system, or is no cost; or an initial or final cost has numbers for each knot.
-    """
+    """The cost with numbers by name in the order of a system; the same object if it has no numbers by name."""
     terms = terms_of(cost, field)
     found = tuple(term._in(dynamics) for term in terms)
     for term in found:

@@ -27,11 +27,7 @@ Part = TypeVar("Part", bound=ProblemPart[Any])
 
 
 class LastCommand(Dynamics):
-    """Dynamics with the last command as their last m states.
-
-    Attributes:
-      of: the dynamics without.
-    """
+    """Dynamics `of` a system, with the last command as their last m states."""
 
     def __init__(self, of: Dynamics) -> None:
         self.of, self.level, self.functions = of, of.level, ()
@@ -146,9 +142,6 @@ def with_last_command(problem: Problem) -> Problem:
     """The problem of a problem with a `control_rate`, with the last command as its last m states.
 
     That before the first step is no state: the cost and the limits of rates have it.
-
-    Raises:
-      InputError: a part of the problem cannot be stated with more states.
     """
     rate, dynamics, m = problem.control_rate, problem.dynamics, len(problem.control_coordinates)
     assert rate is not None

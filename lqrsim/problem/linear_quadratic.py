@@ -20,16 +20,8 @@ class Stage:
     An array with a leading axis of T has one entry per step; an array without that axis is the same at every step. All
     arrays except A, B and R may be left out and are then zero. Paper: Eqs. (4), (7).
 
-    Attributes:
-      A: (..., n, n).
-      B: (..., n, m).
-      c: (..., n).
-      Q: (..., n, n) symmetric.
-      P: (..., m, n).
-      R: (..., m, m) symmetric, positive definite.
-      q: (..., n).
-      r: (..., m).
-      constant: (...).
+    B is (..., n, m), A and Q (..., n, n), P (..., m, n), R (..., m, m), c and q (..., n), r (..., m), constant (...). Q
+    and R are symmetric, R positive definite.
     """
 
     A: npt.ArrayLike

@@ -59,11 +59,8 @@ class FixedState:
         ls.FixedState(x=1.0, heading=np.pi)
 
     Args:
-      state: (n,) in the states' units, or a dictionary of name or unit: number; states without a number are 0.
-      **named: name of a state -> number, in place of a dictionary.
-
-    Attributes:
-      state: the numbers; they may be by name until a Problem has the state.
+      state: (n,) in the states' units, or a dictionary of name or unit: number; states without a number are 0. The
+        numbers may be by name until a Problem has the state.
     """
 
     state: PerEntry

@@ -17,7 +17,7 @@ class Residual(Term):
     slopes)`, which writes them, and their nonzero derivatives in the states (rows, N) to an array of zeros.
 
     Attributes:
-      parts: for messages, the name of each row.
+      parts: the name of each row.
       moved: number of states, from the first one on, that the numbers depend on.
     """
 
@@ -26,7 +26,6 @@ class Residual(Term):
 
     @property
     def rows(self) -> int:
-        """The number of rows."""
         return len(self.parts)
 
     def filling(self, kernel: Source) -> Source:

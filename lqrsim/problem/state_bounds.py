@@ -28,7 +28,6 @@ class GoalState(Constraint):
         as {"m/s": 0} for all velocities.
       count_turns: whether a goal of 2 pi is another than 0. By default, the states that the dynamics declare as angles
         reach their goals up to whole turns, and a search may take any. A QuadraticCost about a goal counts them.
-      **named: name of a state -> number, in place of a dictionary.
     """
 
     @checked
@@ -90,7 +89,6 @@ class StateBounds(Constraint):
     Args:
       bounds: a dictionary of name or unit of a state: (low, high), in its unit, each a number or (T+1,) numbers. An
         infinite number means no bound. A name takes precedence over a unit.
-      **named: name of a state -> (low, high), in place of a dictionary.
     """
 
     def __init__(self, bounds: Mapping[str, Bounds] | None = None, /, **named: Bounds) -> None:
@@ -144,12 +142,7 @@ class StateBounds(Constraint):
 
 
 class LimitCost(Cost):
-    """`1/2 weight depth^2` for each state that is past a bound by some depth: a soft limit.
-
-    Args:
-      low, high: name of a state -> its bound.
-      weight: weight of the square of each depth.
-    """
+    """`1/2 weight depth^2` for each state, by name, that is past a bound by some depth: a soft limit."""
 
     @checked
     def __init__(

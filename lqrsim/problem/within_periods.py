@@ -37,7 +37,6 @@ class WithinPeriods(Constraint):
     A constraint with other numbers at each knot holds within a period as far as it holds at both ends.
 
     Attributes:
-      constraint: the inequality.
       acts: (K, rows) 1 for the periods in which a row acts, else 0.
       spares: (rows,) by how much more than 0 the rows are to be there.
     """

@@ -39,9 +39,7 @@ class Holding:
       controls: (nu,), within their limits, that come nearest to holding the robot still.
       activations: (na,), the states of actuators, at rest with these controls.
       missed: (nv,), the missing force of each joint in N or N m; 0 for joints that follow others.
-      drifting: (nactuator,), the actuators whose activations are not at rest: as an integrator's whose control cannot
-        be 0.
-      held: whether the controls hold the robot.
+      drifting: (nactuator,), whose activations are not at rest: as an integrator's whose control cannot be 0.
     """
 
     controls: Array

@@ -61,7 +61,7 @@ class Joint:
     """A joint.
 
     Attributes:
-      name: name of the joint. kind: free, ball, slide or hinge.
+      kind: free, ball, slide or hinge.
       qpos, dofs: its indices in qpos and in qvel. limits: limits of a slide or hinge, in m or rad, or None.
       forces: limits of the sum that actuators exert on it, in N or N m, with gravity compensation if that is theirs.
       speed: largest speed of a slide or hinge, in m/s or rad/s, infinite if none is stated. MuJoCo does not know it: it
@@ -113,7 +113,7 @@ class Actuator:
     moment arm, which for a slide or hinge is the gear, it acts on the joint, whose sum is clipped to `Joint.forces`.
 
     Attributes:
-      name: name of the actuator. joint: name of the joint that it acts on; None if it acts on something else.
+      joint: name of the joint that it acts on; None if it acts on something else.
       controls, activations, outputs: its indices in ctrl, act and actuator_force; it may have several of each.
       inputs: MuJoCo's names of its controls, such as pos and vel; empty for one that is just a command.
       forces: limits of its force, in N or N m. gear: of its first output.
