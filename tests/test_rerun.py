@@ -12,7 +12,7 @@ from funnels_by_hand import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.scenes.mjcf_model import model_from_xml
+from lqrsim.scenes.mjcf_text import model_from_xml
 from lqrsim.view import rerun_file
 
 Columns = dict[str, np.ndarray]

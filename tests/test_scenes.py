@@ -9,8 +9,7 @@ import pytest
 
 from lqrsim.errors import InputError
 from lqrsim.robots.mjcf import MjcfRobot
-from lqrsim.scenes.mjcf_model import MOST
-from lqrsim.scenes.mjcf_text import MODELS, names
+from lqrsim.scenes.mjcf_text import MODELS, MOST, names
 from lqrsim.scenes.scene import load_scene, scene_from_xml
 
 # method.md, section 4, in metres

@@ -95,12 +95,10 @@ def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
         if address < len(functions):
             functions[int(address)](*arguments)
         else:
-            given = _taken_apart(arguments)
-            _c_function(None, given)(int(address))(*map(_c_argument, given))
+            _c_call(None, address, arguments)
 
     def call_for_value(address: float, *arguments: Any) -> float:
-        given = _taken_apart(arguments)
-        return _c_function(ctypes.c_double, given)(int(address))(*map(_c_argument, given))
+        return _c_call(ctypes.c_double, address, arguments)
 
     words = {name: getattr(np, name, getattr(math, name)) for name in vars(math) if not name.startswith("_")}
     words |= {f"{side}{name}": getattr(np, f"arc{name}") for name in ("sin", "cos", "tan") for side in "a"}
@@ -132,23 +130,20 @@ def _taken_apart(arguments: Sequence[Any]) -> list[Any]:
     return [part for one in arguments for part in (_taken_apart(one) if isinstance(one, tuple) else [one])]
 
 
-def _c_argument(argument: Any) -> Any:
-    if isinstance(argument, np.ndarray):
-        return argument.ctypes.data
-    return (
-        argument if isinstance(argument, ctypes.c_int32) else argument.item() if hasattr(argument, "item") else argument
-    )
-
-
-def _c_function(returns: Any, arguments: Sequence[Any]) -> Any:
-    def kind(argument: Any) -> Any:
-        if isinstance(argument, np.ndarray):
-            return ctypes.c_void_p
-        if isinstance(argument, ctypes.c_int32):
-            return ctypes.c_int32
-        return ctypes.c_double if isinstance(argument, float | np.floating) else ctypes.c_int64
-
-    return ctypes.CFUNCTYPE(returns, *map(kind, arguments))
+def _c_call(returns: Any, address: float, arguments: Sequence[Any]) -> Any:
+    """Call a C function; arrays are passed by their addresses."""
+    kinds, given = list[Any](), list[Any]()
+    for one in _taken_apart(arguments):
+        number = one.item() if isinstance(one, np.generic) else one
+        if isinstance(one, np.ndarray):
+            kinds.append(ctypes.c_void_p)
+            number = one.ctypes.data
+        elif isinstance(one, ctypes.c_int32):
+            kinds.append(ctypes.c_int32)
+        else:
+            kinds.append(ctypes.c_double if isinstance(number, float) else ctypes.c_int64)
+        given.append(number)
+    return ctypes.CFUNCTYPE(returns, *kinds)(int(address))(*given)
 
 
 def _memory(address: float, kind: Any) -> Array:

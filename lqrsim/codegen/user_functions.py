@@ -40,59 +40,6 @@ _SYMBOL = "function"
 _loaded: dict[str, tuple[Any, int]] = {}
 
 
-def compiled(
-    function: Callable[..., Any], adapter: str, names: dict[str, Any], pointers: int, what: str
-) -> tuple[Any, int]:
-    """Compile a function, numba's or one for it, to a C function of this number of pointers to float64.
-
-    Args:
-      adapter: source of `adapter`, which calls the function by the name `function`.
-      names: other names that the adapter uses, among them the named tuple `Parameters`. what: name in messages.
-
-    Returns:
-      The object that must be kept alive, and the address.
-    """
-    try:
-        import numba
-    except ImportError as error:
-        raise InputError(
-            f"{what}: level: got 'compiled', which needs numba, want pip install 'lqrsim[numba]'"
-        ) from error
-    own = fingerprint(function)
-    options = getattr(function, "targetoptions", _OPTIONS)
-    parts = [version("numba"), version("llvmlite"), repr(instruction_set()), adapter, repr(names["Parameters"]._fields)]
-    key = disk.key(*parts, own) if own else ""
-    if key in _loaded:
-        return _loaded[key]
-    kept = disk.load(key) if key else None
-    found = _unpacked(*kept) if kept is not None else None
-    if found is None:
-        note_helpers(function)
-        # numba compiled helpers with their globals at that time. If these have changed, the result is not cached.
-        lasting = bool(key) and not stale(function)
-        compilations.append(what)
-        logger.debug(f"compiling {what} ...")
-        pointer = numba.types.CPointer(numba.types.float64)
-        try:
-            # Compiled again, because numba freezes the globals of a function when it first compiles it.
-            plain = getattr(function, "py_func", function)
-            again = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
-            namespace = names | _numba_names() | {"function": again, "nan": float("nan")}
-            exec(compile(adapter, "<lqrsim>", "exec"), namespace)
-            made: Any = numba.cfunc(numba.types.void(*[pointer] * pointers), **_OPTIONS)(namespace["adapter"])
-        except Exception as error:  # mostly NumbaError, but numba also raises others
-            raise InputError(f"{what}: got code that numba cannot compile, want {_reason(error)}") from error
-        found = made, made.address
-        text = made.inspect_llvm()
-        if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
-            code, needed = object_code_of_one(text, made.native_name, _SYMBOL)
-            disk.save(key, code, what, needed=needed)
-            found = _unpacked(code, {"needed": needed}) or found
-    if key:
-        _loaded[key] = found
-    return found
-
-
 def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int] | None:
     """Load a cached function; None if it cannot be used."""
     from numba.core import registry
@@ -340,8 +287,51 @@ class UserFunction:
         """Forget the exception, so that the function is called again."""
         self._thread.raised = None
 
-    def adapter(self) -> tuple[str, dict[str, Any]]:
-        """Source of the adapter that numba compiles around the function, and the names that it uses."""
+    @cached_property
+    def compiled(self) -> tuple[Any, int]:
+        """A C function that numba makes of this one: the object to keep alive, and its address."""
+        try:
+            import numba
+        except ImportError as error:
+            got = "got 'compiled', which needs numba, want pip install 'lqrsim[numba]'"
+            raise InputError(f"{self.name}: level: {got}") from error
+        function, adapter = self.function, self._adapter()
+        own, parameters = fingerprint(function), parameters_class(self.parameters)
+        parts = [version("numba"), version("llvmlite"), repr(instruction_set()), adapter, repr(parameters._fields)]
+        key = disk.key(*parts, own) if own else ""
+        if key in _loaded:
+            return _loaded[key]
+        kept = disk.load(key) if key else None
+        found = _unpacked(*kept) if kept is not None else None
+        if found is None:
+            note_helpers(function)
+            # numba compiled helpers with their globals at that time. If these have changed, the result is not cached.
+            lasting = bool(key) and not stale(function)
+            compilations.append(self.name)
+            logger.debug(f"compiling {self.name} ...")
+            pointers = [numba.types.CPointer(numba.types.float64)] * (3 + (len(self.writes) or 1))
+            options = getattr(function, "targetoptions", _OPTIONS)
+            try:
+                # Compiled again, because numba freezes the globals of a function when it first compiles it.
+                plain = getattr(function, "py_func", function)
+                again = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
+                namespace = _numba_names() | {"function": again, "nan": float("nan"), "Parameters": parameters}
+                exec(compile(adapter, "<lqrsim>", "exec"), namespace)
+                made: Any = numba.cfunc(numba.types.void(*pointers), **_OPTIONS)(namespace["adapter"])
+            except Exception as error:  # mostly NumbaError, but numba also raises others
+                raise InputError(f"{self.name}: got code that numba cannot compile, want {_reason(error)}") from error
+            found = made, made.address
+            text = made.inspect_llvm()
+            if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
+                code, needed = object_code_of_one(text, made.native_name, _SYMBOL)
+                disk.save(key, code, self.name, needed=needed)
+                found = _unpacked(code, {"needed": needed}) or found
+        if key:
+            _loaded[key] = found
+        return found
+
+    def _adapter(self) -> str:
+        """Source of `adapter`, which numba compiles around `function`."""
         lines = [f"x, u = readonly(carray(x, {self.states})), readonly(carray(u, {self.controls}))"]
         numbers = "".join(f"data[{self.offset + i}], " for i in range(len(self.parameters)))
         lines.append(f"p = Parameters({numbers})")
@@ -365,8 +355,7 @@ class UserFunction:
             lines += [f"    {line}" for line in copies]
             lines += ["except Exception:", "    out[0] = nan"]
         body = "\n".join(f"    {line}" for line in lines)
-        source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
-        return source, {"Parameters": parameters_class(self.parameters)}
+        return f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
 
     def _entry(self, i: int) -> str:
         """The index of value i among the returned values."""
@@ -517,12 +506,7 @@ def address_of(function: UserFunction) -> float:
     """The address of a user's function, for compiled code."""
     with compiling:
         if not function.held:
-            if function.level == "compiled":
-                text, names = function.adapter()
-                count = 3 + (len(function.writes) or 1)
-                function.held.append(compiled(function.function, text, names, count, function.name))
-            else:
-                function.held.append(function.called_back)
+            function.held.append(function.compiled if function.level == "compiled" else function.called_back)
     return float(function.held[0][1])
 
 

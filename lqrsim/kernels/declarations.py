@@ -175,7 +175,7 @@ def loss(r, row, data) -> tuple[float, float, float]:
 def constraint_value(x, u, t, row, data) -> float:
     """One value of a constraint: nonnegative, or zero for an equality, where it is satisfied.
 
-    `value` of `residual_constraint.py`, and of the files of constraints.
+    `value` of the files of constraints.
     """
     return 0.0
 

@@ -15,7 +15,7 @@ from lqrsim.annotations import Index, Want, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import Term
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
-from lqrsim.kernels import residual_constraint
+from lqrsim.problem import residual as kernel
 from lqrsim.problem.costs import ProblemPart
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
@@ -94,8 +94,9 @@ class ConstraintTerm(Term):
           columns: the index of each row's number among L.
         """
         shared = max(1, residual.rows)
+        rows = source_of(kernel, AT=residual.numbers, ROWS=shared)
         return cls(
-            residual.filling(source_of(residual_constraint, AT=residual.numbers, ROWS=shared)),
+            residual.filling(rows.filled(value=(rows, "row_value"), slope=(rows, "row_slope"))),
             np.concatenate([residual.data, least.shape, columns, least.ravel()]),
             residual.rows,
             describe,

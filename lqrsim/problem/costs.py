@@ -16,7 +16,7 @@ from lqrsim.annotations import Index, checked
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import Term
 from lqrsim.errors import Array, InputError, brief, check_count, excerpt
-from lqrsim.kernels import residual_cost
+from lqrsim.problem import residual as kernel
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
@@ -72,7 +72,7 @@ class CostTerm(Term):
         """
         sizes = {"ROWS": max(1, residual.rows), "MOVED": residual.moved, "FIRST_STEP": first}
         return cls(
-            residual.filling(source_of(residual_cost, **sizes).filled(loss=loss)),
+            residual.filling(source_of(kernel, **sizes).filled(loss=loss)),
             np.concatenate([residual.data, numbers]),
             nonconvex_in=nonconvex_in or None,
             factor=None if factor is None else len(residual.data) + factor,

@@ -1,6 +1,6 @@
 """A problem with costs or limits of rates as one with the last command among the states, which solvers can solve.
 
-With `x = (y, z)`, `y_{t+1} = g(y_t, u_t)` and `z_{t+1} = u_t`, a rate is that of u_t and z_t.
+With `x = (y, z)`, `y_{t+1} = g(y_t, u_t)` and `z_{t+1} = u_t`, a rate is that of u_t and z_t. The kernels are its step.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array, free_name
-from lqrsim.kernels import last_command as kernel
+from lqrsim.kernels.declarations import M, N, W, at, call, stack, zeros
 from lqrsim.problem.constraints import bind_all
 from lqrsim.problem.control_rate import RateCost, RateLimits
 from lqrsim.problem.costs import Cost, ProblemPart, terms_of
@@ -64,7 +64,7 @@ class LastCommand(Dynamics):
 
     @cached_property
     def step_source(self) -> Source:
-        return source_of(kernel)
+        return source_of(__name__)
 
     @cached_property
     def curvature_source(self) -> Source | None:
@@ -178,3 +178,49 @@ def with_last_command(problem: Problem) -> Problem:
     terms = {name: other._bound(terms_of(cost)) for name, cost in parts.items()}
     bound = bind_all(constraints, wide, problem.times)
     return other._with(_terms=terms, constraints=tuple(constraints), _constraint_terms=bound)
+
+
+# The kernels. g is called at its address, with sizes of its own, so that it may be any: a formula's Runge-Kutta step, a
+# user's function, or MuJoCo's steps. `p` has the addresses below.
+ADVANCE, STEP_JACOBIAN, STEP_CURVATURE, NUMBERS = 0, 1, 2, 3  # of g's functions, and of the numbers that they call p
+
+
+def advance(x, u, p, h, out):
+    """Write the state (N,) after `h` seconds."""
+    call(p[ADVANCE], x, u, at(p[NUMBERS]), h, out)
+    for i in range(M):
+        out[N - M + i] = u[i]
+
+
+def step_jacobian(x, u, p, h, out, jacobian):
+    """Write the same step, and its Jacobian [A B] (N, W)."""
+    own = stack(N - M, N)
+    call(p[STEP_JACOBIAN], x, u, at(p[NUMBERS]), h, out, own)
+    write_jacobian(u, own, out, jacobian)
+
+
+def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
+    """Write the same; add the Hessian (W, W) of the next state times weights (N,)."""
+    own, curve = stack(N - M, N), zeros(N, N)
+    call(p[STEP_CURVATURE], x, u, at(p[NUMBERS]), h, weights, out, own, curve)
+    write_jacobian(u, own, out, jacobian)
+    for i in range(N):
+        row = i if i < N - M else i + M
+        for j in range(N):
+            column = j if j < N - M else j + M
+            hessian[row, column] += curve[i, j]
+
+
+def write_jacobian(u, own, out, jacobian):
+    """Write the last M states, and the Jacobian of all, given that of the others, (N - M, N)."""
+    for i in range(N):
+        for j in range(W):
+            jacobian[i, j] = 0.0
+    for i in range(N - M):
+        for j in range(N - M):
+            jacobian[i, j] = own[i, j]
+        for j in range(M):
+            jacobian[i, N + j] = own[i, N - M + j]
+    for i in range(M):
+        out[N - M + i] = u[i]
+        jacobian[N - M + i, N + i] = 1.0

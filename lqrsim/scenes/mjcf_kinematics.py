@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_model import MjcfModel
-from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
-from lqrsim.scenes.mujoco_log import unlogged
+from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
 _TYPED = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding

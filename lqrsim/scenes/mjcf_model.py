@@ -1,13 +1,11 @@
 """An MJCF as a record, read and compiled once, that robots, dynamics, plants and pictures share."""
 
-import contextlib
 import itertools
 import math
 import os
-import re
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,12 +15,11 @@ import numpy.typing as npt
 
 from lqrsim import rotations
 from lqrsim.annotations import checked
-from lqrsim.errors import Array, InputError, check_name, excerpt
-from lqrsim.scenes import mjcf_text
-from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, UNNAMED, mujoco
-from lqrsim.scenes.mujoco_log import unlogged
+from lqrsim.errors import Array, InputError, check_name, check_number
+from lqrsim.scenes.mjcf_text import SPEED_LIMIT, UNNAMED, model_from_xml, read_mjcf, spec_of
+from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.urdf import is_urdf, read_urdf
-from lqrsim.scenes.world import World
+from lqrsim.scenes.world import KINDS, World
 
 _KINDS = {
     mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball", mujoco.mjtJoint.mjJNT_SLIDE: "slide",
@@ -30,28 +27,13 @@ _KINDS = {
 }  # fmt: skip
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+WHOLE = "mass"  # name of the mass of all moving bodies together
+_NUMBERS = ("damping", "stiffness", "armature", "frictionloss")  # of joints
+_MEDIUM = ("density", "viscosity")
+_BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # bounds; all other numbers must not be negative
+_LONG = 1e3  # m, half length of a geom that stands for an infinite one
 FAR_PAST = 0.1  # fraction of a joint's range; springs of limits give way by less
 _SAME = 1e-12  # m, and of quaternions, within which a mocap body is where a keyframe has it
-
-MOST_CELLS = 4096**2  # largest number of cells of a height field; MuJoCo crashes with far more
-# Largest numbers of elements whose attributes are sizes of arrays, or of drawings; with far more, MuJoCo takes minutes
-# and GBs. Those that begin with nuser_ are numbers of each element.
-MOST = {
-    "size": {"nkey": 10_000, "nuserdata": 10**7, "njmax": 10**6, "nconmax": 10**6, "nstack": 10**8, "memory": 2**32},
-    "quality": {"shadowsize": 2**14, "offsamples": 64, "numslices": 1000, "numstacks": 1000, "numquads": 1000},
-}
-MOST_USER = 10_000
-MOST_PIXELS = 8192**2  # of a texture that MuJoCo makes
-MOST_COPIES = 1_000_000  # largest number of elements from <replicate>: they take MuJoCo minutes, and GBs
-_COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of the elements that they make
-_MASSES = frozenset(
-    (
-        "mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "boundmass", "boundinertia",
-        "armature",
-    )
-)  # fmt: skip
-_NAN = re.compile(r"(^|[\s,])[+-]?nan")
-
 
 Side = tuple[float, float]  # the least and the largest; infinite without a limit
 
@@ -132,6 +114,15 @@ class Actuator:
     bias: tuple[float, ...] | None
 
 
+@dataclass(frozen=True)
+class Number:
+    """A number of an MJCF: its kind, its body, joint, geom or actuator (empty for all), and its value."""
+
+    what: str
+    part: str
+    value: float
+
+
 @checked
 @dataclass(frozen=True, eq=False)
 class MjcfModel:
@@ -150,7 +141,7 @@ class MjcfModel:
     @classmethod
     def of_file(cls, name_or_path: str | os.PathLike[str]) -> "MjcfModel":
         """That of a packaged scene, an MJCF or a URDF. Raises InputError if there is none, or something else in it."""
-        return cls(*read_urdf(name_or_path)) if is_urdf(name_or_path) else cls(*mjcf_text.read_mjcf(name_or_path))
+        return cls(*read_urdf(name_or_path)) if is_urdf(name_or_path) else cls(*read_mjcf(name_or_path))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """The text: another process compiles it."""
@@ -170,7 +161,7 @@ class MjcfModel:
 
     def spec(self) -> mujoco.MjSpec:
         """A spec of it, to be changed and compiled; its geoms are in the order of their ids."""
-        return _spec_of(self.xml)
+        return spec_of(self.xml)
 
     # What it is made of.
 
@@ -289,9 +280,33 @@ class MjcfModel:
         return next((number for number in moving if masses[number] > 0), moving[0])
 
     @cached_property
-    def numbers(self) -> dict[str, mjcf_text.Number]:
-        """The numbers that can be changed, by the names of parameters."""
-        return mjcf_text.numbers_of(self.xml, self.model)
+    def numbers(self) -> dict[str, Number]:
+        """The numbers that can be changed, by the names of parameters: `mass`, `<body>_mass`, `<joint>_damping`, ....
+
+        Its elements all have names. Only elements with a name and this number in the text count: bodies that move,
+        geoms that collide.
+        """
+        model = self.model
+        elements, found = _elements(ElementTree.fromstring(self.xml)), list[Number]()
+        masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
+        names = {model.body(number).name for number in range(1, model.nbody)}
+        if names == elements["body"].keys():  # otherwise the text has no place for some masses
+            found += [Number("mass", "", sum(masses.values()))] if masses else []
+            found += [Number("mass", name, mass) for name, mass in masses.items()]
+        for number in range(model.njnt):
+            name, dof = model.joint(number).name, int(model.jnt_dofadr[number])
+            if name in elements["joint"]:
+                values = {key: getattr(model, f"dof_{key}")[dof] for key in _NUMBERS if key != "stiffness"}
+                values["stiffness"] = model.jnt_stiffness[number]
+                found += [Number(key, name, float(values[key])) for key in _NUMBERS]
+        for number in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
+            if (name := model.geom(number).name) in elements["geom"]:
+                found.append(Number("friction", name, float(model.geom_friction[number, 0])))
+        for number, gear in enumerate(model.actuator_gear[model.actuator_outadr]):
+            if (name := model.actuator(number).name) in elements["actuator"] and gear.any():
+                found.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
+        found += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
+        return {f"{one.part}_{one.what}" if one.part else one.what: one for one in found}
 
     def keyframe(self, name: str, what: str) -> tuple[Array, Array, Array | None]:
         """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, of which the model has zeros."""
@@ -312,28 +327,77 @@ class MjcfModel:
     # The same with changes, each a model of its own.
 
     def complete(self) -> "MjcfModel":
-        """The same with names for all bodies, joints, geoms and actuators, and with a light, if it has none."""
-        xml, has_light = mjcf_text.named(self.xml)
-        named = self if xml == self.xml else replace(self, xml=xml)
-        if has_light or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
+        """The same with names for all bodies, joints, geoms and actuators, and with a light, if it has none.
+
+        Names are `unnamed_<kind>_<number>`, counted from 0; of several free joints without one, each gets its body's.
+        """
+        root = ElementTree.fromstring(self.xml)
+        taken = {element.get("name") for element in root.iter()}
+        # An MJCF has its own section worldbody, and one from each file that it includes.
+        there = [one for world in root.iter("worldbody") for one in world.iter()]
+        kinds = {"body": ("body",), "joint": ("joint", "freejoint"), "geom": ("geom",)}
+        parts = {kind: [one for one in there if one.tag in tags] for kind, tags in kinds.items()}
+        parts["actuator"] = [one for section in root.iter("actuator") for one in section]
+        free = [
+            (body.get("name"), one)
+            for body in parts["body"]
+            for one in body
+            if (one.tag == "freejoint" or (one.tag == "joint" and one.get("type") == "free"))
+            and one.get("name") is None
+        ]
+        for body, joint in free if len(free) > 1 else ():
+            if body is not None and body not in {one.get("name") for one in parts["joint"]}:
+                joint.set("name", body)
+        unnamed = {kind: [one for one in elements if one.get("name") is None] for kind, elements in parts.items()}
+        for kind, elements in unnamed.items():
+            names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in taken)
+            for element in elements:
+                element.set("name", next(names))
+        changed = len(free) > 1 or any(unnamed.values())
+        xml = ElementTree.tostring(root, encoding="unicode") if changed else self.xml
+        named = replace(self, xml=xml) if changed else self
+        lit = any(one.tag == "light" for one in there)
+        if lit or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
             return named
         # The size of the whole is known when it is compiled, and the light is to be in what is compiled.
-        lit = replace(self, xml=mjcf_text.with_light(xml, np.zeros(3)))
-        model = lit.model
+        model = replace(self, xml=_with_light(xml, np.zeros(3))).model
         place = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
-        found = replace(self, xml=mjcf_text.with_light(xml, place))
+        found = replace(self, xml=_with_light(xml, place))
         for field in (model.light_pos, model.light_pos0, model.light_poscom0):
             field[-1] += [float(f"{number:.6g}") for number in place]
         vars(found)["model"] = model
         return found
 
     def with_mocap(self, key: str, what: str) -> "MjcfModel":
-        """The same with its mocap bodies where a keyframe has them, and all else as it is."""
-        number = self._key(key, what)
-        if not (poses := _mocap_poses(self.model, number)):
+        """The same with its mocap bodies where a keyframe has them, and all else as it is.
+
+        What MuJoCo compiles from where bodies are at rest is stated as it was: what ties two bodies, by sites whose
+        names begin with that of the keyframe.
+        """
+        model, number = self.model, self._key(key, what)
+        if not (poses := _mocap_poses(model, number)):
             return self
-        found = replace(self, xml=mjcf_text.with_mocap(self.xml, self.model, poses, key))
-        if not _same_forces(self.model, number, found.model):
+        root = ElementTree.fromstring(self.xml)
+        elements = _elements(root)["body"]
+        for body, pose in poses.items():
+            for other in ("axisangle", "xyaxes", "zaxis", "euler"):
+                elements[body].attrib.pop(other, None)
+            for attribute, values in zip(("pos", "quat"), pose, strict=True):
+                _set(elements[body], attribute, values)
+        elements["world"] = next(root.iter("worldbody"))
+        ties = [one for section in root.findall("equality") for one in section]
+        for i, (tie, values) in enumerate(zip(ties, model.eq_data, strict=False)):
+            if tie.tag == "weld" and "body1" in tie.attrib:
+                _set(tie, "relpose", values[3:10])
+            elif tie.tag == "connect" and "body1" in tie.attrib:
+                del tie.attrib["anchor"]
+                for side, place in enumerate((values[:3], values[3:6]), 1):
+                    site = {"name": f"{key}_tie_{i}_{side}", "group": "5"}
+                    tied = ElementTree.SubElement(elements[tie.attrib.pop(f"body{side}", "world")], "site", site)
+                    _set(tied, "pos", place)
+                    tie.set(f"site{side}", site["name"])
+        found = self._of(root)
+        if not _same_forces(model, number, found.model):
             raise InputError(
                 f"{what}: mocap: got the keyframe {key!r}, whose mocap bodies cannot be placed by rewriting the MJCF,"
                 " want them directly in the <worldbody>, and springs of tendons at them with a springlength"
@@ -341,42 +405,105 @@ class MjcfModel:
         return found
 
     def with_numbers(self, values: Mapping[str, float], what: str) -> "MjcfModel":
-        """The same with other `numbers`."""
-        return replace(self, xml=mjcf_text.with_numbers(self.xml, self.model, values, what))
+        """The same with other `numbers`.
+
+        A body's inertia scales with its mass; `mass` scales all bodies. The numbers of a gear keep their ratios.
+        """
+        model, numbers, root = self.model, self.numbers, ElementTree.fromstring(self.xml)
+        elements, scales = _elements(root), dict[str, float]()
+        for name, value in values.items():
+            one = numbers[name]
+            value = check_number(f"{what}: {name}", value, **_BOUNDS.get(one.what, {"at_least": 0.0}))
+            ratio = value / one.value if one.value else 0.0
+            if name == WHOLE:
+                scales |= dict.fromkeys(_heavy(model), ratio)
+                if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
+                    raise InputError(f"{what}: {WHOLE}: got {WHOLE} and {other}, want one of the two")
+            elif one.what == "mass":
+                scales[one.part] = ratio
+            elif one.what in _NUMBERS:
+                joint = model.joint(one.part).id
+                # Damping and stiffness may be polynomials, of which this is the linear coefficient.
+                damping, stiffness = model.dof_dampingpoly[model.jnt_dofadr[joint]], model.jnt_stiffnesspoly[joint]
+                rest = {"damping": damping, "stiffness": stiffness}.get(one.what, ())
+                _set(elements["joint"][one.part], one.what, [value, *rest])
+            elif one.what == "friction":
+                _set(elements["geom"][one.part], "friction", [value, *model.geom(one.part).friction[1:]])
+            elif one.what == "gear":
+                first = np.reshape(model.actuator(one.part).gear, (-1, 6))[0]
+                _set(elements["actuator"][one.part], "gear", ratio * first)
+            else:
+                _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last element takes precedence
+        if not scales:
+            return self._of(root)
+        for name, body in elements["body"].items():  # the compiled masses, in the place of what they came from
+            for inertial in body.findall("inertial"):
+                body.remove(inertial)
+            heavy, scale = model.body(name), scales.get(name, 1.0)
+            if heavy.mass[0] > 0:
+                inertial = ElementTree.Element("inertial")
+                _set(inertial, "pos", heavy.ipos)
+                _set(inertial, "quat", heavy.iquat)
+                _set(inertial, "mass", [scale * heavy.mass[0]])
+                _set(inertial, "diaginertia", scale * heavy.inertia)
+                body.insert(0, inertial)
+        compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
+        ElementTree.SubElement(root, "compiler", compiler)
+        return self._of(root)
 
     def with_obstacles(self, world: World) -> "MjcfModel":
-        """The same with these obstacles as further geoms."""
-        return replace(self, xml=mjcf_text.with_obstacles(self.xml, world))
+        """The same with these obstacles as further geoms, fixed to the world, which nothing touches."""
+        root = ElementTree.fromstring(self.xml)
+        taken = {one.get("name") for one in root.iter("geom")}
+        section = ElementTree.SubElement(root, "worldbody")
+        for one in world.obstacles:
+            if one.kind not in KINDS:
+                raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(KINDS)}")
+            if one.name in taken:
+                raise InputError(f"moving: got {one.name}, which is a geom of the robot's MJCF, want another name")
+            turn = np.zeros(4)
+            mujoco.mju_mat2Quat(turn, one.rotation.ravel())
+            size = np.minimum([0.0, 0.0, 1.0] if one.kind == "plane" else one.size, _LONG)
+            own = {"name": one.name, "type": one.kind, "contype": "0", "conaffinity": "0"}
+            geom = ElementTree.SubElement(section, "geom", own)
+            for key, values in (("size", size), ("pos", one.position), ("quat", turn)):
+                _set(geom, key, values)
+        return self._of(root)
+
+    def _of(self, root: ElementTree.Element) -> "MjcfModel":
+        return replace(self, xml=ElementTree.tostring(root, encoding="unicode"))
 
 
-def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
-    """The model of an MJCF given as text, without includes; `what` is its name in messages."""
-    _check_elements(xml, what)
-    try:
-        with unlogged():
-            model = _spec_of(xml).compile() if "<attach" in xml else mujoco.MjModel.from_xml_string(xml)
-    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
-        raise InputError(f"{what}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
-    _check_numbers(model, what)
-    return model
+def _with_light(xml: str, place: Array) -> str:
+    """The MJCF with a light named overview at a place (3,)."""
+    light = {"name": "overview", "pos": "", "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
+    added = ElementTree.Element("worldbody")
+    ElementTree.SubElement(added, "light", light | {"pos": " ".join(f"{number:.6g}" for number in place)})
+    end = xml.rindex("</mujoco>")  # the text comes from ElementTree, and can be long
+    return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
 
 
-def _spec_of(xml: str) -> mujoco.MjSpec:
-    """The spec of an MJCF, in which elements of attached models have names, too: the text cannot name them."""
-    spec = mujoco.MjSpec.from_string(xml)
-    if "<attach" not in xml:
-        return spec
-    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    for joint in free if len(free) > 1 else ():
-        joint.name = joint.name or joint.parent.name
-    for kind, elements in (
-        ("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms), ("actuator", spec.actuators),
-    ):  # fmt: skip
-        taken = {element.name for element in elements}
-        names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in taken)
-        for element in elements:
-            element.name = element.name or next(names)
-    return spec
+def _heavy(model: mujoco.MjModel) -> list[str]:
+    """The bodies with mass that move, by themselves or with others."""
+    moves = (model.body_treeid >= 0) & (model.body_mass > 0)
+    return [model.body(number).name for number in np.flatnonzero(moves)]
+
+
+def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
+    """The named elements, by kind and name. Replicas have other names in the model, and are not found."""
+    found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
+    for world in root.iter("worldbody"):
+        for element in world.iter():
+            if element.tag in found:
+                found[element.tag][element.get("name", "")] = element
+    for section in root.findall("actuator"):
+        found["actuator"] |= {element.get("name", ""): element for element in section}
+    return found
+
+
+def _set(element: ElementTree.Element, name: str, numbers: Iterable[float]) -> None:
+    """Write numbers so that they read back exactly."""
+    element.set(name, " ".join(repr(float(number)) for number in numbers))
 
 
 def _joint_name(model: mujoco.MjModel, number: int) -> str:
@@ -461,88 +588,3 @@ def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return spec.compile()
-
-
-def _check_elements(xml: str, what: str) -> None:
-    """Raises InputError where MuJoCo would crash or stay silent: for excessive counts, or NaN for unknown numbers.
-
-    MuJoCo treats a NaN for the mass or density of a geom as a missing number.
-    """
-    text = xml.lower()
-    rare = any(word in text for word in (*_COPIERS, "hfield", "nan", "builtin", *(f"<{tag}" for tag in MOST)))
-    if not rare and xml.count("</") < DEEPEST and xml.count("<") <= MOST_COPIES:
-        return  # files of thousands of geoms are not read again
-    reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
-    try:
-        reader.feed(xml)
-        made = 0
-        events: Any = reader.read_events()
-        for event, element in events:
-            depth += 1 if event == "start" else -1
-            if depth > DEEPEST:
-                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want less nesting")
-            if element.tag in _COPIERS:
-                copies = [*copies, copies[-1] * _product(element.get("count", ""))] if event == "start" else copies[:-1]
-            if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", *_COPIERS):
-                made += copies[-1]
-                if made > MOST_COPIES:
-                    got = f"<{element.tag}> of {copies[-1]:,} copies" if element.tag in _COPIERS else "more"
-                    raise InputError(f"{what}: got {got}, want {MOST_COPIES:,} elements at most")
-            for key in _MASSES.intersection(element.attrib) if event == "start" else ():
-                if _NAN.search(element.attrib[key].lower()):
-                    name = f" {element.attrib['name']!r}" if "name" in element.attrib else ""
-                    raise InputError(f"{what}: got NaN for the {key} of {element.tag}{name}, want a number")
-            if event == "start":
-                _check_sizes(element, what)
-            if event == "start" and element.tag == "hfield":
-                sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
-                cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
-                if cells > MOST_CELLS:
-                    got = f"{sizes[0]} x {sizes[1]} heights in the height field {element.attrib.get('name', '')!r}"
-                    raise InputError(f"{what}: got {got}, want {MOST_CELLS:,} at most")
-    except (ElementTree.ParseError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise  # MuJoCo reports all other errors
-
-
-def _check_sizes(element: ElementTree.Element, what: str) -> None:
-    """Raises InputError for a size beyond MOST, or a texture of more than MOST_PIXELS."""
-    given = element.attrib
-    most = MOST.get(element.tag, {})
-    for key, text in given.items() if most else ():
-        largest = MOST_USER if key.startswith("nuser_") else most.get(key)
-        if largest is not None and _size(text) > largest:
-            got = f"{key}={excerpt(text)} in <{element.tag}>"
-            raise InputError(f"{what}: got {got}, want {largest:,} at most")
-    if element.tag == "texture" and "builtin" in given:
-        width, height = _size(given.get("width", "0")), _size(given.get("height", "0"))
-        if max(width * height, 6 * width**2 if given.get("type", "cube") == "cube" else 0) > MOST_PIXELS:
-            got = f"{excerpt(given.get('width'))} x {excerpt(given.get('height'))} pixels in <texture>"
-            raise InputError(f"{what}: got {got}, want {MOST_PIXELS:,} at most")
-
-
-def _size(text: str) -> float:
-    """A number of an MJCF, which may end in K, M, G, T, P or E, powers of 1024; 0 if MuJoCo itself refuses it."""
-    match = re.fullmatch(r"\s*\+?([\d.]+(?:e\+?\d{1,2})?)([kmgtpe]?)\s*", text.lower())
-    with contextlib.suppress(ValueError):
-        return float(match[1]) * 1024.0 ** ("kmgtpe".find(match[2]) + 1 if match[2] else 0) if match else 0.0
-    return 0.0
-
-
-def _product(text: str) -> int:
-    """The count in an element of an MJCF, or the product of several counts; 1 if MuJoCo itself refuses it."""
-    return math.prod(max(int(number), 1) for number in re.findall(r"(?<!\S)\+?(\d+)(?!\S)", text))
-
-
-def _check_numbers(model: mujoco.MjModel, what: str) -> None:
-    """Raises InputError if the model contains a NaN, about which MuJoCo only warns, or its timestep is not positive."""
-    if not 0 < model.opt.timestep < np.inf:
-        raise InputError(f"{what}: got the timestep {model.opt.timestep:g}, want a finite number of seconds above 0")
-    for field in ("gravity", "wind", "magnetic"):
-        if not np.isfinite(getattr(model.opt, field)).all():
-            raise InputError(f"{what}: got {field} {getattr(model.opt, field).tolist()}, want finite numbers")
-    for field in (name for name in dir(model) if not name.startswith("_")):
-        array = getattr(model, field)
-        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and array.size and np.isnan(array.min()):
-            element = int(np.argwhere(np.isnan(array))[0][0])
-            raise InputError(f"{what}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")

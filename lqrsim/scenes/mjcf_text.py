@@ -1,28 +1,20 @@
-"""The text of an MJCF: read, with its includes, and rewritten.
+"""The text of an MJCF: read, with its includes, checked, and compiled."""
 
-MuJoCo can also write a model as text, but with six digits, which gives another model.
-"""
-
+import contextlib
 import difflib
 import itertools
+import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_name, check_number, check_path, opengl_error
-from lqrsim.scenes.world import KINDS, World
-
-try:
-    import mujoco
-except Exception as error:
-    if (other := opengl_error(error)) is not None:
-        raise other from None
-    raise
+from lqrsim.errors import InputError, check_name, check_path, excerpt
+from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
 # In the wheel, models/ is inside the package; in the repository, next to it.
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
@@ -31,11 +23,24 @@ MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 DEEPEST = 490  # largest depth of elements; MuJoCo's reader refuses slightly more
 UNNAMED = "unnamed_"  # prefix of the names of bodies, joints, geoms and actuators without a name in the MJCF
 SPEED_LIMIT = "_velocity_limit"  # <numeric name="JOINT_velocity_limit"> is the joint's largest speed in rad/s or m/s
-WHOLE = "mass"  # name of the mass of all moving bodies together
-_OF_JOINTS = ("damping", "stiffness", "armature", "frictionloss")
-_MEDIUM = ("density", "viscosity")
-_BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # bounds; all other numbers must not be negative
-_LONG = 1e3  # m, half length of a geom that stands for an infinite one
+MOST_CELLS = 4096**2  # largest number of cells of a height field; MuJoCo crashes with far more
+# Largest numbers of elements whose attributes are sizes of arrays, or of drawings; with far more, MuJoCo takes minutes
+# and GBs. Those that begin with nuser_ are numbers of each element.
+MOST = {
+    "size": {"nkey": 10_000, "nuserdata": 10**7, "njmax": 10**6, "nconmax": 10**6, "nstack": 10**8, "memory": 2**32},
+    "quality": {"shadowsize": 2**14, "offsamples": 64, "numslices": 1000, "numstacks": 1000, "numquads": 1000},
+}
+MOST_USER = 10_000
+MOST_PIXELS = 8192**2  # of a texture that MuJoCo makes
+MOST_COPIES = 1_000_000  # largest number of elements from <replicate>: they take MuJoCo minutes, and GBs
+_COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of the elements that they make
+_MASSES = frozenset(
+    (
+        "mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "boundmass", "boundinertia",
+        "armature",
+    )
+)  # fmt: skip
+_NAN = re.compile(r"(^|[\s,])[+-]?nan")
 
 
 def names() -> list[str]:
@@ -127,198 +132,119 @@ def _flatten(path: Path) -> str:
     return re.sub(r"\n\s*\n+", "\n", text) + "\n"
 
 
-def named(xml: str) -> tuple[str, bool]:
-    """An MJCF in which every body, joint, geom and actuator has a name: `unnamed_<kind>_<number>`, counted from 0.
+def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
+    """The model of an MJCF given as text, without includes; `what` is its name in messages."""
+    _check_elements(xml, what)
+    try:
+        with unlogged():
+            model = spec_of(xml).compile() if "<attach" in xml else mujoco.MjModel.from_xml_string(xml)
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+        raise InputError(f"{what}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    _check_numbers(model, what)
+    return model
 
-    Of several free joints without a name, each gets its body's. The flag says whether there is a light.
-    """
-    root = ElementTree.fromstring(xml)
-    taken = {element.get("name") for element in root.iter()}
-    # An MJCF has its own section worldbody, and one from each file that it includes.
-    there = [one for world in root.iter("worldbody") for one in world.iter()]
-    kinds = {"body": ("body",), "joint": ("joint", "freejoint"), "geom": ("geom",)}
-    parts = {kind: [one for one in there if one.tag in tags] for kind, tags in kinds.items()}
-    parts["actuator"] = [one for section in root.iter("actuator") for one in section]
-    free = [
-        (body.get("name"), one)
-        for body in parts["body"]
-        for one in body
-        if (one.tag == "freejoint" or (one.tag == "joint" and one.get("type") == "free")) and one.get("name") is None
-    ]
-    for body, joint in free if len(free) > 1 else ():
-        if body is not None and body not in {one.get("name") for one in parts["joint"]}:
-            joint.set("name", body)
-    unnamed = {kind: [one for one in elements if one.get("name") is None] for kind, elements in parts.items()}
-    for kind, elements in unnamed.items():
+
+def spec_of(xml: str) -> mujoco.MjSpec:
+    """The spec of an MJCF, in which elements of attached models have names, too: the text cannot name them."""
+    spec = mujoco.MjSpec.from_string(xml)
+    if "<attach" not in xml:
+        return spec
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    for joint in free if len(free) > 1 else ():
+        joint.name = joint.name or joint.parent.name
+    for kind, elements in (
+        ("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms), ("actuator", spec.actuators),
+    ):  # fmt: skip
+        taken = {element.name for element in elements}
         names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in taken)
         for element in elements:
-            element.set("name", next(names))
-    changed = len(free) > 1 or any(unnamed.values())
-    return ElementTree.tostring(root, encoding="unicode") if changed else xml, any(one.tag == "light" for one in there)
+            element.name = element.name or next(names)
+    return spec
 
 
-def with_obstacles(xml: str, world: World) -> str:
-    """The MJCF with these obstacles as further geoms, fixed to the world, which nothing touches."""
-    root = ElementTree.fromstring(xml)
-    taken = {one.get("name") for one in root.iter("geom")}
-    section = ElementTree.SubElement(root, "worldbody")
-    for one in world.obstacles:
-        if one.kind not in KINDS:
-            raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(KINDS)}")
-        if one.name in taken:
-            raise InputError(f"moving: got {one.name}, which is a geom of the robot's MJCF, want another name")
-        turn = np.zeros(4)
-        mujoco.mju_mat2Quat(turn, one.rotation.ravel())
-        size = np.minimum([0.0, 0.0, 1.0] if one.kind == "plane" else one.size, _LONG)
-        own = {"name": one.name, "type": one.kind, "contype": "0", "conaffinity": "0"}
-        geom = ElementTree.SubElement(section, "geom", own)
-        for key, values in (("size", size), ("pos", one.position), ("quat", turn)):
-            _set(geom, key, values)
-    return ElementTree.tostring(root, encoding="unicode")
+def _check_elements(xml: str, what: str) -> None:
+    """Raises InputError where MuJoCo would crash or stay silent: for excessive counts, or NaN for unknown numbers.
 
-
-def with_light(xml: str, place: Array) -> str:
-    """The MJCF with a light named overview at a place (3,)."""
-    light = {"name": "overview", "pos": "", "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
-    added = ElementTree.Element("worldbody")
-    ElementTree.SubElement(added, "light", light | {"pos": " ".join(f"{number:.6g}" for number in place)})
-    end = xml.rindex("</mujoco>")  # the text comes from ElementTree, and can be long
-    return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
-
-
-def with_mocap(xml: str, model: mujoco.MjModel, poses: Mapping[str, tuple[Array, Array]], prefix: str) -> str:
-    """The MJCF, compiled to this model, with the mocap bodies of the poses there, and all else as it is.
-
-    What MuJoCo compiles from where bodies are at rest is stated as it was: what ties two bodies, by sites whose names
-    have the prefix.
+    MuJoCo treats a NaN for the mass or density of a geom as a missing number.
     """
-    root = ElementTree.fromstring(xml)
-    elements = _elements(root)["body"]
-    for body, pose in poses.items():
-        for other in ("axisangle", "xyaxes", "zaxis", "euler"):
-            elements[body].attrib.pop(other, None)
-        for attribute, values in zip(("pos", "quat"), pose, strict=True):
-            _set(elements[body], attribute, values)
-    elements["world"] = next(root.iter("worldbody"))
-    ties = [one for section in root.findall("equality") for one in section]
-    for i, (tie, values) in enumerate(zip(ties, model.eq_data, strict=False)):
-        if tie.tag == "weld" and "body1" in tie.attrib:
-            _set(tie, "relpose", values[3:10])
-        elif tie.tag == "connect" and "body1" in tie.attrib:
-            del tie.attrib["anchor"]
-            for side, place in enumerate((values[:3], values[3:6]), 1):
-                site = {"name": f"{prefix}_tie_{i}_{side}", "group": "5"}
-                tied = ElementTree.SubElement(elements[tie.attrib.pop(f"body{side}", "world")], "site", site)
-                _set(tied, "pos", place)
-                tie.set(f"site{side}", site["name"])
-    return ElementTree.tostring(root, encoding="unicode")
+    text = xml.lower()
+    rare = any(word in text for word in (*_COPIERS, "hfield", "nan", "builtin", *(f"<{tag}" for tag in MOST)))
+    if not rare and xml.count("</") < DEEPEST and xml.count("<") <= MOST_COPIES:
+        return  # files of thousands of geoms are not read again
+    reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
+    try:
+        reader.feed(xml)
+        made = 0
+        events: Any = reader.read_events()
+        for event, element in events:
+            depth += 1 if event == "start" else -1
+            if depth > DEEPEST:
+                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want less nesting")
+            if element.tag in _COPIERS:
+                copies = [*copies, copies[-1] * _product(element.get("count", ""))] if event == "start" else copies[:-1]
+            if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", *_COPIERS):
+                made += copies[-1]
+                if made > MOST_COPIES:
+                    got = f"<{element.tag}> of {copies[-1]:,} copies" if element.tag in _COPIERS else "more"
+                    raise InputError(f"{what}: got {got}, want {MOST_COPIES:,} elements at most")
+            for key in _MASSES.intersection(element.attrib) if event == "start" else ():
+                if _NAN.search(element.attrib[key].lower()):
+                    name = f" {element.attrib['name']!r}" if "name" in element.attrib else ""
+                    raise InputError(f"{what}: got NaN for the {key} of {element.tag}{name}, want a number")
+            if event == "start":
+                _check_sizes(element, what)
+            if event == "start" and element.tag == "hfield":
+                sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
+                cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
+                if cells > MOST_CELLS:
+                    got = f"{sizes[0]} x {sizes[1]} heights in the height field {element.attrib.get('name', '')!r}"
+                    raise InputError(f"{what}: got {got}, want {MOST_CELLS:,} at most")
+    except (ElementTree.ParseError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise  # MuJoCo reports all other errors
 
 
-@dataclass(frozen=True)
-class Number:
-    """A number of an MJCF: its kind, its body, joint, geom or actuator (empty for all), and its value."""
-
-    what: str
-    part: str
-    value: float
-
-
-def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
-    """All such numbers, by the names of parameters: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
-
-    They are of an MJCF, compiled to this model, whose elements all have names. Only elements with a name and this
-    number in the text count: bodies that move, geoms that collide.
-    """
-    elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
-    masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
-    names = {model.body(number).name for number in range(1, model.nbody)}
-    if names == elements["body"].keys():  # otherwise the text has no place for some masses
-        found += [Number("mass", "", sum(masses.values()))] if masses else []
-        found += [Number("mass", name, mass) for name, mass in masses.items()]
-    for number in range(model.njnt):
-        name, dof = model.joint(number).name, int(model.jnt_dofadr[number])
-        if name in elements["joint"]:
-            values = {key: getattr(model, f"dof_{key}")[dof] for key in _OF_JOINTS if key != "stiffness"}
-            values["stiffness"] = model.jnt_stiffness[number]
-            found += [Number(key, name, float(values[key])) for key in _OF_JOINTS]
-    for number in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
-        if (name := model.geom(number).name) in elements["geom"]:
-            found.append(Number("friction", name, float(model.geom_friction[number, 0])))
-    for number, gear in enumerate(model.actuator_gear[model.actuator_outadr]):
-        if (name := model.actuator(number).name) in elements["actuator"] and gear.any():
-            found.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
-    found += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
-    return {f"{one.part}_{one.what}" if one.part else one.what: one for one in found}
+def _check_sizes(element: ElementTree.Element, what: str) -> None:
+    """Raises InputError for a size beyond MOST, or a texture of more than MOST_PIXELS."""
+    given = element.attrib
+    most = MOST.get(element.tag, {})
+    for key, text in given.items() if most else ():
+        largest = MOST_USER if key.startswith("nuser_") else most.get(key)
+        if largest is not None and _size(text) > largest:
+            got = f"{key}={excerpt(text)} in <{element.tag}>"
+            raise InputError(f"{what}: got {got}, want {largest:,} at most")
+    if element.tag == "texture" and "builtin" in given:
+        width, height = _size(given.get("width", "0")), _size(given.get("height", "0"))
+        if max(width * height, 6 * width**2 if given.get("type", "cube") == "cube" else 0) > MOST_PIXELS:
+            got = f"{excerpt(given.get('width'))} x {excerpt(given.get('height'))} pixels in <texture>"
+            raise InputError(f"{what}: got {got}, want {MOST_PIXELS:,} at most")
 
 
-def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], what: str) -> str:
-    """The MJCF with changed numbers, by name, as in `numbers_of`.
-
-    A body's inertia scales with its mass; `mass` scales all bodies. The numbers of a gear keep their ratios.
-    """
-    numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
-    elements, scales = _elements(root), dict[str, float]()
-    for name, value in values.items():
-        one = numbers[name]
-        value = check_number(f"{what}: {name}", value, **_BOUNDS.get(one.what, {"at_least": 0.0}))
-        ratio = value / one.value if one.value else 0.0
-        if name == WHOLE:
-            scales |= dict.fromkeys(_heavy(model), ratio)
-            if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
-                raise InputError(f"{what}: {WHOLE}: got {WHOLE} and {other}, want one of the two")
-        elif one.what == "mass":
-            scales[one.part] = ratio
-        elif one.what in _OF_JOINTS:
-            joint = model.joint(one.part).id
-            # Damping and stiffness may be polynomials, of which this is the linear coefficient.
-            damping, stiffness = model.dof_dampingpoly[model.jnt_dofadr[joint]], model.jnt_stiffnesspoly[joint]
-            rest = {"damping": damping, "stiffness": stiffness}.get(one.what, ())
-            _set(elements["joint"][one.part], one.what, [value, *rest])
-        elif one.what == "friction":
-            _set(elements["geom"][one.part], "friction", [value, *model.geom(one.part).friction[1:]])
-        elif one.what == "gear":
-            first = np.reshape(model.actuator(one.part).gear, (-1, 6))[0]
-            _set(elements["actuator"][one.part], "gear", ratio * first)
-        else:
-            _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last element takes precedence
-    for name, body in elements["body"].items() if scales else ():  # the compiled masses, for all that they came from
-        for inertial in body.findall("inertial"):
-            body.remove(inertial)
-        compiled, scale = model.body(name), scales.get(name, 1.0)
-        if compiled.mass[0] > 0:
-            inertial = ElementTree.Element("inertial")
-            _set(inertial, "pos", compiled.ipos)
-            _set(inertial, "quat", compiled.iquat)
-            _set(inertial, "mass", [scale * compiled.mass[0]])
-            _set(inertial, "diaginertia", scale * compiled.inertia)
-            body.insert(0, inertial)
-    if scales:
-        compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
-        ElementTree.SubElement(root, "compiler", compiler)
-    return ElementTree.tostring(root, encoding="unicode")
+def _size(text: str) -> float:
+    """A number of an MJCF, which may end in K, M, G, T, P or E, powers of 1024; 0 if MuJoCo itself refuses it."""
+    match = re.fullmatch(r"\s*\+?([\d.]+(?:e\+?\d{1,2})?)([kmgtpe]?)\s*", text.lower())
+    with contextlib.suppress(ValueError):
+        return float(match[1]) * 1024.0 ** ("kmgtpe".find(match[2]) + 1 if match[2] else 0) if match else 0.0
+    return 0.0
 
 
-def _heavy(model: mujoco.MjModel) -> list[str]:
-    """The bodies with mass that move, by themselves or with others."""
-    moves = (model.body_treeid >= 0) & (model.body_mass > 0)
-    return [model.body(number).name for number in np.flatnonzero(moves)]
+def _product(text: str) -> int:
+    """The count in an element of an MJCF, or the product of several counts; 1 if MuJoCo itself refuses it."""
+    return math.prod(max(int(number), 1) for number in re.findall(r"(?<!\S)\+?(\d+)(?!\S)", text))
 
 
-def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
-    """The named elements, by kind and name. Replicas have other names in the model, and are not found."""
-    found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
-    for world in root.iter("worldbody"):
-        for element in world.iter():
-            if element.tag in found:
-                found[element.tag][element.get("name", "")] = element
-    for section in root.findall("actuator"):
-        found["actuator"] |= {element.get("name", ""): element for element in section}
-    return found
-
-
-def _set(element: ElementTree.Element, name: str, numbers: Iterable[float]) -> None:
-    """Write numbers so that they read back exactly."""
-    element.set(name, " ".join(repr(float(number)) for number in numbers))
+def _check_numbers(model: mujoco.MjModel, what: str) -> None:
+    """Raises InputError if the model contains a NaN, about which MuJoCo only warns, or its timestep is not positive."""
+    if not 0 < model.opt.timestep < np.inf:
+        raise InputError(f"{what}: got the timestep {model.opt.timestep:g}, want a finite number of seconds above 0")
+    for field in ("gravity", "wind", "magnetic"):
+        if not np.isfinite(getattr(model.opt, field)).all():
+            raise InputError(f"{what}: got {field} {getattr(model.opt, field).tolist()}, want finite numbers")
+    for field in (name for name in dir(model) if not name.startswith("_")):
+        array = getattr(model, field)
+        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and array.size and np.isnan(array.min()):
+            element = int(np.argwhere(np.isnan(array))[0][0])
+            raise InputError(f"{what}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")
 
 
 def listed(names: Sequence[str], most: int = 12) -> str:

@@ -1,10 +1,17 @@
-"""What MuJoCo logs by itself, switched off."""
+"""MuJoCo: what is wrong if it cannot be imported, and what it logs by itself, switched off."""
 
 import contextlib
 import threading
 from collections.abc import Iterator
 
-from lqrsim.scenes.mjcf_text import mujoco
+from lqrsim.errors import opengl_error
+
+try:
+    import mujoco
+except Exception as error:
+    if (other := opengl_error(error)) is not None:
+        raise other from None
+    raise
 
 _quiet, _count, _before = threading.Lock(), 0, None
 

@@ -27,7 +27,7 @@ from lqrsim.annotations import Want, checked
 from lqrsim.errors import InputError, check_count, check_items, check_name, excerpt, free_name
 from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.scenes.mjcf_model import MjcfModel
-from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
+from lqrsim.scenes.mujoco_log import mujoco
 from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 

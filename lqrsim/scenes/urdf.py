@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_number, check_path, excerpt
-from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, listed, mujoco
-from lqrsim.scenes.mujoco_log import unlogged
+from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, listed
+from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
 Base = Literal["fixed", "free"]
 Servo = Sequence[float]  # stiffness and damping

@@ -12,7 +12,7 @@ from lqrsim.annotations import Index, checked
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
-from lqrsim.scenes.mjcf_model import model_from_xml
+from lqrsim.scenes.mjcf_text import model_from_xml
 
 ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
 UNCOLOURED = 0.5, 0.5, 0.5, 1.0  # the colour of a geom whose MJCF gives none
