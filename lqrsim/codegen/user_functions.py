@@ -186,21 +186,27 @@ class UserFunction:
         plain = self.function if self.level == "jax" else getattr(self.function, "py_func", self.function)
         if not self.held:  # before the first call compiles its helpers
             note_helpers(self.function)
-        written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
             with np.errstate(all="ignore"):  # callers handle NaN and infinity
-                given = (x.copy(), u.copy()) if self.with_control else (x.copy(),)
-                returned = plain(*given, parameters_class(tuple(p))(*p.values()), *written)
-                if self.writes and returned is not None:
-                    last = "argument" if len(self.writes) == 1 else "two arguments"
-                    raise InputError(f"got {excerpt(returned)} returned, want the result written to the last {last}")
-        except InputError as error:
-            raise InputError(f"{self.name}: {error}") from None
+                return self._values(plain, x, u, parameters_class(tuple(p))(*p.values()))
+        except InputError:
+            raise
         except Exception as error:  # any exception of a user's function becomes one line
             raise InputError(
                 f"{self.name}: got {type(error).__name__} ({error}), want no exception at x = {first_numbers(x)}"
             ) from error
-        return written or [self._vector(returned)]
+
+    def _values(self, function: Callable[..., Any], x: Array, u: Array, p: Any) -> list[Array]:
+        """What it returns, as one vector, or writes; of copies, because it may keep them beyond the call."""
+        given, written = (x.copy(), u.copy())[: 1 + self.with_control], [np.zeros(shape) for shape in self.writes]
+        try:
+            returned = function(*given, p, *written)
+            if self.writes and returned is not None:
+                last = "argument" if len(self.writes) == 1 else "two arguments"
+                raise InputError(f"got {excerpt(returned)} returned, want the result written to the last {last}")
+            return written or [self._vector(returned)]
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
 
     def plain_call(self, parameters: Mapping[str, float]) -> Callable[..., None]:
         """The function for kernels in plain Python: it writes the values that the user's function returns."""
@@ -218,11 +224,11 @@ class UserFunction:
                 raise TypeError
             vector = np.array([float(entry) for entry in array.reshape(-1)])
         except (TypeError, ValueError, OverflowError):  # OverflowError for an int beyond all floats
-            raise InputError(f"{self.name}: got {excerpt(returned)}, want {self._wanted()}") from None
+            raise InputError(f"got {excerpt(returned)}, want {self._wanted()}") from None
         if self.columns and array.shape != (wanted := (self.values // self.columns, self.columns)):
-            raise InputError(f"{self.name}: got shape {array.shape}, want {wanted}: {self._wanted()}")
+            raise InputError(f"got shape {array.shape}, want {wanted}: {self._wanted()}")
         if len(vector) != self.values:
-            raise InputError(f"{self.name}: got {len(vector)} entries, want {self._wanted()}")
+            raise InputError(f"got {len(vector)} entries, want {self._wanted()}")
         return vector
 
     def _wanted(self) -> str:
@@ -245,17 +251,10 @@ class UserFunction:
             arrays = [view(address, size) for address, size in zip(outputs, sizes, strict=True)]
 
             def write() -> None:
-                values = view(data, end)[self.offset :]
-                p = parameters_class(self.parameters)(*values.tolist())
-                given = (view(x, self.states).copy(), view(u, self.controls).copy())[: 1 + self.with_control]
-                if self.writes:
-                    # Copies, because the function may keep them beyond the call.
-                    written = [np.zeros(shape) for shape in self.writes]
-                    self.function(*given, p, *written)
-                    for array, values_written in zip(arrays, written, strict=True):
-                        array[:] = values_written.reshape(-1)
-                else:
-                    arrays[0][:] = self._vector(self.function(*given, p))
+                p = parameters_class(self.parameters)(*view(data, end)[self.offset :].tolist())
+                found = self._values(self.function, view(x, self.states), view(u, self.controls), p)
+                for array, values in zip(arrays, found, strict=True):
+                    array[:] = values.reshape(-1)
 
             self._guarded(write, arrays)
 
