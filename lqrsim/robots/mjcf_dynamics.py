@@ -70,7 +70,7 @@ class MjcfPhysics:
 
     Attributes:
       model: MuJoCo's model. numbers: the numbers for the kernel, without a wrench and loads. team: the words that its
-        threads share. carriers: ids of the bodies that can carry a load: bodies that move and have mass.
+        threads share. carriers: those of the MJCF.
     """
 
     def __init__(
@@ -84,8 +84,7 @@ class MjcfPhysics:
         softness: float = 0.0,
         unlimited: tuple[tuple[int, ...], tuple[int, ...]] = ((), ()),
     ) -> None:
-        model = mjcf.model
-        self.model = copy.copy(model)
+        self.model = copy.copy(mjcf.model)
         self.model.geom_contype[list(obstacles)] = self.model.geom_conaffinity[list(obstacles)] = 0
         option, flags = self.model.opt, mujoco.mjtDisableBit
         option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
@@ -97,7 +96,7 @@ class MjcfPhysics:
         self.model.jnt_actfrclimited[list(unlimited[1])] = 0
         if softness > 0:
             _soften(self.model, softness)
-        self.carriers = _carriers(model)
+        self.carriers = mjcf.carriers
         # With loads, each slot has its own model, which may be large; filters need one slot.
         slots = 2 if loaded else 2 * processors()
         self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
@@ -184,11 +183,6 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
     model.opt.o_solimp[0], model.opt.o_solimp[2] = 0.0, max(width, model.opt.o_solimp[2])
 
 
-def _carriers(model: mujoco.MjModel) -> tuple[int, ...]:
-    """Ids of the bodies that can carry a load: bodies that move and have mass."""
-    return tuple(np.flatnonzero((model.body_treeid >= 0) & (model.body_mass > 0)).tolist())
-
-
 @cache
 def _yield() -> int:
     """The address of a function that yields to other threads; 0 if there is none."""
@@ -250,7 +244,7 @@ class MjcfDynamics(Dynamics):
         for geom in np.intersect1d(self._stated["obstacles"], [model.pair_geom1, model.pair_geom2])[:1]:
             who = model.geom(int(geom)).name
             raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
-        loads = [f"{model.body(number).name}_load" for number in _carriers(model)]
+        loads = [f"{model.body(number).name}_load" for number in mjcf.carriers]
         self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
 
     @property

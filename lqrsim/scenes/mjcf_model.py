@@ -280,6 +280,11 @@ class MjcfModel:
         return next((number for number in moving if masses[number] > 0), moving[0])
 
     @cached_property
+    def carriers(self) -> tuple[int, ...]:
+        """The ids of the bodies with mass that move, by themselves or with others: they can carry loads."""
+        return tuple(np.flatnonzero((self.model.body_treeid >= 0) & (self.model.body_mass > 0)).tolist())
+
+    @cached_property
     def numbers(self) -> dict[str, Number]:
         """The numbers that can be changed, by the names of parameters: `mass`, `<body>_mass`, `<joint>_damping`, ....
 
@@ -288,7 +293,7 @@ class MjcfModel:
         """
         model = self.model
         elements, found = _elements(ElementTree.fromstring(self.xml)), list[Number]()
-        masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
+        masses = {model.body(number).name: float(model.body_mass[number]) for number in self.carriers}
         names = {model.body(number).name for number in range(1, model.nbody)}
         if names == elements["body"].keys():  # otherwise the text has no place for some masses
             found += [Number("mass", "", sum(masses.values()))] if masses else []
@@ -416,7 +421,7 @@ class MjcfModel:
             value = check_number(f"{what}: {name}", value, **_BOUNDS.get(one.what, {"at_least": 0.0}))
             ratio = value / one.value if one.value else 0.0
             if name == WHOLE:
-                scales |= dict.fromkeys(_heavy(model), ratio)
+                scales |= dict.fromkeys([model.body(number).name for number in self.carriers], ratio)
                 if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
                     raise InputError(f"{what}: {WHOLE}: got {WHOLE} and {other}, want one of the two")
             elif one.what == "mass":
@@ -481,12 +486,6 @@ def _with_light(xml: str, place: Array) -> str:
     ElementTree.SubElement(added, "light", light | {"pos": " ".join(f"{number:.6g}" for number in place)})
     end = xml.rindex("</mujoco>")  # the text comes from ElementTree, and can be long
     return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
-
-
-def _heavy(model: mujoco.MjModel) -> list[str]:
-    """The bodies with mass that move, by themselves or with others."""
-    moves = (model.body_treeid >= 0) & (model.body_mass > 0)
-    return [model.body(number).name for number in np.flatnonzero(moves)]
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
