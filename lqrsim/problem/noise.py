@@ -155,9 +155,17 @@ class Noise:
             kernel = source_of(noise_kernel, COUNT=n, SIZE=self.size)
             source = kernel.filled(noise_values=(kernel, "constant_values"), noise_slopes=(kernel, "constant_slopes"))
             return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
-        if self.level != "symbolic":
-            return self._bind_function(dynamics, numbers)
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        if self.level != "symbolic":
+            active, unused = axes_of("Noise", self.depends_on, (*names[0], *names[1]))
+            functions = with_derivatives(
+                self.function,
+                {"values": n * self.size, "entries": names[0], "columns": self.size, "unused": unused}, None, (),
+                level=self.level, states=n, controls=len(names[1]), parameters=tuple(self.parameters),
+            )  # fmt: skip
+            given = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
+            source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
+            return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
         details = ("noise", *names, self.size, tuple(self.parameters))
         made = symbolic.kept(self.function, details, lambda: self._trace(*names), source=str, rows=list, active=list)
         source = text_source(made["source"], self.name)
@@ -201,19 +209,6 @@ class Noise:
             if len(row) != self.size:
                 raise InputError(f"got a row of {len(row)} entries, want {wanted}")
         return rows
-
-    def _bind_function(self, dynamics: Dynamics, numbers: Array) -> NoiseTerm:
-        states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
-        names = (*states, *controls)
-        active, unused = axes_of("Noise", self.depends_on, names)
-        n, m = len(states), len(controls)
-        functions = with_derivatives(
-            self.function, {"values": n * self.size, "entries": states, "columns": self.size, "unused": unused}, None,
-            (), level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
-        )  # fmt: skip
-        given = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
-        source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
-        return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
 
     @checked
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:

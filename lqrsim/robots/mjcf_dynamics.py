@@ -388,9 +388,8 @@ class MjcfDynamics(Dynamics):
         return other
 
     def contact_modes(self, dt: float) -> ContactModes | None:
-        model, known = self.physics.model, not self.parameters and ContactModes.known_for(self.physics.model)
-        substeps = round(dt / float(model.opt.timestep))
-        return ContactModes(model, self._stated["actuators"], substeps) if known else None
+        known = not self.parameters and ContactModes.known_for(self.physics.model)
+        return ContactModes(self.physics.model, round(dt / self.period)) if known else None
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
         """The slopes are those of an explicit Euler step, which MuJoCo can differentiate, divided by the step.
@@ -406,7 +405,7 @@ class MjcfDynamics(Dynamics):
         found[:, :nv, nv : 2 * nv] = np.eye(nv)
         for slopes, qpos, state, control in zip(found, self._qpos_of(states), states, controls, strict=True):
             data.qpos[:], data.qvel[:], data.act[:] = qpos, state[nv : 2 * nv], state[2 * nv :]
-            data.qacc_warmstart[:], data.ctrl[list(self._stated["actuators"])] = 0.0, control
+            data.qacc_warmstart[:], data.ctrl[:] = 0.0, control
             with unlogged():
                 mujoco.mjd_transitionFD(explicit, data, _DIFFERENCE, True, step, None, None, None)
             slopes[nv:] = (step - np.eye(n))[nv:] / self.period

@@ -82,17 +82,14 @@ class Period:
 class ContactModes:
     """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
 
-    Args:
-      actuators: ids of the controlled actuators. substeps: physics steps of a control period.
-
     Attributes:
       look: called before each part of a long computation, which its exception ends.
     """
 
     look: Callable[[], None] = staticmethod(lambda: None)
 
-    def __init__(self, model: mujoco.MjModel, actuators: tuple[int, ...], substeps: int) -> None:
-        self._model, self._actuators, self._substeps = model, list(actuators), substeps
+    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
+        self._model, self._substeps = model, substeps
         self._data, self._ahead = mujoco.MjData(model), copy.copy(model)
         for margins in (self._ahead.jnt_margin, self._ahead.tendon_margin, self._ahead.geom_margin):
             margins[:] += _NEAR
@@ -111,7 +108,7 @@ class ContactModes:
         """The state (n,) after a control period, and its switches."""
         data, found = self._data, list[tuple[Names, Array]]()
         data.qpos[:], data.qvel[:] = state[: self._nv], state[self._nv :]
-        data.ctrl[self._actuators], data.qacc_warmstart[:], data.time = control, 0.0, 0.0
+        data.ctrl[:], data.qacc_warmstart[:], data.time = control, 0.0, 0.0
         for step in range(self._substeps):
             if self._four:
                 self._runge_kutta(4 * step, found)
