@@ -82,10 +82,6 @@ class Pointer:
 
     block: tuple[int, ...] = ()
 
-    def strides(self) -> list[int]:
-        """The stride of each index, in entries."""
-        return [int(np.prod(self.block[i:], dtype=int)) for i in range(len(self.block) + 1)]
-
 
 @dataclass(frozen=True)
 class Pointers:

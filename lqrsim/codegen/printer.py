@@ -692,8 +692,8 @@ class _Body:
         match base.type:
             case Pointer(block=block) if len(values) <= len(block) + 1:
                 total = None
-                for value, stride in zip(values, base.type.strides(), strict=False):
-                    number = self._int(value, node)
+                for i, value in enumerate(values):
+                    number, stride = self._int(value, node), math.prod(block[i:])
                     number = self._emit(f"mul nsw i64 {number}, {stride}") if stride != 1 else number
                     total = number if total is None else self._emit(f"add nsw i64 {total}, {number}")
                 address = self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {total}")

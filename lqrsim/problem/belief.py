@@ -12,7 +12,7 @@ is the noise of the belief. Everything is formulas, with exact first and second 
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import chain
 from statistics import NormalDist
 from typing import Annotated, Any, NamedTuple
@@ -248,19 +248,10 @@ class Belief(Dynamics):
         }
         return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values | slopes, made, of)}"
 
-    def _trace_curvature(self) -> dict[str, Any]:
-        import sympy
-
+    def _weighted_hessian(self, weights: list[Any]) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
         made = self._step()
-        weights = [sympy.Symbol(f"w{i}", real=True) for i in range(len(made.x))]
         found = hessian_of(made.operations, made.after, weights, [*made.x, *made.u], most=MOST_STEPS)
-        if found is None:
-            return {"source": "", "support": []}
-        support = sorted({i for pair in found[1] for i in pair})
-        place = {i: k for k, i in enumerate(support)}
-        values = {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in found[1].items()}
-        of = f"{self.name}(x, u, p)"
-        return {"source": _written("rate_curvature", "x, u, p, w, curve", values, made, of), "support": support}
+        return None if found is None else (_needed(made, found[1].values()), found[1])
 
     def _trace_filter(self) -> dict[str, Any]:
         made, of = self._step(read=True), f"{self.name}(x, u, p)"
@@ -391,12 +382,17 @@ def _together(*given: Mapping[str, float]) -> dict[str, float]:
 
 def _written(name: str, arguments: str, values: dict[str, Any], made: _Step, of: str, data: str = "p") -> str:
     """Source of a function of the operations that these values need."""
-    needed, steps = {symbol for one in values.values() for symbol in one.free_symbols}, []
+    return symbolic.write_function(name, arguments, data, values, of=of, steps=_needed(made, values.values()))
+
+
+def _needed(made: _Step, values: Iterable[Any]) -> list[tuple[Any, Any]]:
+    """The operations that these values need, in order."""
+    needed, steps = {symbol for one in values for symbol in one.free_symbols}, []
     for symbol, operation in reversed(made.operations.steps):
         if symbol in needed:
             needed |= operation.free_symbols
             steps.append((symbol, operation))
-    return symbolic.write_function(name, arguments, data, values, of=of, steps=steps[::-1])
+    return steps[::-1]
 
 
 def _lower(entries: Any, n: int) -> list[list[Any]]:

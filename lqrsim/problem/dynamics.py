@@ -419,9 +419,7 @@ class Dynamics:
         """
         import sympy
 
-        rates, x, u = self._traced()
-        weights = [sympy.Symbol(f"w{i}", real=True) for i in range(len(rates))]
-        found = weighted_hessian(rates, weights, [*x, *u], most=MOST_STEPS)
+        found = self._weighted_hessian([sympy.Symbol(f"w{i}", real=True) for i in range(len(self.state_coordinates))])
         if found is None:
             return {"source": "", "support": []}
         steps, curves = found
@@ -431,6 +429,11 @@ class Dynamics:
         of = f"{self.name}(x, u, p)"
         source = symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of, steps=steps)
         return {"source": source, "support": support}
+
+    def _weighted_hessian(self, weights: list[Any]) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
+        """The second derivatives of the weighted sum of f's entries by (x, u), as `weighted_hessian` returns them."""
+        rates, x, u = self._traced()
+        return weighted_hessian(rates, weights, [*x, *u], most=MOST_STEPS)
 
     @checked
     def period_near(self, dt: Finite) -> float:

@@ -59,9 +59,8 @@ class GoalState(Constraint):
         turning = self._turning_states(dynamics)
         rows = list(self.final_states(dynamics).items())
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
-        periods = [2 * np.pi if i in turning else 0.0 for i, _ in rows]
         data = _bound_data(
-            [(i, 1.0, np.inf, period, np.array([number])) for (i, number), period in zip(rows, periods, strict=True)]
+            [(i, 1.0, np.inf, 2 * np.pi if i in turning else 0.0, np.array([number])) for i, number in rows]
         )
         return ConstraintTerm(
             source_of(__name__), data, len(rows), described.__getitem__, equality=True, final_only=True,

@@ -49,7 +49,10 @@ class Approaches:
         self._mjcf, self._model, self._steps = mjcf, mjcf.model, len(states) - 1
         model = self._model
         self._data, self._positions, self._moves = mujoco.MjData(model), states[:, : model.nv], moves
-        own = _below(model, int(model.dof_bodyid[np.argmax(np.abs(moves))]))
+        root = int(model.body_weldid[model.dof_bodyid[np.argmax(np.abs(moves))]])
+        own: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)  # what the body carries, with it
+        for one in range(model.nbody):  # parents come first
+            own[one] = one == root or (one > 0 and own[model.body_parentid[one]])
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         self.thing = np.flatnonzero(own[model.geom_bodyid] & collides).tolist()
         self._place(self._positions[0])
@@ -205,15 +208,6 @@ class Approaches:
             spots = np.array([self._spot(*one) for one in zip(tools, points, strict=True)])
             misses[t] = np.linalg.norm(target - spots, axis=1).max()
         return found, misses
-
-
-def _below(model: mujoco.MjModel, body: int) -> npt.NDArray[np.bool_]:
-    """Which bodies (nbody,) a body carries, with it and with those that are fixed to it."""
-    root = int(model.body_weldid[body])
-    found: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)
-    for one in range(model.nbody):  # parents come first
-        found[one] = one == root or (one > 0 and found[model.body_parentid[one]])
-    return found
 
 
 def _unit(vector: Array) -> Array:
