@@ -105,6 +105,13 @@ def _writers() -> str:
     return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
+def weights(count: int) -> list[Any]:
+    """The symbols w0, w1, ... of a weighted sum."""
+    import sympy
+
+    return [sympy.Symbol(f"w{i}", real=True) for i in range(count)]
+
+
 def trace(
     function: Callable[..., Any],
     states: Sequence[str],

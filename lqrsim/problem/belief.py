@@ -248,8 +248,9 @@ class Belief(Dynamics):
         }
         return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values | slopes, made, of)}"
 
-    def _weighted_hessian(self, weights: list[Any]) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
+    def _weighted_hessian(self) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
         made = self._step()
+        weights = symbolic.weights(len(made.after))
         found = hessian_of(made.operations, made.after, weights, [*made.x, *made.u], most=MOST_STEPS)
         return None if found is None else (_needed(made, found[1].values()), found[1])
 

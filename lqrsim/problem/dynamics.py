@@ -417,9 +417,7 @@ class Dynamics:
 
         There is no source if it would take more than MOST_STEPS.
         """
-        import sympy
-
-        found = self._weighted_hessian([sympy.Symbol(f"w{i}", real=True) for i in range(len(self.state_coordinates))])
+        found = self._weighted_hessian()
         if found is None:
             return {"source": "", "support": []}
         steps, curves = found
@@ -430,10 +428,10 @@ class Dynamics:
         source = symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of, steps=steps)
         return {"source": source, "support": support}
 
-    def _weighted_hessian(self, weights: list[Any]) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
-        """The second derivatives of the weighted sum of f's entries by (x, u), as `weighted_hessian` returns them."""
+    def _weighted_hessian(self) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
+        """The second derivatives by (x, u) of f's entries, weighted by w0, w1, ..., as `weighted_hessian` has them."""
         rates, x, u = self._traced()
-        return weighted_hessian(rates, weights, [*x, *u], most=MOST_STEPS)
+        return weighted_hessian(rates, symbolic.weights(len(rates)), [*x, *u], most=MOST_STEPS)
 
     @checked
     def period_near(self, dt: Finite) -> float:
