@@ -154,7 +154,7 @@ class MjcfRobot(Robot):
             angles=(*(one.dof for one in mjcf.joints if one.kind == "hinge" and one.limits is None), *turns),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
-            mjcf, who, body=number, obstacles=tuple(geoms), states=states, actuators=tuple(range(model.nu)),
+            mjcf, who, body=number, obstacles=tuple(geoms), states=states,
             controls=Coordinates(
                 names=tuple(one.name for one in mjcf.controls) or ("none",),
                 units=tuple(one.unit for one in mjcf.controls) or ("",),

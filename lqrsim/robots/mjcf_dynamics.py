@@ -61,8 +61,7 @@ class MjcfPhysics:
     - an unstable simulation is not reset.
 
     Args:
-      body: id of the body that is pushed.
-      actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
+      body: id of the body that is pushed. obstacles: ids of the geoms that are obstacles.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
       softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
         impedance.
@@ -78,7 +77,6 @@ class MjcfPhysics:
         mjcf: MjcfModel,
         *,
         body: int,
-        actuators: tuple[int, ...],
         obstacles: tuple[int, ...],
         loaded: bool = False,
         softness: float = 0.0,
@@ -108,12 +106,12 @@ class MjcfPhysics:
                 data.warning.number[warning] = 1
         self._flags = np.zeros(slots, dtype=np.int64)
         self.team = np.zeros(8, dtype=np.int64)
-        n, m = 2 * self.model.nv + self.model.na, len(actuators)
+        n, m = 2 * self.model.nv + self.model.na, self.model.nu
         self.team[kernel.TICKET] = n + m  # a job without columns left
         self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
         addresses = [self._addresses(data, model, body) for data, model in zip(self._data, self._models, strict=True)]
         self._table = np.array(addresses, dtype=np.float64)
-        self.numbers = self._numbers(actuators, self.carriers if loaded else (), mjcf.turns_about)
+        self.numbers = self._numbers(self.carriers if loaded else (), mjcf.turns_about)
 
     def address(self) -> int:
         """The address of the numbers, for kernels of places and distances.
@@ -149,7 +147,7 @@ class MjcfPhysics:
         row[kernel.DATA], row[kernel.OWN_MODEL] = data._address, model._address
         return row.tolist()
 
-    def _numbers(self, actuators: tuple[int, ...], carriers: tuple[int, ...], turns_about: str | None) -> Array:
+    def _numbers(self, carriers: tuple[int, ...], turns_about: str | None) -> Array:
         model, functions = self.model, _functions()
         joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
         numbers = np.zeros(kernel.TABLE)
@@ -164,12 +162,12 @@ class MjcfPhysics:
         numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
         numbers[kernel.RESET], numbers[kernel.COMPOS] = functions["mj_resetData"], functions["mj_comPos"]
         numbers[kernel.JAC], numbers[kernel.DISTANCE] = functions["mj_jac"], functions["mj_geomDistance"]
-        numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size + len(actuators)
+        numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size + model.nu
         loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
         numbers[kernel.CONSTANTS] = functions["mj_setConst"]
         if turns_about is not None:
             numbers[kernel.AXIS + AXES.index(turns_about)] = 1.0
-        return np.concatenate([numbers, joints.ravel(), actuators, *loads])
+        return np.concatenate([numbers, joints.ravel(), np.arange(model.nu), *loads])
 
 
 def _soften(model: mujoco.MjModel, width: float) -> None:
@@ -220,10 +218,10 @@ class MjcfDynamics(Dynamics):
 
     def __init__(
         self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
-        controls: Coordinates, actuators: tuple[int, ...],
+        controls: Coordinates,
     ) -> None:  # fmt: skip
         self._name = name
-        self._stated: dict[str, Any] = {"body": body, "obstacles": obstacles, "actuators": actuators}
+        self._stated: dict[str, Any] = {"body": body, "obstacles": obstacles}
         self.functions, self.level = (), "compiled"
         self.parameters: dict[str, float] = {}
         self.state_coordinates, self.control_coordinates = states, controls

@@ -151,7 +151,7 @@ class RobotSensors:
             qpos, qvel, ctrl = *robot.configuration(states), robot.actuation(controls)
             found = np.empty((len(states), model.nsensordata))
             for k, state in enumerate(states):
-                mujoco.mj_resetData(model, data)
+                data.qpos[:], data.qvel[:], data.ctrl[:], data.qacc_warmstart[:] = model.qpos0, 0.0, 0.0, 0.0
                 data.qpos[in_qpos], data.qvel[in_qvel], data.ctrl[in_ctrl] = qpos[k], qvel[k], ctrl[k]
                 if robot.activations:
                     data.act[:] = state[len(state) - robot.activations :]
