@@ -198,7 +198,8 @@ class UserFunction:
 
     def _values(self, function: Callable[..., Any], x: Array, u: Array, p: Any) -> list[Array]:
         """What it returns, as one vector, or writes; of copies, because it may keep them beyond the call."""
-        given, written = (x.copy(), u.copy())[: 1 + self.with_control], [np.zeros(shape) for shape in self.writes]
+        given = (x.copy(), u.copy())[: 1 + self.with_control]
+        written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
             returned = function(*given, p, *written)
             if self.writes and returned is not None:
