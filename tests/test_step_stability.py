@@ -111,3 +111,23 @@ def test_physics_steps_of_an_mjcf(tmp_path: Path, integrator: str, product: floa
         assert named is not None
         assert float(named[1]) == pytest.approx(0.01 / np.ceil(product / END), rel=1e-8)
         assert "are unstable" not in solved(named[1]).detail
+
+
+@pytest.mark.parametrize(("start", "pull"), [(1.5, 2.0), (3.0, 0.5)])
+def test_of_a_motion_that_escapes_by_itself_no_step_is_named(start: float, pull: float) -> None:
+    """x'' = pull x^3: eigenvalues are a pair, and what grows is multiplied by more. With ten times as many steps it
+    escapes as well.
+    """
+    cube = ls.Dynamics(
+        lambda x, u, p: [x[1], p.pull * x[0] ** 3 + u[0]],
+        states={"x": "m", "v": "m/s"}, controls={"u": "m/s^2"}, parameters={"pull": pull},
+    )  # fmt: skip
+    for dt, steps in ((0.1, 60), (0.01, 600)):
+        problem = ls.Problem(
+            dynamics=cube, dt=dt, steps=steps, initial=ls.FixedState([start, 0.0]), stage_cost=ls.ControlCost([1.0]),
+            final_cost=ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0]),
+        )  # fmt: skip
+        solution = ls.ilqr(problem)
+        assert solution.status is ls.Status.NOT_FINITE
+        assert "are unstable" not in solution.detail
+        assert "controls under which the states stay in their domain" in solution.remedy

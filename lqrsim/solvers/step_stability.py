@@ -27,7 +27,8 @@ class UnstableStep(NamedTuple):
 def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bool) -> UnstableStep | None:
     """The step at which a plan, states (T+1, n) and controls (T, m), needs the shortest Runge-Kutta steps, if shorter.
 
-    It is the first such step if the plan is not sound: what follows may be beyond all bounds because of it.
+    It is the first such step if the plan is not sound: what follows may be beyond all bounds because of it. Where steps
+    multiply something more that grows by the dynamics too, shorter ones would not help such a plan.
     """
     known = np.flatnonzero(np.isfinite(states[:-1]).all(axis=1) & np.isfinite(controls).all(axis=1))
     found = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
@@ -44,6 +45,11 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     excess, reach = np.zeros(rates.shape), step * np.abs(rates)
     for i, j in np.argwhere((reach > STABLE) & (rates.real <= ROUNDING * np.abs(rates))):
         excess[i, j] = reach[i, j] / _reach(complex(rates[i, j]))
+    if not sound:
+        with np.errstate(over="ignore", invalid="ignore"):
+            growth = np.nan_to_num(np.abs(np.polyval(_TAYLOR[::-1], step * rates)), nan=np.inf)
+        unstable = np.where(excess > 1, growth, 0.0).max(axis=1)
+        excess[unstable <= np.where(rates.real > ROUNDING * np.abs(rates), growth, 0.0).max(axis=1)] = 0.0
     worst = excess.max(axis=1)
     if not (worst > 1).any():
         return None
