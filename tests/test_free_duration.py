@@ -218,8 +218,10 @@ def test_the_status_of_a_search_without_success_is_true(seed: int) -> None:
     longest = float(draws.uniform(4.0, 6.0))
     far = float(draws.uniform(1.1, 2.0)) * longest**2 / 4
     solution = ls.smooth(problem(way=far, duration=(1.0, longest)), max_iterations=5000)
-    assert solution.status is Status.STALLED
-    assert solution.remedy.startswith("state a dt that allows enough time")
+    assert solution.status is Status.INFEASIBLE
+    assert solution.detail.startswith(f"even in {longest:g} s the goal of {far:g} m for x is missed by ")
+    assert solution.remedy.startswith(f"allow more time than {longest:g} s, relax ")
+    assert ls.smooth(problem(way=far, duration=(1.0, 2 * longest))).success
     assert "\n  remedy:" in str(solution)
 
 

@@ -72,6 +72,8 @@ def solve_for_duration(
         search.go_on_from(begin)
     if alone:
         search.grow_trees()
+    if settings.safeguard:
+        search.try_longest()
     return stop.finish(search.solution())
 
 
@@ -147,6 +149,17 @@ class DurationSearch:
             self._follow(f"trees of short plans, seed {seed}, {way.horizon:.4g} s", way)
             if self.best is not None:
                 return
+
+    def try_longest(self) -> None:
+        """Solve for the longest duration while no plan is known, and go on from there: the stated one may be too short.
+
+        If no plan of that duration keeps the constraints, none of a shorter one is likely to.
+        """
+        if self.best is not None or any(one.success for one in self._fixed) or self._budget.over:
+            return
+        self._fixed.append(self._solved(settled(self._problem, self._range[1]), self._settings))
+        if self._fixed[-1].success:
+            self._settle(self._fixed[-1].trajectory, self._settings)
 
     def _follow(self, name: str, plan: Trajectory) -> None:
         """Go on from a plan that is one of the candidates."""
@@ -254,13 +267,16 @@ class DurationSearch:
             gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
             guess = InitialGuess(gain, found.plan.controls, summary, found=found, log=log)
             return self._described(self._solved(ordinary, replace(settings, start=guess)))  # its log begins with this
-        first, chosen = self._fixed[0], min(self._fixed, key=self._rank)
-        status, remedy = Status.STALLED, "state another dt" if chosen.success else "state a dt that allows enough time"
+        first, last, chosen = self._fixed[0], self._fixed[-1], min(self._fixed, key=self._rank)
+        if last.status is Status.INFEASIBLE and not chosen.success and not self._stop.due:
+            said = f"even in {last.trajectory.horizon:g} s {last.detail}"
+            return self._described(replace(last, detail=said))
+        status, remedy = Status.STALLED, "begin with another dt"
         if self._stop.due:
             status, remedy = Status.TIME_LIMIT, "raise time_limit"
         elif not self._budget.left or chosen.status is Status.MAX_ITERATIONS:
             status, remedy = Status.MAX_ITERATIONS, "raise max_iterations"
-        detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
+        detail = f"the best duration was not found, this plan takes {chosen.trajectory.horizon:g} s; {chosen.detail}"
         log = (*first.iterations, *self._budget.log, *(chosen.iterations if chosen is not first else ()))
         self._total += len(self._budget.log)
         return self._described(replace(
