@@ -115,9 +115,7 @@ def test_physics_steps_of_an_mjcf(tmp_path: Path, integrator: str, product: floa
 
 @pytest.mark.parametrize(("start", "pull"), [(1.5, 2.0), (3.0, 0.5)])
 def test_of_a_motion_that_escapes_by_itself_no_step_is_named(start: float, pull: float) -> None:
-    """x'' = pull x^3: eigenvalues are a pair, and what grows is multiplied by more. With ten times as many steps it
-    escapes as well.
-    """
+    """x'' = pull x^3: with ten times as many steps it escapes as well, although one eigenvalue of each pair decays."""
     cube = ls.Dynamics(
         lambda x, u, p: [x[1], p.pull * x[0] ** 3 + u[0]],
         states={"x": "m", "v": "m/s"}, controls={"u": "m/s^2"}, parameters={"pull": pull},

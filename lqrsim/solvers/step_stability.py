@@ -11,9 +11,11 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
+from lqrsim.solvers import compiled
 
 # |R(z)| <= 1 for all z of Re z <= 0 within this distance, and on each ray up to one root further away.
 STABLE = 2.61
+LONGEST = 100_000  # number of shorter steps that are tried
 ROUNDING = 1e-6  # of an eigenvalue by MuJoCo's differences, relative to its size: of an oscillation without damping
 
 
@@ -27,8 +29,8 @@ class UnstableStep(NamedTuple):
 def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bool) -> UnstableStep | None:
     """The step at which a plan, states (T+1, n) and controls (T, m), needs the shortest Runge-Kutta steps, if shorter.
 
-    It is the first such step if the plan is not sound: what follows may be beyond all bounds because of it. Where steps
-    multiply something more that grows by the dynamics too, shorter ones would not help such a plan.
+    It is the first such step if the plan is not sound: what follows may be beyond all bounds because of it. None if with
+    shorter steps the same controls lead there as well.
     """
     known = np.flatnonzero(np.isfinite(states[:-1]).all(axis=1) & np.isfinite(controls).all(axis=1))
     found = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
@@ -45,11 +47,6 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     excess, reach = np.zeros(rates.shape), step * np.abs(rates)
     for i, j in np.argwhere((reach > STABLE) & (rates.real <= ROUNDING * np.abs(rates))):
         excess[i, j] = reach[i, j] / _reach(complex(rates[i, j]))
-    if not sound:
-        with np.errstate(over="ignore", invalid="ignore"):
-            growth = np.nan_to_num(np.abs(np.polyval(_TAYLOR[::-1], step * rates)), nan=np.inf)
-        unstable = np.where(excess > 1, growth, 0.0).max(axis=1)
-        excess[unstable <= np.where(rates.real > ROUNDING * np.abs(rates), growth, 0.0).max(axis=1)] = 0.0
     worst = excess.max(axis=1)
     if not (worst > 1).any():
         return None
@@ -58,20 +55,37 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     rate, t = rates[knot, mode], int(known[knot])
     with np.errstate(over="ignore"):
         growth = abs(np.polyval(_TAYLOR[::-1], step * rate))
+    shorter = step / float(worst[knot])
+    unit = 10.0 ** (math.floor(math.log10(shorter)) - 2)  # of three digits
+    longest = math.floor(shorter / unit) * unit
+    if not sound and not _stays_finite(problem, states[0], controls, math.ceil(step / longest)):
+        return None
     # The state that takes part the most in the eigenvalue, whatever the units of states.
     each, right = np.linalg.eig(slopes[knot])
     mode = int(np.argmin(np.abs(each - rate)))
     carrier = int(np.argmax(np.abs(np.linalg.pinv(right)[mode] * right[:, mode])))
-    shorter = step / float(worst[knot])
-    unit = 10.0 ** (math.floor(math.log10(shorter)) - 2)  # of three digits
     name = problem.dynamics.state_coordinates.names[carrier]
     value = f"{rate.real:.3g}" + (f" +- {abs(rate.imag):.3g}i" if rate.imag else "")
     return UnstableStep(
         f"Runge-Kutta steps of {step:g} s are unstable: at {problem.begin + t * problem.dt:g} s (step {t + 1} of"
         f" {problem.steps}) df/dx has the stable eigenvalue {value} 1/s, mostly of {name}, whose deviations a"
         f" step multiplies by {growth:.3g}",
-        problem.dynamics._with_finer_steps(step, math.floor(shorter / unit) * unit),
+        problem.dynamics._with_finer_steps(step, longest),
     )
+
+
+def _stays_finite(problem: Problem, start: Array, controls: Array, times: int) -> bool:
+    """Whether controls (T, m) lead to finite states if each is held for so many control periods as much shorter.
+
+    Controls that are not finite are the nominal one. True for MuJoCo's steps, and for runs of more than `LONGEST`.
+    """
+    steps, n = times * len(controls), len(start)
+    if problem.dynamics.by_mujoco or steps > LONGEST:
+        return True
+    held = np.repeat(np.where(np.isfinite(controls), controls, problem.nominal_control), times, axis=0)
+    gain = np.zeros((steps, held.shape[1], n))
+    states, _ = compiled.rollout(problem, gain, held, start, dt=problem.dt / times)
+    return bool(np.isfinite(states).all())
 
 
 _TAYLOR = np.array([1.0, 1.0, 1 / 2, 1 / 6, 1 / 24])
