@@ -314,7 +314,7 @@ def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> No
     assert sorted(reasons) == np.flatnonzero(table.outcome == "error").tolist()
     assert results.tally(cell)["reached"] == 24 - len(reasons)
     assert np.isnan(table.worst[sorted(reasons)]).all()
-    assert f"{len(reasons)} trials came to nothing: {said}" in results.summary()
+    assert f"{len(reasons)} trials were stopped: {said}" in results.summary()
 
 
 def line_of(text: str) -> int:
@@ -327,7 +327,7 @@ def test_where_every_trial_fails_the_line_is_named_and_no_disturbance_blamed(own
     results = run_campaign(replace(campaign, sweeps={"light": campaign.sweeps["own"]}), tmp_path, workers=0)
     summary = results.summary()
     where = f"({own.name}, line {line_of('np.stack')})"
-    assert f"24 trials came to nothing: ValueError: all input arrays must have the same shape {where}" in summary
+    assert f"24 trials were stopped: ValueError: all input arrays must have the same shape {where}" in summary
     assert "alone: --sweep" not in summary
     assert "deterministic" not in summary
     assert "0/24" in summary

@@ -464,7 +464,7 @@ def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage:
     np.testing.assert_allclose(rollout.goal_distance, 1.9, atol=1e-3)
     for text in (str(solution), rollout.summary()):
         assert "the plan ends 1.9 m from the goal, which is reached within 0.3 m\n" in text
-        assert "the plan MISSES the goal; to mend that" in text
+        assert "the plan MISSES the goal: raise the weights of the final cost" in text
     assert rollout.tally() == "0 of 2 trials reached the goal"
     assert outcomes(rollout).goal == pytest.approx(rollout.goal_distance)
     near = ls.simulate(cage, short(0.2), goal_radius=0.3)
@@ -836,7 +836,7 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     assert all(re.fullmatch(r"filter at .* s: the estimate of \w+ is .*", reason) for reason in reasons.values())
     said = results.came_to_nothing()
     assert len(said) == min(len(set(reasons.values())), 5)
-    assert all(re.fullmatch(r"[1-9]\d* trials came to nothing: filter at .*", line) for line in said)
+    assert all(re.fullmatch(r"[1-9]\d* trials were stopped: filter at .*", line) for line in said)
     assert all(line in results.summary().splitlines() for line in said)
     page = report(results, tmp_path / "page.html", videos=0).read_text(encoding="utf-8")
     assert all(f"{line}." in page for line in said)
@@ -954,7 +954,7 @@ def test_simulate_says_how_many_reached_the_goal_and_that_a_plan_misses_it(
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "0 of 3 trials reached the goal"
     assert "  the plan ends 0.0647 m from the goal, which is reached within 0.01 m" in lines
-    assert any(line.startswith("  the plan MISSES the goal; ") for line in lines)
+    assert any(line.startswith("  the plan MISSES the goal: ") for line in lines)
     assert main(["simulate", path, "--goal-tolerance", "0.1"]) == 2
     assert "want goal_radius, in metres" in capsys.readouterr().err
 

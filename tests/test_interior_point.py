@@ -461,7 +461,7 @@ SLOW, QUICK = ls.StateBounds(v=(-np.inf, 0.2)), ls.StateBounds(v=(-np.inf, 4.0))
         (problem(FAR, SLOW), {}, "INFEASIBLE", "relax v of at most 0.2 m/s, ", problem(FAR, QUICK), {}),
         (blocked(0.1), {}, "", "move the goal, which is at (1, 0.1) m, 0.2 m inside obstacle 'ball'", blocked(0.5), {}),
         (replace(racing(), control_limits=None), {}, "NOT_POSITIVE_DEFINITE",
-         "the cost is linear or flat in u: give control_limits, or add a ControlCost", racing(), {}),
+         "the cost is not curved in u: give control_limits, or add a ControlCost", racing(), {}),
         (racing(), {"finish": None}, "NOT_POSITIVE_DEFINITE", 'solve with finish="newton"', racing(), {}),
         (UPRIGHT, {"max_iterations": 3}, "MAX_ITERATIONS",
          "raise max_iterations: the cost still fell in the last one, by ", UPRIGHT, {}),

@@ -101,7 +101,7 @@ def test_the_risk_that_is_too_high_is_named():
     for solver in (ls.smooth, ls.ilqr):
         solution = solver(problem, risk=1.02 * most)
         assert solution.status is ls.Status.RISK_TOO_HIGH
-        said = f"about the best plan risk {1.02 * most:g} is too high at step {step} of 12, and at most "
+        said = f"about the best plan a risk of {1.02 * most:g} is too high at step {step} of 12, and at most "
         assert solution.detail.startswith(said)
         will_do = float(solution.detail.removeprefix(said).split()[0])
         assert will_do == pytest.approx(most, rel=1e-4)
@@ -117,7 +117,7 @@ def test_where_the_start_has_no_pass_at_all_the_risk_is_named_about_the_plan_wit
     most = ls.largest_risk(problem, ls.smooth(problem))
     solution = ls.smooth(problem, risk=times * most)
     assert solution.status is ls.Status.RISK_TOO_HIGH
-    said = f"about the best plan risk {times * most:g} is too high at step "
+    said = f"about the best plan a risk of {times * most:g} is too high at step "
     assert solution.detail.startswith(said)
     will_do = float(solution.detail.partition(", and at most ")[2].split()[0])
     assert will_do == pytest.approx(most, rel=1e-3)  # the two plans are the same to the tolerance of a solve

@@ -60,8 +60,8 @@ class TestCandidates:
         (best,) = [one for one in drive_solution.candidates if one.status is not None]
         dropped = [replace(best, start=f"other {i}", status=None, cost=cost) for i, cost in enumerate(costs)]
         text = replace(drive_solution, candidates=(best, *dropped)).summary()
-        said = "at costs of 7.5 or more" if min(costs) < np.inf else "without a finite cost"
-        assert f"; {len(costs)} were dropped {said}" in text
+        said = "which cost 7.5 or more" if min(costs) < np.inf else "for no cost was finite"
+        assert f"; {len(costs)} were dropped, {said}" in text
         assert " inf" not in text
 
     def test_the_same_bits_however_they_are_run(self, differential_drive, drive_solution) -> None:

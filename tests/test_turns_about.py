@@ -106,7 +106,7 @@ def test_it_is_a_rotation_vector_where_nothing_tilts(kind: str, axis: str) -> No
     assert not other.detail
     *_, singular = turning(kind, axis, 360, None)
     assert "from a whole turn, where rotation vectors are singular" in singular.detail
-    assert singular.detail.endswith(f'MjcfRobot(..., turns_about="{axis}") has no such place on this way')
+    assert singular.detail.endswith(f'MjcfRobot(..., turns_about="{axis}") avoids this')
 
 
 def test_a_tilt_near_half_a_turn_is_singular_and_named() -> None:

@@ -95,7 +95,7 @@ class ReplanLog:
         finite = bool(np.isfinite(replan.cost))
         used = finite and not late and (replan.success or replan.improved)
         if not finite:
-            reason = "the previous law leads to infinity by the model"
+            reason = "the previous law diverges by the model"
         self.solved += used
         if not used:
             self.kept[reason] += 1

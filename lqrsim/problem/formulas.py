@@ -230,7 +230,7 @@ class SymbolicConstraint(OfFormula, Constraint):
                 f"{self.name}: got {rows} entries of which {len(with_control)} depend on u, want all of them or none:"
                 " state the others as another SymbolicConstraint"
             )
-        kind = "zero" if self.equality else "not negative"
+        kind = "=" if self.equality else ">="
         parts = [f"[{row}]" for row in range(rows)] if rows > 1 else [""]
         name = self._name or getattr(self.function, "__name__", type(self.function).__name__)
         names, texts = ([f"{one}{part}" for part in parts] for one in (name, self.name))
@@ -240,7 +240,7 @@ class SymbolicConstraint(OfFormula, Constraint):
             source=made["source"],
             data=self._data,
             rows=rows,
-            describe=lambda row: f"that {texts[row]} is {kind}",
+            describe=lambda row: f"{texts[row]} {kind} 0",
             names=tuple(names),
             uses_control=bool(with_control),
             equality=self.equality,

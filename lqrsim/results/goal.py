@@ -222,8 +222,8 @@ class Target:
         lines = [f"the plan ends {self.describe(away)}{within}{f': {worst}' if worst else ''}"]
         if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):
             by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
-            mend = "raise the weights of the final cost or the number of steps"
-            lines.append(f"the plan MISSES the goal{by}; to mend that, {mend}")
+            mend = "raise the weights of the final cost or, if controls are at their limits, the number of steps"
+            lines.append(f"the plan MISSES the goal{by}: {mend}")
         return lines
 
     def worst(self, state: Array, radius: float | None) -> str:

@@ -221,8 +221,8 @@ class Solution(Plan):
         ).start
         lines = [f"the plan is from the start {best!r}, one of {len(self.candidates)}"]
         if dropped:
-            costs = f"at costs of {min(dropped):.6g} or more" if np.isfinite(min(dropped)) else "without a finite cost"
-            lines[0] += f"; {len(dropped)} were dropped {costs}"
+            why = f"which cost {min(dropped):.6g} or more" if np.isfinite(min(dropped)) else "for no cost was finite"
+            lines[0] += f"; {len(dropped)} were dropped, {why}"
         if (total := sum(candidate.iterations for candidate in self.candidates)) > len(self.iterations):
             lines[0] += f"; {total} iterations in all"
         others = [one for one in ended if one.start != best]

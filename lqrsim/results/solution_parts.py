@@ -83,7 +83,7 @@ class Status(enum.StrEnum):
     )  # fmt: skip
     MAX_ITERATIONS = (
         "max iterations", "the iteration limit was reached",
-        "raise max_iterations while the improvements shrink; otherwise try another start",
+        "raise max_iterations",
     )  # fmt: skip
     STALLED = (
         "stalled", "no step makes the plan better, though it is not within tolerance",
@@ -111,11 +111,11 @@ class Status(enum.StrEnum):
     )  # fmt: skip
     NOT_POSITIVE_DEFINITE = (
         "not positive definite", "a matrix that must be inverted was not positive definite",
-        "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
+        "raise the control weight, or begin with another start",
     )  # fmt: skip
     RISK_TOO_HIGH = (
         "risk too high", "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
-        "lower the risk below the largest that is named, or lower the noise; or start from a solution of a lower risk",
+        "lower the risk below the largest that is named, or lower the noise",
     )  # fmt: skip
     NOT_CERTIFIED = (
         "not certified", "the method converged, but a check of its plan against the problem failed",

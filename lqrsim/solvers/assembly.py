@@ -65,7 +65,7 @@ def assemble(
         later,
         status=found.status,
         detail="; ".join(part for part in said if part),
-        remedy=unstable.remedy if unstable else remedy_of(problem, found, log, options),
+        remedy=remedy_of(problem, found, log, options, shorter=unstable.remedy if unstable else ""),
         policy=policy(*law, nominal[:-1]),
         cost_to_go=copy_of(found.values.get("cost_to_go")),
         cost_to_come=copy_of(found.values.get("cost_to_come")),
@@ -131,7 +131,7 @@ def _near_singular(problem: Problem, found: RunResult) -> str:
             return (
                 f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from {what}, where {where} are"
                 " singular: the policy may take an attitude beside the plan's for another turn"
-            ) + (f'; MjcfRobot(..., turns_about="{axis}") has no such place on this way' if axis else "")
+            ) + (f'; MjcfRobot(..., turns_about="{axis}") avoids this' if axis else "")
     return ""
 
 
@@ -161,17 +161,25 @@ def _fragile(problem: Problem, found: RunResult) -> str:
     return ""
 
 
-def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
-    """The remedy for this case; if none is known, the usual one for the status. Empty for a success that needs none."""
+def remedy_of(
+    problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object], *, shorter: str
+) -> str:
+    """The remedy for this case; if none is known, the usual one for the status. Empty for a success that needs none.
+
+    `shorter` names the steps to take where those of the plan are unstable.
+    """
     status = found.status
-    if status.success or found.remedy:
-        return found.remedy
+    lost = status in (Status.NOT_FINITE, Status.NOT_POSITIVE_DEFINITE, Status.DIVERGED)
+    if lost and options.get("safeguard") is False:
+        return "solve with safeguard=True, whose steps only ever lower the cost"
+    if shorter or status.success or found.remedy:
+        return shorter or found.remedy
     if inside := problem.goal_inside:
         geoms = any("geoms" in one.shape for one in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
     if status is Status.TIME_LIMIT and log:
         took = sum(one.seconds for one in log)
-        return f"raise time_limit: {len(log)} iterations took {took:.2g} s; or begin with start=solution of one like it"
+        return f"raise time_limit: {len(log)} iterations took {took:.2g} s; or begin with start=solution of a similar problem"
     if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
         fell = log[-1].improvement * abs(log[-1].cost)
         costs = f"by {fell:.2g}; the plan costs {found.cost:.6g}"
@@ -183,12 +191,13 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
             'solve with finish="newton" and stop="optimal": the interior point finds plans where this method does not'
         )
     if status is Status.NOT_FINITE and not np.isfinite(found.states).all():
-        return "begin with start=[...], controls under which the states stay in their domain"
+        begin = "begin with start=[...], controls under which the states stay in their domain"
+        return begin if "form" in options else f"solve with smooth, or {begin}"
     if status is Status.INFEASIBLE and found.against:
         relaxed = f"relax {found.against[0].rsplit(' at ', 1)[0]}"
         return f"allow more time than {problem.dt * problem.steps:g} s, {relaxed}, or ask for less of what is missed"
     if status is Status.NOT_POSITIVE_DEFINITE and (flat := _flat_controls(problem, found)):
-        return f"the cost is linear or flat in {', '.join(flat)}: give control_limits, or add a ControlCost"
+        return f"the cost is not curved in {', '.join(flat)}: give control_limits, or add a ControlCost"
     return status.remedy
 
 

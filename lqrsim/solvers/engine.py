@@ -61,7 +61,7 @@ _STATUS = {getattr(declarations, one.name): one for one in Status if hasattr(dec
 _DETAILS = {
     declarations.NO_START: "rollout of the initial controls",
     declarations.CYCLING: "the iterations repeat themselves",
-    declarations.NO_PROGRESS: "the least cost so far no longer falls, or the gap does not",
+    declarations.NO_PROGRESS: "neither the least cost so far nor the gap falls any more",
     declarations.STALLED: "the line search found no lower cost",
 }
 
@@ -339,7 +339,7 @@ class SolveRun:
         ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.final, added=added, least=least)
         status = ending.status
         if ending.outcome == declarations.STALLED:
-            detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
+            detail = f"{detail}; Newton's method makes no progress".removeprefix("; ")
         if patient and ending.outcome != declarations.TIMED_OUT and not status.success and self.work.memory["damping"]:
             status = Status.NOT_POSITIVE_DEFINITE  # its last models had no minimum without weights
         return self.damped_result(ending, status, detail)

@@ -123,7 +123,7 @@ def _passes(
     )  # fmt: skip
     failure = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
     if failed >= 0 and form == "dual" and which > 0:
-        failure += '; form="primal" may do'
+        failure += '; try form="primal"'
     return found, failure
 
 

@@ -320,7 +320,7 @@ class _Neighbour:
         if self._late(0.0):
             return _unchanged(self._best)
         if not np.isfinite(self._best.cost):
-            detail = "the law that it begins with leads to infinity"
+            detail = "the policy that it begins with diverges"
             return replace(_unchanged(self._best), status=Status.NOT_FINITE, detail=detail)
         known = tuple(one.values for one in run.initial_guess.multipliers)
         for function in functions_of(run.problem):

@@ -108,7 +108,7 @@ def name_risk(run: SolveRun, found: RunResult) -> str:
     if failed < 0 or run.fails_at(0.0) >= 0:
         return found.detail
     most = _bisect(run.fails_at, risk) * (1 - 1e-5)  # so that even the rounded number works
-    told = f"about the best plan risk {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
+    told = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
     return f"{told}; {found.detail}" if found.detail else told
 
 

@@ -185,7 +185,7 @@ class Results:
             ends = self.tally(cell, partial=True)
             if ends["error"] or ends["diverged"]:
                 reasons.update(self.reasons(cell).values())
-        return [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
+        return [f"{count} trials were stopped: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
     def hints(self) -> list[str]:
         """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance.
