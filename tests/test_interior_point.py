@@ -433,54 +433,6 @@ def test_limits_that_stand_against_a_goal_are_named_however_far_it_is(way: float
     assert "relax the limits of force" in solution.remedy
 
 
-def blocked(place: float) -> ls.Problem:
-    """A mass in the plane, whose goal may be in a ball about (1, 0)."""
-    world = ls.World([ls.Obstacle("ball", "sphere", np.array([1.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]))])
-    dynamics = ls.Dynamics(
-        lambda x, u, p: [x[2], x[3], u[0], u[1]], states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
-        controls={"fx": "N", "fy": "N"}, position=("x", "y"),
-    )  # fmt: skip
-    return ls.Problem(
-        dynamics=dynamics, dt=DT, steps=15, initial=ls.FixedState(np.zeros(4)), stage_cost=ls.ControlCost(np.ones(2)),
-        final_cost=ls.QuadraticCost(np.ones(4), about=np.zeros(4)),
-        constraints=[ls.Clearance(world, radius=0.1), ls.GoalState(x=1.0, y=place, vx=0.0, vy=0.0)],
-    )  # fmt: skip
-
-
-FAR, LATE = ls.GoalState(x=1.5), ls.GoalState(x=2.0, v=0.0)
-UPRIGHT = problem(dynamics=system(pull=4.0), goal=(3.0, 0.0), final=(100.0, 100.0), steps=40)
-SLOW, QUICK = ls.StateBounds(v=(-np.inf, 0.2)), ls.StateBounds(v=(-np.inf, 4.0))
-
-
-@pytest.mark.parametrize(
-    ("of", "options", "status", "remedy", "mended", "then"),
-    [
-        (problem(LATE, limit=1.0), {}, "INFEASIBLE", "allow more time than 1.5 s, ",
-         problem(LATE, limit=1.0, steps=40), {}),
-        (problem(FAR, limit=1.0), {}, "INFEASIBLE", "relax the limits of u, ", problem(FAR, limit=9.0), {}),
-        (problem(FAR, SLOW), {}, "INFEASIBLE", "relax v of at most 0.2 m/s, ", problem(FAR, QUICK), {}),
-        (blocked(0.1), {}, "", "move the goal, which is at (1, 0.1) m, 0.2 m inside obstacle 'ball'", blocked(0.5), {}),
-        (replace(racing(), control_limits=None), {}, "NOT_POSITIVE_DEFINITE",
-         "the cost is not curved in u: give control_limits, or add a ControlCost", racing(), {}),
-        (racing(), {"finish": None}, "NOT_POSITIVE_DEFINITE", 'solve with finish="newton"', racing(), {}),
-        (UPRIGHT, {"max_iterations": 3}, "MAX_ITERATIONS",
-         "raise max_iterations: the cost still fell in the last one, by ", UPRIGHT, {}),
-        (problem(FAR), {"time_limit": 1e-9}, "TIME_LIMIT", "raise time_limit", problem(FAR), {"time_limit": 60.0}),
-    ],
-)  # fmt: skip
-def test_the_remedy_is_for_this_case_and_helps(
-    of: ls.Problem, options: dict[str, Any], status: str, remedy: str, mended: ls.Problem, then: dict[str, Any]
-) -> None:
-    failed = ls.smooth(of, **options)
-    assert not failed.success
-    assert failed.status.name == status or not status
-    assert remedy in failed.remedy
-    assert failed.remedy in str(failed)
-    assert "raise the weights" not in str(failed)  # which does not help here
-    assert "violation: " in str(failed) or failed.violation <= 1e-6
-    assert solved(mended, **then).remedy == ""
-
-
 def test_bounds_that_contradict_each_other_are_infeasible() -> None:
     """One as a bound, one as a formula: half of what is between them is the least that can be missed."""
     numbers = {"share": 0.0, "bent": 0.0, "place": 1.0, "speed": 1.0, "there": 0.5}

@@ -87,7 +87,7 @@ class Status(enum.StrEnum):
     )  # fmt: skip
     STALLED = (
         "stalled", "no step makes the plan better, though it is not within tolerance",
-        "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
+        "begin with another start, or accept a larger tolerance",
     )  # fmt: skip
     TIME_LIMIT = (
         "time limit", "the time limit was reached; the plan is the best so far",
@@ -102,12 +102,12 @@ class Status(enum.StrEnum):
         "relax the constraint that is named, allow more time, or try another start",
     )  # fmt: skip
     DIVERGED = (
-        "diverged", "the cost of the policy grew beyond all bounds",
-        "try a start nearer to a solution or an InitialPrior, shorten dt, or try the other solver",
+        "diverged", "the cost of the policy grew, or fell, beyond all bounds",
+        "raise the control weight, or give control_limits and StateBounds",
     )  # fmt: skip
     NOT_FINITE = (
         "not finite", "a NaN or an infinity appeared",
-        "check the dynamics and the cost at the step that is named; try another start; shorten dt",
+        "check the dynamics and the cost at the step that is named, or begin with another start",
     )  # fmt: skip
     NOT_POSITIVE_DEFINITE = (
         "not positive definite", "a matrix that must be inverted was not positive definite",

@@ -1,7 +1,7 @@
 """Makes a `Solution` from the result of a run."""
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -30,6 +30,7 @@ WHOLE = 0.3
 # That of a tilt from half a turn. An error of the attitude is 2 / HALF times as large in the turn, which is as much as
 # 2 pi / WHOLE times in a rotation vector.
 HALF = 0.1
+UNBOUNDED = 1e10  # a cost so many times below that of the first iteration, or below -1, falls for ever
 FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
 
@@ -44,6 +45,9 @@ def assemble(
 ) -> Solution:
     """Copy the result of a run into a Solution."""
     assert found.certificate is not None
+    falls = bool(log) and found.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
+    if falls and not found.success and found.status is not Status.NOT_POSITIVE_DEFINITE:
+        found = replace(found, status=Status.DIVERGED, detail="the cost falls without bound")
     states, controls, law = found.states.copy(), found.controls.copy(), (found.law[0].copy(), found.law[1].copy())
     inverse_law = found.values.get("inverse_law")
     if inverse_law is not None:
@@ -179,17 +183,19 @@ def remedy_of(
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
     if status is Status.TIME_LIMIT and log:
         took = sum(one.seconds for one in log)
-        return f"raise time_limit: {len(log)} iterations took {took:.2g} s; or begin with start=solution of a similar problem"
+        similar = "or begin with start=solution of a similar problem"
+        return f"raise time_limit: {len(log)} iterations took {took:.2g} s; {similar}"
     if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
         fell = log[-1].improvement * abs(log[-1].cost)
         costs = f"by {fell:.2g}; the plan costs {found.cost:.6g}"
         return f"raise max_iterations: the cost still fell in the last one, {costs}"
     limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
     paper = options.get("finish", "newton") is None or options["stop"] == "cost"
-    if status is not Status.TIME_LIMIT and can_be_exact(problem) and paper and (problem.constraints or limited):
-        return (
-            'solve with finish="newton" and stop="optimal": the interior point finds plans where this method does not'
-        )
+    bounded = bool(problem.constraints) or limited
+    helps = status is Status.NOT_POSITIVE_DEFINITE or (bounded and status is not Status.NOT_FINITE)
+    if paper and can_be_exact(problem) and helps and status is not Status.TIME_LIMIT:
+        better = "the interior point" if bounded else "Newton's method"
+        return f'solve with finish="newton" and stop="optimal": {better} finds plans where this method does not'
     if status is Status.NOT_FINITE and not np.isfinite(found.states).all():
         begin = "begin with start=[...], controls under which the states stay in their domain"
         return begin if "form" in options else f"solve with smooth, or {begin}"

@@ -108,8 +108,9 @@ def name_risk(run: SolveRun, found: RunResult) -> str:
     if failed < 0 or run.fails_at(0.0) >= 0:
         return found.detail
     most = _bisect(run.fails_at, risk) * (1 - 1e-5)  # so that even the rounded number works
-    told = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
-    return f"{told}; {found.detail}" if found.detail else told
+    too_high = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}"
+    too_high += f", and at most {most:.5g} will do"
+    return f"{too_high}; {found.detail}" if found.detail else too_high
 
 
 def _bisect(fails: Fails, high: float) -> float:

@@ -29,8 +29,8 @@ class UnstableStep(NamedTuple):
 def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bool) -> UnstableStep | None:
     """The step at which a plan, states (T+1, n) and controls (T, m), needs the shortest Runge-Kutta steps, if shorter.
 
-    It is the first such step if the plan is not sound: what follows may be beyond all bounds because of it. None if with
-    shorter steps the same controls lead there as well.
+    It is the first such step if the plan is not sound: what follows may be beyond all bounds because of it. None if the
+    same controls lead there with shorter steps as well.
     """
     known = np.flatnonzero(np.isfinite(states[:-1]).all(axis=1) & np.isfinite(controls).all(axis=1))
     found = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
@@ -77,11 +77,11 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
 def _stays_finite(problem: Problem, start: Array, controls: Array, times: int) -> bool:
     """Whether controls (T, m) lead to finite states if each is held for so many control periods as much shorter.
 
-    Controls that are not finite are the nominal one. True for MuJoCo's steps, and for runs of more than `LONGEST`.
+    Controls that are not finite are the nominal one. True for MuJoCo's steps, and false for more than `LONGEST`.
     """
     steps, n = times * len(controls), len(start)
     if problem.dynamics.by_mujoco or steps > LONGEST:
-        return True
+        return problem.dynamics.by_mujoco
     held = np.repeat(np.where(np.isfinite(controls), controls, problem.nominal_control), times, axis=0)
     gain = np.zeros((steps, held.shape[1], n))
     states, _ = compiled.rollout(problem, gain, held, start, dt=problem.dt / times)
