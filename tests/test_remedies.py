@@ -121,7 +121,8 @@ CASES = {
         reach(1.0), {}, [(reach(1.0, steps=25), {}), (reach(1.0, limit=2.0), {}), (reach(0.5), {})],
     ),
     "too slow": Case(
-        "INFEASIBLE", "relax v of at most 0.2 m/s", problem(mass, ls.GoalState(x=1.0), ls.StateBounds(v=(-0.2, 0.2))), {},
+        "INFEASIBLE", "relax v of at most 0.2 m/s",
+        problem(mass, ls.GoalState(x=1.0), ls.StateBounds(v=(-0.2, 0.2))), {},
         [(problem(mass, ls.GoalState(x=1.0), ls.StateBounds(v=(-4.0, 4.0))), {})],
     ),
     "too late, whatever the duration": Case(
