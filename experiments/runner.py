@@ -194,7 +194,7 @@ class Kept:
             if self.file is not None:
                 with replacing(self.file) as unfinished:
                     kept = {"asked": self.asked, "rows": self.rows}
-                    unfinished.write_text(json.dumps(kept, allow_nan=False) + "\n", encoding="utf-8")
+                    unfinished.write_text(json.dumps(kept) + "\n", encoding="utf-8")
         return self.rows[key]
 
 

@@ -583,3 +583,10 @@ def test_what_a_script_prints_as_json_has_no_infinity(
     runner.run(runner.Settings, lambda config: found, lambda result: "", None)
     printed = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert printed["result"] == {"figures": [], "ratio": None, "rows": [None, 1.0, None]}
+
+
+def test_rows_that_are_kept_may_be_infinite(tmp_path: Path) -> None:
+    """A solver that was not there has no least cost; read again, the report is of the same numbers."""
+    runner: Any = import_module("runner")
+    runner.Kept(tmp_path / "kept.json", {"trials": 1}).row("cost", lambda: [np.inf, 1.0])
+    assert runner.Kept(tmp_path / "kept.json", {"trials": 1}).row("cost", pytest.fail) == [np.inf, 1.0]

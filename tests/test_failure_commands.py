@@ -21,6 +21,7 @@ from lqrsim.cli import main
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import multilevel_splitting
+from lqrsim.stress.failure_search import write_json
 from lqrsim.stress.trial_score import TrialScore
 
 # One random number decides: how far towards the wall behind it the robot begins.
@@ -397,3 +398,14 @@ def test_ctrl_c_is_one_line_and_leaves_nothing(command: str, own: str, tmp_path:
     assert process.returncode == 130
     assert error.splitlines()[-1] == "lqrsim: stopped"
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_written_of_a_search_has_no_infinity(tmp_path: Path) -> None:
+    """As null, which every program can read; a plan's numbers may be infinite, and so may a distance."""
+    problem = ls.stress.ReliabilityProblem("quadrotor")
+    found = {"distance": np.inf, "shares": [np.float64("nan"), 1.0]}
+    solution = ls.smooth(ls.scenarios.quadrotor().problem, max_iterations=1, safeguard=False)
+    write_json(problem, solution, tmp_path / "break.json", {"largest": -np.inf}, found, "")
+    written = json.loads((tmp_path / "break.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    assert written["found"] == {"distance": None, "shares": [None, 1.0]}
+    assert written["asked"]["largest"] is None

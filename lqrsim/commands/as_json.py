@@ -1,21 +1,19 @@
 """Results as plain dictionaries, for `--json`. docs/json.md describes them."""
 
 import dataclasses
-import enum
 import json
-import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import lqrsim as ls
+from lqrsim.results.archive import plain
 
 Object = dict[str, Any]
 
 
 def text_of(value: object) -> str:
     """The JSON text of a result in one line, with numbers at full precision."""
-    return json.dumps(_plain(value), allow_nan=False)
+    return json.dumps(plain(value), allow_nan=False)
 
 
 def of_scenario(name: str, scenario: "ls.Scenario") -> Object:
@@ -120,22 +118,3 @@ def _rows(columns: Mapping[str, Any]) -> list[Object]:
 
 def _named(space: "ls.types.Coordinates") -> list[Object]:
     return [{"name": name, "unit": unit} for name, unit in zip(space.names, space.units, strict=True)]
-
-
-def _plain(value: Any) -> Any:
-    """Convert a value to types of JSON; null for numbers that are not finite."""
-    if hasattr(value, "tolist"):  # an array or a number of NumPy
-        value = value.tolist()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, enum.Enum):
-        return value.name
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(name): _plain(one) for name, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return value

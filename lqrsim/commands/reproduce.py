@@ -70,7 +70,7 @@ class Reproduce:
     def run(self) -> int:
         from lqrsim.errors import check_name
         from lqrsim.machine import description
-        from lqrsim.results.archive import replacing
+        from lqrsim.results.archive import plain, replacing
 
         named = {check_name("results", name, SCRIPTS) for name in self.results} or set(SCRIPTS)
         chosen = [name for name in SCRIPTS if name in named]
@@ -96,7 +96,7 @@ class Reproduce:
             ordered = {name: together[name] for name in SCRIPTS if name in together}
             saved = {"machine": kept["machine"], "quick": self.quick, "results": ordered}
             with replacing(out / "results.json") as unfinished:
-                unfinished.write_text(json.dumps(saved, allow_nan=False) + "\n", encoding="utf-8")
+                unfinished.write_text(json.dumps(plain(saved), allow_nan=False) + "\n", encoding="utf-8")
             with replacing(out / "results.md") as unfinished:
                 unfinished.write_text(results_page(saved), encoding="utf-8")
             console.say("\n" + "\n".join(verdicts(results, out)))

@@ -5,15 +5,17 @@ Every exception of a parser becomes a one-line error.
 """
 
 import contextlib
+import dataclasses
+import enum
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
 import time
 import zipfile
 from collections.abc import Iterator, Mapping
-from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,6 +70,25 @@ def parse(text: str | bytes) -> Any:
 def canonical(value: Any) -> str:
     """The canonical JSON text of a value: sorted names, no spaces. Raises TypeError or ValueError."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def plain(value: Any) -> Any:
+    """Convert a value to types of JSON; null for numbers that are not finite."""
+    if hasattr(value, "tolist"):  # an array or a number of NumPy
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(name): plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return value
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -167,7 +188,7 @@ class Archive:
         shape = tuple(int(length) for length in (match[2] or b"").decode().replace(",", " ").split())
         dtype = match[1].decode()
         bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])
-        if 10 + length + prod(shape) * bytes_each != self._members[name].file_size or len(shape) > 32:
+        if 10 + length + math.prod(shape) * bytes_each != self._members[name].file_size or len(shape) > 32:
             raise InputError(f"{excerpt(name)}: got a size that does not fit, want the size of {excerpt(shape)}")
         return Header(dtype, shape)
 

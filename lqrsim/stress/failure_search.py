@@ -23,7 +23,7 @@ from lqrsim.errors import Array, InputError, check_path
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
-from lqrsim.results.archive import replacing, sha256
+from lqrsim.results.archive import plain, replacing, sha256
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -438,4 +438,4 @@ def write_json(
         "found": found,
     }
     with replacing(path) as unfinished:
-        unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        unfinished.write_text(json.dumps(plain(contents), indent=1, allow_nan=False) + "\n", encoding="utf-8")
