@@ -565,7 +565,7 @@ for largest, work in ((0, new), (40_000, video), (4096, save), (4096, table), (0
     assert len(said) == 6
     assert all(line.endswith("want a file that can be written (File too large)") for line in said)
     assert "Traceback" not in done.stderr
-    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(("a.", ".unfinished"))]
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(("a.", ".unfinished", "robot"))]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")

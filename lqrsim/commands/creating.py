@@ -4,6 +4,7 @@ import builtins
 import importlib.util
 import keyword
 import shlex
+import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -51,12 +52,16 @@ class New:
             raise ls.InputError(
                 f"--out: got {excerpt_of(self.out)}, want a folder that can be written ({error})"
             ) from None
-        for template in sorted(TEMPLATES.glob("*.*")):
-            path = folder / _named(template.name, self.name)
-            with replacing(path) as unfinished:
-                text = _named(template.read_text(encoding="utf-8"), self.name)
-                unfinished.write_text(text, encoding="utf-8", newline="\n")
-            console.wrote(path)
+        try:
+            for template in sorted(TEMPLATES.glob("*.*")):
+                path = folder / _named(template.name, self.name)
+                with replacing(path) as unfinished:
+                    text = _named(template.read_text(encoding="utf-8"), self.name)
+                    unfinished.write_text(text, encoding="utf-8", newline="\n")
+                console.wrote(path)
+        except BaseException:  # as on a full disk: the same command can then be given again
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         console.say("\nnext:")
         for command in next_commands(self.name, folder):
             console.say(f"  {shlex.join(command)}")
