@@ -13,6 +13,7 @@ from typing import Any
 
 from lqrsim import process
 
+LEAST_MEMORY = 1_000_000_000  # bytes of address space, of which a short run takes some 800 MB on two processors
 NARROWEST = 20  # columns of a terminal for which help and errors are laid out
 
 DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under
@@ -81,6 +82,11 @@ def _run(arguments: list[str]) -> int:
             print(f"lqrsim {version('lqrsim')}")
         return 0
 
+    if limit := _memory_limit():
+        memory = f"{limit / 1e6:.0f} MB of address space (ulimit -v), want at least {LEAST_MEMORY / 1e6:.0f} MB"
+        process.print_error(f"lqrsim: error: memory: got {memory}")
+        return 2
+
     from lqrsim.commands import COMMANDS
 
     if arguments in (["--help"], ["-h"]):
@@ -136,6 +142,19 @@ def _has_folder() -> bool:
     except OSError:
         return False
     return True
+
+
+def _memory_limit() -> int:
+    """The limit of the address space in bytes if NumPy, SciPy, Numba and MuJoCo cannot be loaded within it; else 0.
+
+    Some of them would end the process, or ask for memory for ever and heed no signal.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return 0
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return limit if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY else 0
 
 
 @contextlib.contextmanager

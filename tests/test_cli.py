@@ -526,6 +526,20 @@ def test_too_little_memory_is_one_line(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
+@pytest.mark.parametrize("megabytes", [300, *rarely(150, 999)])
+def test_too_little_address_space_is_refused_before_a_library_meets_it(megabytes: int) -> None:
+    program = (
+        f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({megabytes}_000_000,) * 2)\n"
+        "from lqrsim.cli import main; raise SystemExit(main(['simulate', 'solution.npz']))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"lqrsim: error: memory: got {megabytes} MB of address space (ulimit -v), want at least 1000 MB\n"
+    )
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     """In another process, for a video that could not even be begun ended it by a fault of memory."""
     program = """
