@@ -147,7 +147,7 @@ def _has_folder() -> bool:
 def _memory_limit() -> int:
     """The limit of the address space in bytes if NumPy, SciPy, Numba and MuJoCo cannot be loaded within it; else 0.
 
-    Some of them would end the process, or ask for memory for ever and heed no signal.
+    With less they end the process; or SciPy's OpenBLAS, as it is loaded, asks again for ever and no signal is heeded.
     """
     try:
         import resource
