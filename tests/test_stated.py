@@ -252,6 +252,16 @@ def test_simulate_runs_a_controller_by_its_name(
     assert found.policy_digest == law.digest
 
 
+@pytest.mark.parametrize(("told", "said"), [([], True), (["--design-disturbances", "calm"], False)])
+def test_a_law_that_was_designed_for_the_default_says_so(
+    told: list[str], said: bool, solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A law for moderate disturbances may lose what one for those of the run would not."""
+    assert main(["simulate", str(solved), "--out", str(tmp_path), "--controller", "track", *told]) == 0
+    line = "track was designed for moderate; for others: --design-disturbances NAME"
+    assert (line in capsys.readouterr().out) == said
+
+
 def test_a_plan_with_a_clearance_is_tracked_but_not_planned_again_without_it(
     differential_drive: ls.Scenario,
 ) -> None:

@@ -194,7 +194,7 @@ class Simulate:
     def run(self) -> int:
         from lqrsim.scenarios.references import disturbance_set
         from lqrsim.simulation.uncertainty_of import tube_under
-        from lqrsim.stress.policies import check_designed, make_controller
+        from lqrsim.stress.policies import DEFAULT_DESIGN, DESIGNED, check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
             raise ls.InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
@@ -213,6 +213,8 @@ class Simulate:
         with console.progress("simulating", "step") as progress:
             rollout = ls.simulate(plant, solution, progress=progress, **options)
         console.say(rollout.summary())
+        if self.controller in DESIGNED and self.design_disturbances is None:
+            console.say(f"{self.controller} was designed for {DEFAULT_DESIGN}; for others: --design-disturbances NAME")
         violations = _violations(scenario.problem, rollout)
         for one in (one for one in violations or () if one["trials"]):
             console.say(
