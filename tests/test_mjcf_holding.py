@@ -115,7 +115,7 @@ WEIGHT = 0.5 * 9.81 * 0.15  # N m, of the level link
 )
 def test_too_weak_an_actuator_is_short_by_what_its_limit_leaves(joint: str, actuator: str) -> None:
     robot = ls.MjcfRobot(scene_from_xml(pendulum(actuator, joint), "weak"))
-    assert f"; turn falls short by {WEIGHT - 0.4:.3g} N m" in str(robot)
+    assert f"; turn is not held: {WEIGHT - 0.4:.3g} N m are missing" in str(robot)
     assert robot._held(robot.at()).missed == pytest.approx([-(WEIGHT - 0.4)], rel=1e-6)
 
 

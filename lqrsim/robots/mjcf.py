@@ -433,7 +433,7 @@ class MjcfRobot(Robot):
         unit = "N m" if space.units[worst] == "rad" else "N"
         short = "".join(f"; {drifting}" for drifting in self._drifting(held))
         if not held.held and not short:
-            short = f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {unit}"
+            short = f"; {space.names[worst]} is not held: {abs(held.missed[worst]):.3g} {unit} are missing"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",
