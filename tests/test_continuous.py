@@ -278,7 +278,7 @@ class TestEndings:
         assert found.status in (Status.NOT_FINITE, Status.DIVERGED, Status.NOT_POSITIVE_DEFINITE)
         assert " of iteration " in found.detail
         assert " s: " in found.detail
-        assert found.status.remedy in str(found)
+        assert found.remedy in str(found)
 
     def test_a_cost_without_a_minimum(self) -> None:
         found = smooth_continuous(scalar(bonus=1.0))

@@ -219,7 +219,12 @@ def test_problems_without_a_minimum() -> None:
     assert found.status is Status.NOT_POSITIVE_DEFINITE
     assert found.detail == "total cost, at 0 s: S + Sbar is not positive definite"
     assert np.isnan(found.cost)
-    assert "remedy" in str(found)
+    assert found.remedy in str(found)
+    for shorter in (1.0, 0.5):
+        assert smooth_lq_continuous(escaping, horizon=shorter, initial=UNIT, final=UNIT).remedy == ""
+    heavier = Stage(A=[[0.0]], B=[[1.0]], R=[[1.0]], Q=[[1.0]])
+    assert smooth_lq_continuous(heavier, horizon=5.0, initial=UNIT, final=UNIT).success
+    assert smooth_lq_continuous(STAGE, horizon=1.0, initial=UNIT, final=none).success
 
 
 def test_times_come_in_any_shape() -> None:

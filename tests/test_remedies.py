@@ -260,6 +260,31 @@ def test_what_the_summary_of_a_success_advises_helps() -> None:
         assert advice not in second.summary()
 
 
+def escaping(pull: float, *, paid: float = 0.0) -> ls.Problem:
+    """x' = pull x^3 + u from 1, which is infinite after 1 / (2 pull) seconds under no control."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [p.pull * x[0] ** 3 + u[0]], states={"x": "m"}, controls={"u": "m/s"}, parameters={"pull": pull}
+    )
+    return ls.Problem(
+        dynamics=dynamics, dt=0.05, steps=20, initial=ls.QuadraticCost([1.0], about=[1.0]),
+        stage_cost=ls.ControlCost([1.0]) + ls.SymbolicCost(lambda x, u, p: -p.paid * u.u**2, parameters={"paid": paid}, convex=True),
+        final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+    )  # fmt: skip
+
+
+def test_remedies_in_continuous_time() -> None:
+    lost = ls.lq.smooth_continuous(escaping(3.0))
+    assert lost.remedy == "solve with smooth, whose steps only lower the cost"
+    assert ls.smooth(escaping(3.0)).success
+    paid = ls.lq.smooth_continuous(escaping(0.1, paid=2.0))
+    assert paid.remedy == "raise the control weight"
+    assert ls.lq.smooth_continuous(escaping(0.1)).success
+    early = ls.lq.smooth_continuous(escaping(0.1), max_iterations=1)
+    assert early.remedy == "raise max_iterations"
+    for found in (lost, paid, early):
+        assert f"  remedy:    {found.remedy}" in str(found)
+
+
 def test_each_status_that_is_no_success_has_a_case() -> None:
     untried = {
         Status.INTERRUPTED,  # below

@@ -175,7 +175,7 @@ def remedy_of(
     status = found.status
     lost = status in (Status.NOT_FINITE, Status.NOT_POSITIVE_DEFINITE, Status.DIVERGED)
     if lost and options.get("safeguard") is False:
-        return "solve with safeguard=True, whose steps only ever lower the cost"
+        return "solve with safeguard=True, whose steps only lower the cost"
     if shorter or status.success or found.remedy:
         return shorter or found.remedy
     if inside := problem.goal_inside:

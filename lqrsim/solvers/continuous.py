@@ -23,7 +23,9 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.initial_guess import InitialPrior
+from lqrsim.solvers.linear_quadratic import WEIGH_MORE
 from lqrsim.solvers.riccati_ode import (
+    FLAT,
     NO_MINIMUM,
     IntegrationFailure,
     Model,
@@ -48,12 +50,14 @@ class ContinuousSolution:
     Attributes:
       status: how the solve ended; only CONVERGED is success.
       detail: the pass, the time and the reason if the solve failed.
+      remedy: what to try then.
       horizon: the paper's l, in seconds.
       iterations: the log of the iterations; empty for a linear-quadratic problem, which needs none.
     """
 
     status: Status
     detail: str
+    remedy: str
     horizon: Positive
     iterations: tuple[Iteration, ...] = ()
     _backward: Pass | None = field(repr=False, compare=False)
@@ -106,8 +110,8 @@ class ContinuousSolution:
             lines = [f"{self.status.name}: a linear-quadratic problem is solved by one pass each way"]
         if self.detail:
             lines.append(f"  detail:    {self.detail}")
-        if self.status.remedy:
-            lines.append(f"  remedy:    {self.status.remedy}")
+        if self.remedy:
+            lines.append(f"  remedy:    {self.remedy}")
         line = f"  cost:      {self.cost:.9g}"
         if self.iterations:
             line += f"   gap: {self.iterations[-1].gap:.1e}   optimality: {self.iterations[-1].optimality:.1e}"
@@ -198,7 +202,10 @@ def smooth_lq_continuous(
         _check_minimum(backward, forward)
     except IntegrationFailure as failure:
         status, detail = failure.status, _at(where, failure)
-    return ContinuousSolution(status=status, detail=detail, horizon=horizon, _backward=backward, _forward=forward)
+    return ContinuousSolution(
+        status=status, detail=detail, remedy="" if status.success else WEIGH_MORE, horizon=horizon,
+        _backward=backward, _forward=forward,
+    )  # fmt: skip
 
 
 def _model(stage: Stage, n: int, m: int) -> Model:
@@ -294,9 +301,13 @@ def smooth_continuous(
     if (error := interrupt_of(functions)) is not None:
         raise error
     raised = raised_by(functions)
+    remedy = status.remedy
+    if status not in (Status.CONVERGED, Status.MAX_ITERATIONS):
+        remedy = "raise the control weight" if FLAT in detail else "solve with smooth, whose steps only lower the cost"
     return ContinuousSolution(
-        status=status, detail=f"{detail}; {raised}" if detail and raised else detail, horizon=solver.system.horizon,
-        iterations=tuple(iterations), _backward=solver.backward, _forward=solver.forward,
+        status=status, detail=f"{detail}; {raised}" if detail and raised else detail, remedy=remedy,
+        horizon=solver.system.horizon, iterations=tuple(iterations),
+        _backward=solver.backward, _forward=solver.forward,
     )  # fmt: skip
 
 

@@ -19,6 +19,8 @@ from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.versions import versions
 
+WEIGH_MORE = "raise the weights of states or controls, or shorten the horizon: the cost has no single minimum"
+
 
 @checked
 def smooth_lq(
@@ -74,7 +76,7 @@ def smooth_lq(
     return Solution(
         status=Status.CONVERGED if solved else Status.NOT_POSITIVE_DEFINITE,
         detail=detail,
-        remedy="" if solved else Status.NOT_POSITIVE_DEFINITE.remedy,
+        remedy="" if solved else WEIGH_MORE,
         policy=_policy(*passes.policy, states[:-1].copy(), dt),
         inverse_policy=_policy(*passes.smoothing[2:], states[1:].copy(), dt) if whole and form == "primal" else None,
         cost_to_go=Quadratic(*passes.to_go) if solved else None,

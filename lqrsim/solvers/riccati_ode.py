@@ -27,7 +27,7 @@ from lqrsim.results.solution_parts import Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialPrior
 
-NO_MINIMUM = "S + Sbar is not positive definite"
+NO_MINIMUM, FLAT = "S + Sbar is not positive definite", "R is not positive definite"
 
 # Largest number of evaluations of one right-hand side, a few seconds. A trajectory that needs more diverges or is far
 # too stiff.
@@ -145,9 +145,7 @@ def riccati_pass(
         _, law, info = dposv(R, push)
         if info != 0:
             good = np.isfinite(R).all() and np.isfinite(push).all()
-            raise IntegrationFailure(
-                Status.NOT_POSITIVE_DEFINITE if good else Status.NOT_FINITE, "R is not positive definite", t
-            )
+            raise IntegrationFailure(Status.NOT_POSITIVE_DEFINITE if good else Status.NOT_FINITE, FLAT, t)
         drift = sign * (F.T @ V)
         return V, H + drift + drift.T - push.T @ law, -law
 
