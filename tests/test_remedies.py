@@ -238,6 +238,30 @@ def test_a_solution_of_a_similar_problem_takes_less_time(of: ls.Problem, monkeyp
     assert ls.smooth(of, time_limit=needed - 1.5, callback=tick, start=similar).success
 
 
+def pump(**about: float) -> ls.Problem:
+    """z flows only while both valves are open, and w not at all."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [u[0] * u[0] * u[1], 0 * x[1]], states={"z": "m", "w": "m"}, controls={"a": "", "b": ""}
+    )
+    return ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=15, initial=ls.FixedState(np.zeros(2)), stage_cost=ls.ControlCost(np.ones(2)),
+        final_cost=ls.QuadraticCost(dict.fromkeys(about, 100.0), about=about),
+    )  # fmt: skip
+
+
+def test_a_goal_that_no_control_comes_nearer_to() -> None:
+    beyond = ls.smooth(pump(z=1.0, w=1.0))
+    assert beyond.remedy == "leave w out of the goal, which no control that was tried changes"
+    assert ls.smooth(pump(z=1.0)).remedy == ""
+    shut = ls.smooth(pump(z=1.0), start=[0.0, 0.0], safeguard=False)
+    assert shut.status is Status.STALLED
+    assert shut.remedy == "begin with start=[...], controls that change z"
+    opened = ls.smooth(pump(z=1.0), start=[0.5, 0.5])
+    assert opened.success
+    assert opened.remedy == ""
+    assert opened.cost < shut.cost
+
+
 def test_what_the_summary_of_a_success_advises_helps() -> None:
     """Coarse steps, bounds that are exceeded between knots, and goals that are missed with and without limits."""
     bounded = problem(
@@ -267,7 +291,8 @@ def escaping(pull: float, *, paid: float = 0.0) -> ls.Problem:
     )
     return ls.Problem(
         dynamics=dynamics, dt=0.05, steps=20, initial=ls.QuadraticCost([1.0], about=[1.0]),
-        stage_cost=ls.ControlCost([1.0]) + ls.SymbolicCost(lambda x, u, p: -p.paid * u.u**2, parameters={"paid": paid}, convex=True),
+        stage_cost=ls.ControlCost([1.0])
+        + ls.SymbolicCost(lambda x, u, p: -p.paid * u.u**2, parameters={"paid": paid}, convex=True),
         final_cost=ls.QuadraticCost([1.0], about=[0.0]),
     )  # fmt: skip
 

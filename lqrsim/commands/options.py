@@ -136,7 +136,7 @@ SolutionFile = Annotated[
 Folder = Annotated[Path | None, optional("FOLDER")]
 OwnScenario = Annotated[
     str | None,
-    optional("SCENARIO", "The campaign's scenario if it is your own function: files never choose code to run."),
+    optional("SCENARIO", "The scenario, if it is your own function: files never choose code to run."),
 ]
 Json = Annotated[
     FlagCreatePairsOff[bool],

@@ -168,7 +168,7 @@ class Compare:
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """A folder from `lqrsim stress`."""
     other: Annotated[Path | None, optional("FOLDER"), arg(name="with")] = None
-    """Another one. By default the same."""
+    """Folder of the stress test to compare it with. By default the same."""
     policies: Annotated[tuple[str, str] | None, optional("POLICY POLICY")] = None
     """The policy of each. By default each policy with the one of the same name."""
     out: Annotated[Path | None, optional("FILE")] = None

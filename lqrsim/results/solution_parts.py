@@ -65,7 +65,7 @@ class Status(enum.StrEnum):
     """The way in which a solve ended.
 
     Attributes:
-      remedy: what to try; empty for a success.
+      remedy: what to try; empty for CONVERGED.
     """
 
     meaning: str
