@@ -82,11 +82,6 @@ def _run(arguments: list[str]) -> int:
             print(f"lqrsim {version('lqrsim')}")
         return 0
 
-    if limit := _memory_limit():
-        memory = f"{limit / 1e6:.0f} MB of address space (ulimit -v), want at least {LEAST_MEMORY / 1e6:.0f} MB"
-        process.print_error(f"lqrsim: error: memory: got {memory}")
-        return 2
-
     from lqrsim.commands import COMMANDS
 
     if arguments in (["--help"], ["-h"]):
@@ -96,6 +91,11 @@ def _run(arguments: list[str]) -> int:
         raise SystemExit(0)
     with process.printing(), _wide_enough():
         command = _parse(arguments)
+
+    if limit := _memory_limit():
+        memory = f"{limit / 1e6:.0f} MB of address space (ulimit -v), want at least {LEAST_MEMORY / 1e6:.0f} MB"
+        process.print_error(f"lqrsim: error: memory: got {memory}")
+        return 2
 
     from lqrsim.versions import outdated
 

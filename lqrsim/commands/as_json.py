@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import lqrsim as ls
-from lqrsim.results.archive import plain
 
 Object = dict[str, Any]
 
 
 def text_of(value: object) -> str:
     """The JSON text of a result in one line, with numbers at full precision."""
+    from lqrsim.results.archive import plain  # with NumPy, which help does without
+
     return json.dumps(plain(value), allow_nan=False)
 
 
