@@ -211,7 +211,7 @@ def test_a_goal_is_reached_within_a_tenth_of_the_way_of_each_state(one: Any, dat
     lines = target.of_plan(radius)
     assert any("MISSES" in line for line in lines) == bool(misses)
     if not left[list(weighed)].any():
-        assert lines == [f"the plan ends 0 {OF_WAY} from the goal, which is reached within 0.1"]
+        assert lines == [f"the plan ends 0 % {OF_WAY} from the goal, which is reached within 10 %"]
         return
     worst = max(weighed, key=lambda i: abs(left[i]))
     off, allowed = plan[-1, worst] - end[worst], abs(end - start)[worst] / 10

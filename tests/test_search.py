@@ -61,7 +61,7 @@ class TestCandidates:
         dropped = [replace(best, start=f"other {i}", status=None, cost=cost) for i, cost in enumerate(costs)]
         text = replace(drive_solution, candidates=(best, *dropped)).summary()
         said = "which cost 7.5 or more" if min(costs) < np.inf else "for no cost was finite"
-        assert f"; {len(costs)} were dropped, {said}" in text
+        assert f"; {len(costs)} {'was' if len(costs) == 1 else 'were'} dropped, {said}" in text
         assert " inf" not in text
 
     def test_the_same_bits_however_they_are_run(self, differential_drive, drive_solution) -> None:

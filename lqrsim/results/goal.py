@@ -202,8 +202,11 @@ class Target:
         return TOLERANCE * way if STAYS * radius < way <= near else radius
 
     def describe(self, distance: float) -> str:
-        """A distance as text: "0.1 m from the goal"."""
-        return f"{distance:.3g} {self.unit} from the {self.name}"
+        """A distance as text: "0.1 m from the goal", "10 % of the way from the goal"."""
+        return f"{self._measured(distance)} from the {self.name}"
+
+    def _measured(self, distance: float) -> str:
+        return f"{distance:.3g} m" if self.places else f"{100 * distance:.3g} % {OF_WAY}"
 
     def misses(self, radius: float | None) -> bool:
         """Whether the plan ends outside the radius; False if the radius is not known."""
@@ -217,7 +220,9 @@ class Target:
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
-        within = "" if radius is None else f", which is reached within {radius:.3g}{' m' if self.places else ''}"
+        within = (
+            "" if radius is None else f", which is reached within {self._measured(radius).removesuffix(f' {OF_WAY}')}"
+        )
         worst = self.worst(self.plan[-1], radius)
         lines = [f"the plan ends {self.describe(away)}{within}{f': {worst}' if worst else ''}"]
         if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):

@@ -222,11 +222,13 @@ class Solution(Plan):
         lines = [f"the plan is from the start {best!r}, one of {len(self.candidates)}"]
         if dropped:
             why = f"which cost {min(dropped):.6g} or more" if np.isfinite(min(dropped)) else "for no cost was finite"
-            lines[0] += f"; {len(dropped)} were dropped, {why}"
+            lines[0] += f"; {len(dropped)} {'was' if len(dropped) == 1 else 'were'} dropped, {why}"
         if (total := sum(candidate.iterations for candidate in self.candidates)) > len(self.iterations):
             lines[0] += f"; {total} iterations in all"
         others = [one for one in ended if one.start != best]
-        return lines + [f"{one.start} ended {one.status and one.status.name} at {one.cost:.6g}" for one in others]
+        costs = [f" at a cost of {one.cost:.6g}" if np.isfinite(one.cost) else "" for one in others]
+        ends = zip(others, costs, strict=True)
+        return lines + [f"{one.start} ended {one.status and one.status.name}{cost}" for one, cost in ends]
 
     __str__ = summary
 

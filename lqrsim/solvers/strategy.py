@@ -684,7 +684,7 @@ class Search:
         found = finish(choose(runs, self._threads)[0], Known())
         if not found.success or self._budget.stop.due:
             return
-        begin = policy_of(found, "a plan without a risk")
+        begin = policy_of(found, "a plan without risk")
         run = self._add(replace(begin, cost_to_go=found.values["cost_to_go"], multipliers=found.multipliers))
         result = self._finish(run)
         # Of plans whose risk is too high, this one is near an optimum.

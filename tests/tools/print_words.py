@@ -1,6 +1,7 @@
 """Prints all sentences of the package that a user may read, by kind and place, so that a person can read them through.
 
-Kinds: `status` (meanings and remedies), `warning`, `error`, `say` (details, summaries, progress, figures), `help`.
+Kinds: `status` (meanings and remedies), `solve` (summaries of the solves of tests/test_remedies.py), `warning`, `error`,
+`say` (details, summaries, progress, figures), `help`.
 Values that are filled in are shown as `{}`. Run it as `python tests/tools/print_words.py [KIND ...]`.
 """
 
@@ -15,8 +16,8 @@ import lqrsim
 from lqrsim import cli
 from lqrsim.commands import COMMANDS
 
-PACKAGE = Path(lqrsim.__file__).parent
-KINDS = ("status", "warning", "error", "say", "help")
+PACKAGE, TESTS = Path(lqrsim.__file__).parent, Path(__file__).parents[1]
+KINDS = ("status", "solve", "warning", "error", "say", "help")
 CODE = ("kernels", "codegen")  # rooms with programs as texts, of which only errors and warnings are read by users
 
 
@@ -32,7 +33,10 @@ def main() -> int:
             if kind != "say" or place.parts[0] not in CODE:
                 found[kind].append(f"{place}:{line}: {text}")
     found["status"] += [f"{one.name}: {one.meaning} | {one.remedy}" for one in lqrsim.Status]
-    found["help"] += helps()
+    if "help" in kinds:
+        found["help"] += helps()
+    if "solve" in kinds:
+        found["solve"] += solves()
     for kind in kinds:
         print(f"== {kind}", *found[kind], "", sep="\n")
     return 0
@@ -73,6 +77,14 @@ def helps() -> list[str]:
             cli.main([*command.split(), "--help"])
         found.append(said.getvalue())
     return found
+
+
+def solves() -> list[str]:
+    """What is printed of solves that fail, each with its name."""
+    sys.path[:0] = [str(TESTS), str(TESTS / "helpers")]
+    from test_remedies import CASES
+
+    return [f"{name}:\n{case.solver(case.of, **case.options)}\n" for name, case in CASES.items()]
 
 
 if __name__ == "__main__":
