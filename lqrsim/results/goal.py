@@ -220,9 +220,8 @@ class Target:
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
-        within = (
-            "" if radius is None else f", which is reached within {self._measured(radius).removesuffix(f' {OF_WAY}')}"
-        )
+        near = "" if radius is None else self._measured(radius).removesuffix(f" {OF_WAY}")
+        within = f", which is reached within {near}" if near else ""
         worst = self.worst(self.plan[-1], radius)
         lines = [f"the plan ends {self.describe(away)}{within}{f': {worst}' if worst else ''}"]
         if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):

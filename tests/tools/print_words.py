@@ -1,7 +1,7 @@
 """Prints all sentences of the package that a user may read, by kind and place, so that a person can read them through.
 
-Kinds: `status` (meanings and remedies), `solve` (summaries of the solves of tests/test_remedies.py), `warning`, `error`,
-`say` (details, summaries, progress, figures), `help`.
+Kinds: `status` (meanings and remedies), `solve` (summaries of the solves of tests/test_remedies.py), `warning`,
+`error`, `say` (details, summaries, progress, figures), `help`.
 Values that are filled in are shown as `{}`. Run it as `python tests/tools/print_words.py [KIND ...]`.
 """
 
