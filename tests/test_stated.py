@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from sampling import is_short
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -136,7 +137,11 @@ def test_the_file_of_a_stated_disturbance_of_ones_own_is_hashed_too() -> None:
 def test_a_design_is_made_for_what_the_summary_says(differential_drive: ls.Scenario, tmp_path: Path) -> None:
     """Laws that are made by hand for the same disturbances run the same trials, bit for bit."""
     campaign = replace(
-        CAMPAIGN, policies=("track", "track_per_cell"), strengths=(0.0, 4.0), trials=2, design_disturbances=None
+        CAMPAIGN,
+        policies=("track", "track_per_cell"),
+        strengths=(4.0,) if is_short() else (0.0, 4.0),
+        trials=2,
+        design_disturbances=None,
     )
     results = ls.stress.run_campaign(campaign, tmp_path / "here", workers=0)
     plant, solution = differential_drive.plant(), results.solution("track_per_cell")
