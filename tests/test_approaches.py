@@ -82,7 +82,7 @@ def test_an_arm_pushes_a_puck_away_and_back(mass: float) -> None:
 
 
 @pytest.mark.usefixtures("no_further")
-@pytest.mark.parametrize("mass", [0.4, *rarely(0.2, 0.8)])
+@pytest.mark.parametrize("mass", rarely(0.2, 0.4, 0.8))  # sixteen states, of which no other test has as many
 def test_a_foot_kicks_a_ball(mass: float) -> None:
     robot = robot_of(LEG, mass)
     problem = stated(robot, robot.settled(robot.at(hip=0.3, knee=0.3)), 40, 1e-4, body_x=1.0)

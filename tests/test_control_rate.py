@@ -17,7 +17,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.solvers.control_rates import bounding_cost, feedback
 
-SIZES = [(2, 1), (1, 2)]  # states and controls
+SIZES = [(2, 1), (2, 2)]  # states and controls
 
 
 def drawn(rng: np.random.Generator, n: int, m: int, steps: int = 8) -> Linear:
