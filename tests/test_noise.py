@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sampling import examples
 from scipy.linalg import block_diag
@@ -276,6 +276,46 @@ def test_noise_without_bounds_is_never_left_out_of_the_cost(power: float, solver
         wanted = quiet.cost + 0.5 * np.float64(10.0**power) ** 2 * np.trace(quiet.cost_to_go.hessian[1:].sum(axis=0))
     assert loud.cost == (pytest.approx(wanted, rel=1e-6) if np.isfinite(wanted) else np.inf)
     assert np.isfinite(loud.cost) or not loud.success
+
+
+@settings(max_examples=examples(8))
+@given(power=st.floats(0, 30), constant=st.booleans(), solver=st.sampled_from([ls.smooth, ls.ilqr]))
+@example(power=20.0, constant=True, solver=ls.ilqr)
+@example(power=15.0, constant=False, solver=ls.ilqr)
+def test_no_plan_is_optimal_because_a_cost_dwarfs_it(power: float, constant: bool, solver: Any) -> None:
+    """Noise on a state that no control changes, or a constant, adds to the cost and changes nothing of the best plan.
+
+    The plan's own cost is compared with a minimiser's over the controls: to iLQR's tolerance of 1e-4, with a margin for
+    what the prediction of a decrease is off. It is relative to the whole cost, or to the least own cost where the whole
+    has no digits left for that.
+    """
+
+    def motion(x: Any, u: Any, p: Any) -> list[Any]:
+        from sympy import sin
+
+        return [x.a + sin(u.f), p.growth * x.b, x.c / 2 + u.g]
+
+    def own(controls: Array) -> float:
+        a, total = 2.0, 0.5 * float(controls @ controls)
+        for f in controls:
+            total += 0.05 * a**2
+            a += np.sin(f)
+        return total + 5 * a**2
+
+    growth, added = (0.5, 10.0**power) if constant else (10.0 ** (power / 5), 0.0)
+    dynamics = ls.Dynamics(
+        motion, states=dict.fromkeys("abc", "m"), controls=dict.fromkeys("fg", "m"), parameters={"growth": growth},
+        period=1.0,
+    )  # fmt: skip
+    stage = ls.ControlCost([1.0, 1.0]) + ls.QuadraticCost([0.1, 1.0, 1.0], about=[0.0, 0.0, 0.0])
+    problem = ls.Problem(
+        dynamics=dynamics, dt=1.0, steps=STEPS, initial=ls.FixedState([2.0, 0.0, 0.0]),
+        stage_cost=stage + ls.SymbolicCost(lambda x, u, p: p.added, parameters={"added": added}),
+        final_cost=ls.QuadraticCost([10.0, 1.0, 1.0], about=[0.0, 0.0, 0.0]), noise=ls.Noise(np.diag([0.0, 1.0, 0.0])),
+    )  # fmt: skip
+    solution, least = solver(problem), minimize(own, np.full(STEPS, -0.2)).fun
+    size = solution.cost if solution.cost < 1e16 else least
+    assert not solution.success or own(solution.trajectory.controls[:, 0]) <= least + 1e-2 * size
 
 
 def of(noise: Any, *, risk: float = 0.0) -> ls.Problem:

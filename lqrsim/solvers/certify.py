@@ -92,7 +92,9 @@ def certificate_of(
         start = float(np.abs(states[0] - problem.initial.numbers).max())
     if not np.isfinite(cost):
         decrease = np.inf
-    least = max(abs(cost), least, TYPICAL * typical, 1e-26 * scale, 1e-300)
+    # A cost in whose rounding typical changes are lost, as of noise that no control damps, says nothing about them.
+    whole = typical if 0 < typical < REST * abs(cost) else abs(cost)
+    least = max(whole, least, TYPICAL * typical, 1e-26 * scale, 1e-300)
     optimality = decrease / least if np.isfinite(decrease) else np.inf
     return Certificate(
         cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),
