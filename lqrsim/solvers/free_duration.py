@@ -40,9 +40,11 @@ MOST = 300  # largest number of iterations
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 # A sketch with a free duration whose cost is this many times that of the best plan leads to no better one.
 PROMISING = 1.1
-# Fixed durations of the sketches, relative to the stated one; the largest number of iterations of a sketch, its
-# tolerance, that of constraints in their units, and that of what is worth going on from, violations and gaps.
-SKETCHED, SKETCH, ROUGH, KEPT, WORTH = (1.0, 2.0), 100, 1e-2, 1e-4, 1e-2
+# Durations from which ways are sketched, relative to the stated one, and whether they are free then: each where none
+# before has led to a plan. The largest number of iterations of a sketch, its tolerance, that of constraints in their
+# units, and that of what is worth going on from, violations and gaps.
+SKETCHED = (1.0, True), (1.5, True), (0.25, True), (1.0, False), (2.0, False)
+SKETCH, ROUGH, KEPT, WORTH = 100, 1e-2, 1e-4, 1e-2
 FREED = Barrier(1.0, 0.02, near=False)  # beginning of the interior point from another plan
 # Tolerance of the search for durations of segments: their ends go to whole knots, one in some hundred.
 NEAR_SEGMENTS = 1e-4
@@ -105,17 +107,24 @@ class DurationSearch:
         with stop.not_counting():  # compiling
             stages = Stages(stated)
             free = with_duration(problem)
-        sketches = list[Sketch]()
-        for way in ways(stated, stages):
-            with stop.reporting("smooth", self._attentive), stop.heeding():
-                made = self._sketched(way, free)
-                self._total += made.iterations
-                if np.isfinite(made.cost):
-                    sketches.append(made)
-                else:
-                    self.candidates.append(Candidate(made.name, np.inf, made.iterations, None, made.plan))
-            if stop.due:
-                return
+        found, sketches = list(ways(stated, stages)), list[Sketch]()
+        spent = dict.fromkeys((way.name for way in found), 0)
+        for share, freed in SKETCHED:
+            for way in found:
+                with stop.reporting("smooth", self._attentive), stop.heeding():
+                    made = self._sketched(way, share, free if freed else None)
+                    self._total += made.iterations
+                    spent[way.name] += made.iterations
+                    if np.isfinite(made.cost):
+                        sketches.append(made._replace(iterations=spent[way.name]))
+                if stop.due:
+                    return
+            if sketches:
+                break
+        far = spent.keys() - {one.way for one in sketches}
+        self.candidates += (
+            Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in found if way.name in far
+        )
         for made in sorted(sketches, key=lambda one: one.cost):
             if stop.due:
                 return
@@ -124,22 +133,16 @@ class DurationSearch:
             else:
                 self._follow(made.name, made.plan)
 
-    def _sketched(self, way: Way, free: Problem) -> "Sketch":
-        """What a few iterations make of a way: with a free duration or, where this fails, with some fixed ones."""
-        problem, price, stop = self._problem, self._settings.price, self._stop
-        stated = problem.steps * problem.dt
-        fixed = settled(problem, stated)
-        made = sketch(fixed, way.over(fixed), price, stop, free)._replace(name=way.name)
-        for duration in dict.fromkeys(float(np.clip(share * stated, *self._range)) for share in SKETCHED):
-            if np.isfinite(made.cost) or stop.due:
-                break
-            fixed = settled(problem, duration)
-            other = sketch(fixed, way.over(fixed), price, stop)
-            made = other._replace(
-                name=f"{way.name}, {duration:g} s", cost=other.cost + problem.time_weight * duration,
-                iterations=made.iterations + other.iterations,
-            )  # fmt: skip
-        return made
+    def _sketched(self, way: Way, share: float, free: Problem | None) -> "Sketch":
+        """What a few iterations make of a way in a share of the stated duration, which is free or fixed."""
+        problem = self._problem
+        duration = float(np.clip(share * problem.steps * problem.dt, *self._range))
+        fixed = settled(problem, duration)
+        made = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
+        if free is not None:
+            return made._replace(name=way.name, way=way.name)
+        cost = made.cost + problem.time_weight * duration
+        return made._replace(name=f"{way.name}, {duration:g} s", way=way.name, cost=cost)
 
     def grow_trees(self) -> None:
         """Grow trees while no plan is known, and go on from the ways through them."""
@@ -302,13 +305,14 @@ class Sketch(NamedTuple):
 
     Attributes:
       plan: the plan. cost: its cost, infinite if it is far from the constraints. iterations: their number.
-      free: whether the duration was free. name: that of the way.
+      free: whether the duration was free. way: its name. name: the same, with the duration where that was fixed.
     """
 
     plan: Trajectory
     cost: float
     iterations: int
     free: bool
+    way: str = ""
     name: str = ""
 
 

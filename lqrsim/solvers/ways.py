@@ -20,7 +20,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.solvers.multistart import passable
+from lqrsim.solvers.multistart import bends, passable
 from lqrsim.solvers.stages import Stages
 
 CELLS = {2: 100, 3: 36}  # of the grid, along its longest side, in the plane and in space
@@ -34,6 +34,7 @@ ROUND = 20  # a path's corners are rounded over this part of the steps
 TURNED = 0.7  # rad by which all angles are turned, to see whether the motion turns with them
 SAME = 1e-6  # relative difference of two motions that are the same but for rounding
 SIDEWAYS = 0.05  # sideways part of the motion of a robot that drives along its heading
+LARGE, AXES = np.pi / 2, 4  # rad, turn of a rotation vector from which on other axes are tried, and their number
 RATE = 0.1  # relative error of the derivative of a state that still counts as another state
 SHORT = 1e-3  # of a control period, over which derivatives are taken
 
@@ -90,6 +91,7 @@ def ways(problem: Problem, stages: Stages) -> Iterator[Way]:
             states[:, i] = np.unwrap(np.append(start[i], angle))
         yield Way(f"{name}, {'backwards' if backwards else 'forwards'}", states)
     yield from (Way(f"a line of states, {which}", line + turns) for which, turns in turned.items())
+    yield from _other_axes(problem, line)
 
 
 def _whole_turns(problem: Problem, headings: Headings, goal: Array) -> Iterator[tuple[str, Array]]:
@@ -107,6 +109,18 @@ def _whole_turns(problem: Problem, headings: Headings, goal: Array) -> Iterator[
         sides = [(goal[i] + turn, *one[i]) for one in bounds for i in group if i in one]
         if group and all(np.min(low) <= at <= np.max(high) for at, low, high in sides):
             yield f"a turn {word} of {' and '.join(names[i] for i in group)}", turns
+
+
+def _other_axes(problem: Problem, line: Array) -> Iterator[Way]:
+    """Lines of states along which a large turn of a rotation vector also leads about other axes."""
+    names, share = problem.dynamics.state_coordinates.names, np.linspace(0, np.pi, len(line))[:, None]
+    for first in problem.dynamics.state_coordinates.rotation_vectors:
+        turn = (line[-1] - line[0])[first : first + 3]
+        if np.linalg.norm(turn) > LARGE:
+            for name, bend in bends(turn, 1 + AXES, ring=0.5, unit="rad")[1:]:
+                states = line.copy()
+                states[:, first : first + 3] += np.sin(share) * bend
+                yield Way(f"a line of states, {names[first]} {name}", states)
 
 
 def _rates(problem: Problem) -> list[tuple[int, int]]:
