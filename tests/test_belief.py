@@ -1,5 +1,7 @@
 """Beliefs: against LQG in closed form, an extended Kalman filter of matrices, differences, and drawn runs."""
 
+import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +16,8 @@ import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Status
+from lqrsim.simulation.uncertainty_of import tube_under
+from lqrsim.view.figure_parts import accuracy
 
 DT = 0.1
 A, B = np.array([[1.0, DT], [-0.3, 0.9]]), np.array([[0.0, 0.1], [DT, 0.3]])
@@ -110,6 +114,36 @@ def test_the_predicted_covariance_is_that_of_drawn_runs() -> None:
     variances = np.diag(expected)
     errors = np.sqrt((np.outer(variances, variances) + expected**2) / trials)
     assert (np.abs(found - expected) < 4.5 * errors).all()
+
+
+def test_the_tube_of_a_linear_system_is_that_of_lqg() -> None:
+    """Covariances of state, command and error, by the recursion of state and error; to rounding."""
+    of, steps = linear_belief(), 20
+    first = of.state([1.0, -0.5], START[:2, :2])
+    weights = of.uncertainty({"x": 2.0, "v": 1.0})
+    problem = ls.Problem(
+        dynamics=of, dt=DT, steps=steps, initial=ls.FixedState(first), noise=of.innovations,
+        stage_cost=ls.QuadraticCost({"x": 2.0, "v": 1.0} | weights, about={}) + ls.ControlCost([0.5, 0.3]),
+        final_cost=ls.QuadraticCost({"x": 2.0}, about={}),
+    )  # fmt: skip
+    solution = ls.smooth(problem)
+    tube, gains = ls.predict_tube(problem, solution), solution.policy.gain[:, :, :2]
+    covariance, known = np.kron([[1.0, 1.0], [1.0, 1.0]], START[:2, :2]), START[:2, :2]  # of state and error
+    for t, gain in enumerate(gains):
+        np.testing.assert_allclose(tube.covariance[t], covariance[:2, :2], atol=1e-12)
+        law = np.hstack([gain, -gain])
+        np.testing.assert_allclose(tube.command[t] ** 2, np.diag(law @ covariance @ law.T), atol=1e-12)
+        predicted = A @ known @ A.T + M @ M.T
+        kalman = predicted @ H.T @ np.linalg.inv(H @ predicted @ H.T + np.diag(R**2))
+        kept = np.eye(2) - kalman @ H
+        moves = np.block([[A + B @ gain, -B @ gain], [np.zeros((2, 2)), kept @ A]])
+        noise = np.block([[M, np.zeros((2, 2))], [kept @ M, -kalman * R]])
+        np.testing.assert_allclose(tube.across[t], (moves @ covariance)[:2, :2], atol=1e-12)
+        covariance, known = moves @ covariance @ moves.T + noise @ noise.T, kept @ predicted
+        assert tube.estimate_covariance is not None
+        np.testing.assert_allclose(tube.estimate_covariance[t + 1], predicted, atol=1e-12)
+    with pytest.raises(ls.InputError, match="in belief space, want none"):
+        ls.predict_tube(problem, solution, ls.disturbances.Uncertainty())
 
 
 def test_what_is_no_belief_is_refused() -> None:
@@ -246,3 +280,49 @@ def test_the_filter_in_the_loop_is_as_good_as_it_says() -> None:
     np.testing.assert_array_equal(alone.states[0], run.states[7])
     exact = ls.simulate(scenario.plant(), controller=law, frames=False)
     np.testing.assert_allclose(exact.states[0], plan.trajectory.states[:, :3], atol=0.02)
+
+
+def belief_scenario() -> ls.Scenario:
+    """The packaged drive along a wall, with what a run meets."""
+    scenario = ls.scenarios.differential_drive()
+    problem = drive(scenario)
+    of = problem.dynamics
+    assert isinstance(of, ls.belief.Belief)
+    met = (ls.disturbances.InitialStateError(0.1), ls.disturbances.StateNoise(of.process), ls.belief.ReadingErrors(of))
+    return dataclasses.replace(scenario, name="along a wall", problem=problem, disturbances=met, goal_radius=0.1)
+
+
+def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> None:
+    """Outcomes are those of `simulate`; formulas of disturbances are those of the scenario. Sensors are drawn."""
+    setup = ls.stress.Setup(f"{__file__}:belief_scenario")
+    campaign = ls.stress.Campaign.of_sets(setup, ["scenario"], strengths=(1.0,), policies=("smooth",), trials=20)
+    results = ls.stress.run_campaign(campaign, tmp_path / "runs", workers=0, batch=7)
+    scenario, cell = setup.resolved, results.cells[0]
+    solution = results.trials.solutions["smooth"]
+    law = ls.belief.BeliefFeedback(scenario.problem, solution)
+    options: dict[str, Any] = {"goal_radius": 0.1, "disturbances": scenario.disturbances}
+    run = ls.simulate(scenario.plant(), controller=law, trials=20, frames=False, contacts=False, **options)
+    found = results.outcomes(cell)
+    assert found.outcome.tolist() == list(run.outcome)
+    assert 0 < results.tally(cell)["reached"] < 20
+    whole = found.outcome != "collided"
+    np.testing.assert_array_equal(found.goal[whole], run.goal_distance[whole])
+    stored = ls.stress.Results(tmp_path / "runs", scenario=setup.scenario)
+    assert ls.stress.replay(stored, cell, 3).outcome == (run.outcome[3],)
+    others = "track", "offset_free", "replan"
+    for policy in others:
+        with pytest.raises(ls.InputError, match="planned in belief space"):
+            ls.stress.run_campaign(dataclasses.replace(campaign, policies=(policy,)), tmp_path / policy)
+    tube, one = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)[0], law.plan
+    assert tube is not None
+    alone = tube.added_to(ls.simulate(scenario.plant(), controller=law, **options))
+    of, world = law.belief, scenario.scene.world
+    ls.view.plot_run(one, {"disturbed": alone}, tmp_path / "run.svg", world=world, belief=of)
+    ls.view.plot_policy(solution, tmp_path / "policy.svg", world=world, tube=tube, belief=of)
+    for name in ("run", "policy"):
+        assert "by readings alone" in (tmp_path / f"{name}.svg").read_text()
+    states = np.array([[0.3, 0.4, 0.0], [-1.0, 2.0, 1.0]])  # whose distances to the beacons have unit gradients in part
+    apart = states[:, None, :2] - [[-2.0, 0.0], [2.0, 0.0]]
+    distance = np.sqrt(np.square(apart).sum(axis=2) + 0.01)
+    information = np.square(np.linalg.norm(apart, axis=2) / distance / (0.05 * (0.1 + distance))).sum(axis=1)
+    np.testing.assert_allclose(accuracy(of, states), np.sqrt(2 / information), rtol=1e-7)

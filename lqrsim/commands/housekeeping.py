@@ -37,8 +37,10 @@ class Demo:
     json: Json = False
 
     def run(self) -> int:
+        from lqrsim.control.belief_feedback import BeliefFeedback
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
         from lqrsim.simulation.uncertainty_of import tube_under
+        from lqrsim.stress.policies import make_controller
         from lqrsim.view import cameras, gl
 
         console.check_output("--out", self.out)
@@ -59,17 +61,20 @@ class Demo:
             tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
             if remark:
                 console.say(remark)
+            law = make_controller("feedback", scenario, solution)
+            plan, belief = (law.plan, law.belief) if isinstance(law, BeliefFeedback) else (solution, None)
             world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)
             if solution.cost_to_go is not None:
                 path = folder / "policy.png"
-                console.wrote(ls.view.plot_policy(solution, path, world=world, radius=radius, tube=tube))
+                shown = {"world": world, "radius": radius, "tube": tube, "belief": belief}
+                console.wrote(ls.view.plot_policy(solution, path, **shown))
             if not solution.success:
                 failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
             runs = dict[str, ls.Rollout]()
             for name, disturbances in {"undisturbed": (), "disturbed": scenario.disturbances}.items():
                 options = {"disturbances": disturbances, "seed": self.seed, **scenario.near_enough()}
                 with console.progress("simulating", "step") as progress:
-                    rollout = ls.simulate(scenario.plant(), solution, progress=progress, **options)
+                    rollout = ls.simulate(scenario.plant(), plan, controller=law, progress=progress, **options)
                 console.say(rollout.summary())
                 runs[name] = tube.added_to(rollout) if tube is not None and name == "disturbed" else rollout
                 console.wrote(ls.save(runs[name], folder / f"{name}.npz"))
@@ -79,7 +84,7 @@ class Demo:
             if not worst <= scenario.tracking_bound:  # also true for the NaN of a diverged run
                 bound = f"want <= {scenario.tracking_bound:g} {unit}"
                 failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
-            console.wrote(ls.view.plot_run(solution, runs, folder / "figure.png", world=world))
+            console.wrote(ls.view.plot_run(plan, runs, folder / "figure.png", world=world, belief=belief))
             misses += [f"{reference}: {line}" for line in undisturbed.target.of_plan(undisturbed.goal_radius)[1:]]
             if video:  # with the calibrated panes that show the robot's position
                 run, (quality, fps) = runs["disturbed"], ("draft", 5) if self.quick else ("standard", 30)

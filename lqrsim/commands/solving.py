@@ -120,6 +120,7 @@ class Solve:
         console.wrote(ls.save(solution, folder / "solution.npz"))
         console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
+            from lqrsim.problem.belief import Belief
             from lqrsim.simulation.uncertainty_of import tube_under
 
             ran = scenario.settled(solution)
@@ -127,8 +128,9 @@ class Solve:
             if remark:
                 console.say(remark)
             world, robot = scenario.scene.world, scenario.robot
-            radius = robot.shape.get("radius", 0.0)
-            console.wrote(ls.view.plot_policy(solution, self.figure, world=world, radius=radius, tube=tube))
+            radius, dynamics = robot.shape.get("radius", 0.0), scenario.problem.dynamics
+            shown = {"tube": tube, "belief": dynamics if isinstance(dynamics, Belief) else None}
+            console.wrote(ls.view.plot_policy(solution, self.figure, world=world, radius=radius, **shown))
         return 0 if solution.success else 1
 
     def _start(self, scenario: "ls.Scenario") -> "StartLike":
@@ -222,7 +224,9 @@ class Simulate:
                 f" {one['most']:.3g} (trial {one['trial']} at {one['time']:.2f} s); outcomes do not count this"
             )
         if violations is None and scenario.problem.constraints:
-            console.say("whether trials violate constraints is not checked: the scenario has another horizon")
+            console.say(
+                "whether trials violate constraints is not checked: another horizon, or constraints of a belief"
+            )
         tube, remark = tube_under(scenario.problem, solution, plant, disturbances, controller)
         if remark:
             console.say(remark)
@@ -310,8 +314,13 @@ class Bridge:
 
 
 def _violations(problem: "ls.Problem", rollout: "ls.Rollout") -> list[dict[str, Any]] | None:
-    """For each constraint, how many trials violate it, and the worst; None for a problem of another horizon."""
-    if (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
+    """For each constraint, how many trials violate it, and the worst; None for a problem of another horizon, or of a
+    belief, whose constraints are not of states.
+    """
+    from lqrsim.problem.belief import Belief
+
+    other = (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt)
+    if other or isinstance(problem.dynamics, Belief):
         return None
     listed = list[dict[str, Any]]()
     for name, found in problem.violations(rollout).items():

@@ -1,5 +1,7 @@
 """The policy of a belief, on an extended Kalman filter that runs with it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lqrsim.annotations import checked
@@ -10,10 +12,8 @@ from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Spaces
-from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Trajectory
 
 
 class BeliefFeedback(Controller):
@@ -46,18 +46,18 @@ class BeliefFeedback(Controller):
         return self.belief
 
     @property
-    def plan(self) -> Plan:
-        """The plan of the mean; its policy has the gains on the mean, and the covariance of the plan."""
+    def plan(self) -> Solution:
+        """The plan of the mean. Its policy has the gains on the mean, and the covariance of the plan."""
         n, own, policy = self.belief.size, self.solution, self.solution.policy
         known = np.vecdot(policy.gain[:, :, n:], policy.nominal[:, None, n:])
         law = AffinePolicy(
             gain=policy.gain[:, :, :n], offset=policy.offset + known, nominal=policy.nominal[:, :n], dt=policy.dt,
             state_coordinates=self.belief.robot.state_coordinates, control_coordinates=policy.control_coordinates,
         )  # fmt: skip
-        trajectory = Trajectory(own.trajectory.states[:, :n], own.trajectory.controls, own.trajectory.dt)
-        return Plan(
-            status=own.status, detail=own.detail, policy=law, trajectory=trajectory, cost_to_go=None,
-            goal=None if own.goal is None else own.goal[:n], goal_radius=own.goal_radius,
+        trajectory = replace(own.trajectory, states=own.trajectory.states[:, :n])
+        return replace(
+            own, policy=law, trajectory=trajectory, goal=None if own.goal is None else own.goal[:n], cost_to_go=None,
+            cost_to_come=None, inverse_policy=None, candidates=(),
         )  # fmt: skip
 
     @property

@@ -133,7 +133,9 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
     """The controller of a run on a robot with these dynamics, by default the plan's policy, and the plan of the run."""
     wanted = "a Plan, such as smooth(problem), which may be followed by another policy: controller=policy"
     check_kind("plan", plan, (Plan, type(None)), wanted)
-    if plan is None and isinstance(given, Controller):
+    # What is planned in belief space has more states than the robot: its controller has the plan of the mean.
+    of_belief = isinstance(given, Controller) and isinstance(given.sensors, Belief)
+    if isinstance(given, Controller) and (plan is None or of_belief):
         plan = check_kind(f"{type(given).__name__}.plan", given.plan, (Plan, type(None)), "a Plan or None")
     if plan is None:
         raise InputError(

@@ -2,7 +2,8 @@
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
 are jointly Gaussian, and their distribution is known before any run; `linear_loop.py` has the recursion. The chance of
-collision follows from these moments, unless trials of the nonlinear model refute it; see `sampled_loop.py`.
+collision follows from these moments, unless trials of the nonlinear model refute it; see `sampled_loop.py`. In belief
+space the filter is part of the plan, and its moments are the tube's.
 """
 
 from dataclasses import dataclass, replace
@@ -10,8 +11,10 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
+from scipy.special import ndtr
 
 from lqrsim.annotations import Share, checked, repr_of
+from lqrsim.control.belief_feedback import BeliefFeedback
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import ControllerLike, Feedback
 from lqrsim.control.linear_loop import LinearLoop
@@ -21,6 +24,7 @@ from lqrsim.control.sampled_loop import Counted, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
@@ -93,7 +97,7 @@ class Tube:
 def predict_tube(
     problem: Problem,
     solution: Solution,
-    uncertainty: Uncertainty,
+    uncertainty: Uncertainty | None = None,
     controller: ControllerLike | None = None,
     *,
     samples: int | None = None,
@@ -103,14 +107,18 @@ def predict_tube(
 
     Args:
       uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are computed from the
-        samples that stay finite.
+        samples that stay finite. None for a problem of a Belief, which states noise and readings itself.
       controller: an OffsetFree of this solution or an AffinePolicy; by default the solution's policy. It may have been
-        designed for another uncertainty.
+        designed for another uncertainty. In belief space the solution's BeliefFeedback.
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
-        written in plain Python, and with distances by MuJoCo.
+        written in plain Python, with distances by MuJoCo, and in belief space.
     """
     check_plan("predict_tube", problem, solution)
+    if isinstance(problem.dynamics, Belief):
+        if uncertainty is not None or samples or not isinstance(controller, BeliefFeedback | None):
+            raise InputError("predict_tube: got uncertainty, samples or another controller in belief space, want none")
+        return _tube_of_belief(problem.dynamics, problem, solution if controller is None else controller.solution)
     check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
     check_count("predict_tube: samples", 0 if samples is None else samples, at_least=0, at_most=40_000)
     check_count("predict_tube: seed", seed, at_least=0)
@@ -163,4 +171,32 @@ def predict_tube(
         step_chance=chance, linear_chance=float(linear), strays=strays,
         collision_chance=float(linear) if trials is None else trials.chance(float(linear)),
         samples=0 if trials is None else len(trials.collided),
+    )  # fmt: skip
+
+
+def _tube_of_belief(belief: Belief, problem: Problem, solution: Solution) -> Tube:
+    """The mean strays as readings move it, and the state from the mean by what the filter does not know.
+
+    To first order the two are independent.
+    """
+    n, plan, policy = belief.size, solution.trajectory, solution.policy
+    each = zip(plan.states[:-1], plan.controls, strict=True)
+    A, B = (np.array(one) for one in zip(*(belief.linearize(x, u, plan.dt)[:2] for x, u in each), strict=True))
+    closed, known = A + B @ policy.gain, belief.covariance(plan.states)
+    pushed = belief.innovations.matrices(belief, plan.states[:-1], plan.controls)
+    pushed = pushed @ pushed.swapaxes(1, 2)
+    strayed = np.zeros((plan.steps + 1, *A.shape[1:]))
+    for t in range(plan.steps):
+        strayed[t + 1] = closed[t] @ strayed[t] @ closed[t].T + pushed[t]
+    covariance = strayed[:, :n, :n] + known
+    across = closed[:, :n] @ strayed[:-1, :, :n] + A[:, :n, :n] @ known[:-1]
+    command = np.sqrt(np.vecdot(policy.gain @ strayed[:-1], policy.gain))
+    space, scale = policy.control_coordinates, np.maximum(command, 1e-12)
+    beyond = ndtr((space.low - plan.controls) / scale) + ndtr((plan.controls - space.high) / scale)
+    chance, linear = collision_chance(plan.states, covariance, across, Surroundings.of(problem, 0.0))
+    return Tube(
+        plan=Trajectory(plan.states[:, :n], plan.controls, plan.dt), state_coordinates=belief.robot.state_coordinates,
+        mean=np.zeros((plan.steps + 1, n)), covariance=covariance, across=across,
+        estimate_covariance=known + np.concatenate([np.zeros((1, n, n)), pushed[:, :n, :n]]), command=command,
+        saturation=beyond, step_chance=chance, linear_chance=float(linear), collision_chance=float(linear),
     )  # fmt: skip

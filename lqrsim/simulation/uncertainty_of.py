@@ -9,6 +9,7 @@ from lqrsim.control.controllers import ControllerLike
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty, gathered
 from lqrsim.errors import InputError, check_kind
+from lqrsim.problem.belief import Belief
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -54,7 +55,8 @@ def tube_under(
     if not disturbances:
         return None, ""
     try:
-        uncertainty = uncertainty_of(plant, disturbances)
+        belief = isinstance(problem.dynamics, Belief)
+        uncertainty = None if belief else uncertainty_of(plant, disturbances)
         if not problem.dynamics.state_coordinates.position:
             raise InputError("the robot has no position")
         with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop overflows; it is refused below
@@ -63,5 +65,7 @@ def tube_under(
             raise InputError("the loop is not stable, its covariance is not finite")
     except InputError as error:
         return None, f"no predicted tube: {error}"
+    if uncertainty is None:
+        return tube, "the predicted tube has the noise and the readings of the plan, and no other disturbances"
     left_out = uncertainty.left_out
     return tube, f"the predicted tube leaves out {'; '.join(left_out)}" if left_out else ""

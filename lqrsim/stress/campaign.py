@@ -195,8 +195,9 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
     remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
     impossible = policies.impossible_policies(scenario, given)
     # Policies that were chosen leave out others on purpose.
-    missing = impossible if {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*impossible} else {}
-    left_out = "; ".join(f"{policy}, {why}" for policy, why in missing.items())
+    missing = [one for one in policies.DEFAULT_POLICIES if one in impossible]
+    missing = missing if {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*missing} else []
+    left_out = "; ".join(f"{policy}, {impossible[policy]}" for policy in missing)
     about = {
         "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {left_out}" if left_out else "",

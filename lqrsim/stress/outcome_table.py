@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Count, checked
 from lqrsim.errors import Array, InputError, check_shape, excerpt, keep, numbers_of
+from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.goal import OUTCOMES
@@ -32,7 +33,8 @@ class Outcomes:
       clearance: the least clearance in metres; at most 0 after a collision.
       effort: integral of the squared applied controls over time, in their unit squared times s.
       saturated: fraction of the control periods with a command at a limit.
-      cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before.
+      cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before. Of a
+        problem in belief space, that of true states as if they were known: without the cost of what is not known.
       deterministic: whether the trials drew nothing, so that all are the same run.
     """
 
@@ -101,8 +103,10 @@ def outcomes(
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         got = f"{problem.steps} steps of {problem.dt:g} s"
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
+    belief = problem.dynamics if problem is not None and isinstance(problem.dynamics, Belief) else None
     if problem is not None:
-        check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces_of(rollout), "the rollout")
+        own = spaces_of(problem.dynamics if belief is None else belief.robot)
+        check_same_system("problem", "a problem", own, spaces_of(rollout), "the rollout")
     if goal_radius is not None or goal_tolerance is not None:
         rollout = replace(rollout, goal_radius=rollout.target.radius(None, goal_radius, goal_tolerance))
     plan, ended, counts = rollout.plan, rollout.ended, rollout.counts
@@ -115,7 +119,11 @@ def outcomes(
     effort = np.where(driven, spent * np.sum(np.square(rollout.applied), axis=2), 0.0).sum(axis=1)
     cost = np.full(rollout.trials, np.nan)
     if problem is not None and whole.any():
-        cost[whole] = compiled.costs_of(problem, rollout.states[whole], rollout.applied[whole])
+        states = rollout.states[whole]
+        if belief is not None:
+            known = np.zeros((*states.shape[:2], len(belief.state_coordinates) - belief.size))
+            states = np.concatenate([states, known], axis=2)
+        cost[whole] = compiled.costs_of(problem, states, rollout.applied[whole])
     return Outcomes(
         trial=rollout.first_trial + np.arange(rollout.trials),
         outcome=outcome,

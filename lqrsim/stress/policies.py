@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lqrsim.control.belief_feedback import BeliefFeedback
 from lqrsim.control.controllers import Controller
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.replanner import Replanner
 from lqrsim.control.tracking import track
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError, check_name
+from lqrsim.problem.belief import Belief
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions as solving
@@ -136,6 +138,9 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
         impossible["ilqr"] = "which cannot keep the scenario's constraints"
     elif scenario.problem.duration is not None:
         impossible["ilqr"] = "which cannot find the scenario's free duration"
+    if isinstance(scenario.problem.dynamics, Belief):
+        others = (name for name, kind in POLICY_KINDS.items() if kind.controller != "feedback" or kind.designed)
+        impossible |= dict.fromkeys(others, "which is of states, while the scenario is planned in belief space")
     replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
     if replanned is not None and replanned.problem_digest != (stated := scenario.settled(replanned).problem).digest:
         other = solving.difference(replanned, stated)
@@ -154,11 +159,15 @@ def make_controller(
     """A controller for a solution of the scenario.
 
     Args:
-      name: one of CONTROLLERS. "feedback" is the solution's policy; "track" and "offset_free" are `lqrsim.track` and
-        `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
+      name: one of CONTROLLERS. "feedback" is the solution's policy, in belief space with its filter; "track" and
+        "offset_free" are `lqrsim.track` and `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
     """
     problem = scenario.settled(solution).problem
+    if isinstance(problem.dynamics, Belief):
+        if name != "feedback":
+            raise InputError(f"controller: got {name} for a plan in belief space, want feedback")
+        return BeliefFeedback(problem, solution)
     match check_name("controller", name, CONTROLLERS):
         case "track":
             return track(problem, solution, uncertainty=design_uncertainty(scenario, design))

@@ -38,6 +38,8 @@ from lqrsim.stress.policies import (
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
 
+OF_SCENARIO = "of the scenario"  # the kind of what is stored by its number
+
 Name = Annotated[str, Want("a name")]
 SetName = Annotated[str, Want("a name, such as 'light'")]
 Disturbances = Annotated[tuple[Disturbance, ...], Want("a tuple of disturbances, such as (ControlNoise(0.05),)")]
@@ -179,7 +181,8 @@ class Campaign(Setup):
     """A stress test: trials of policies under disturbances of growing strength.
 
     Attributes:
-      sweeps: name -> disturbances at strength 1.
+      sweeps: name -> disturbances at strength 1. Those that are made of formulas, such as a `Noise`, can only be
+        disturbances of the scenario, as in `Campaign.of_sets(setup, ["scenario"])`.
       strengths: factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate.
       policies: some of CAMPAIGN_POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is
         the plan of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan
@@ -264,10 +267,24 @@ class Campaign(Setup):
         """The campaign as plain data without its solution, from which `from_json` makes it again."""
         design = self.design_disturbances
         fields = {name: getattr(self, name) for name in CAMPAIGN_FIELDS} | {
-            "sweeps": {name: disturbances_as_json(sweep) for name, sweep in self.sweeps.items()},
+            "sweeps": {name: self._as_json(sweep) for name, sweep in self.sweeps.items()},
             "design_disturbances": None if design is None else disturbances_as_json(design),
         }
         return json.loads(json.dumps(fields))
+
+    def _as_json(self, sweep: Disturbances) -> list[dict[str, Any]]:
+        """As `disturbances_as_json`. The scenario's own may have formulas, which are no plain data: by their number."""
+        own = {id(one): number for number, one in enumerate(self.resolved.disturbances)}
+        plant, items = self.resolved.plant(), list[dict[str, Any]]()
+        for one in sweep:
+            try:
+                items += disturbances_as_json([one])
+            except InputError:
+                if id(one) not in own:
+                    raise
+                settings = {"number": own[id(one)], "text": one.describe(plant)}
+                items.append({"kind": OF_SCENARIO, "settings": settings})
+        return items
 
     @classmethod
     @checked
@@ -280,8 +297,8 @@ class Campaign(Setup):
         """
         try:
             design = fields["design_disturbances"]
-            sweeps = {name: disturbances_from_json(sweep) for name, sweep in fields["sweeps"].items()}
-            design = None if design is None else disturbances_from_json(design)
+            sweeps = {name: disturbances_from_json(sweep, scenario) for name, sweep in fields["sweeps"].items()}
+            design = None if design is None else disturbances_from_json(design, scenario)
             campaign = cls(**{**fields, "solution": solution, "sweeps": sweeps, "design_disturbances": design})
         except InputError:
             raise
@@ -315,11 +332,13 @@ def _plain(value: Any) -> Any:
     raise InputError(f"sweeps: got {excerpt(value)} in a disturbance, want numbers, strings, and lists of them")
 
 
-def disturbances_from_json(items: Iterable[Mapping[str, Any]]) -> tuple[Disturbance, ...]:
-    """The inverse of `disturbances_as_json`."""
+def disturbances_from_json(items: Iterable[Mapping[str, Any]], scenario: Scenario) -> tuple[Disturbance, ...]:
+    """The inverse of `disturbances_as_json`, and of the numbers of the scenario's own."""
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
     return tuple(
-        kinds[check_name("disturbance", item["kind"], sorted(kinds))](
+        scenario.disturbances[item["settings"]["number"]]
+        if item["kind"] == OF_SCENARIO
+        else kinds[check_name("disturbance", item["kind"], sorted(kinds))](
             **{name: _with_tuples(value) for name, value in item["settings"].items()}
         )
         for item in items

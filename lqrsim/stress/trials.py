@@ -47,7 +47,9 @@ class Trials:
     def warm_up(self) -> None:
         """Compile everything, by running undisturbed trials."""
         options: dict[str, Any] = {"frames": False, "contacts": False, "threads": 1}
-        self.outcomes(simulate(self.plant, next(iter(self.solutions.values())), **options))
+        first = next(iter(self.solutions.values()))
+        law = make_controller("feedback", self.scenario, first)
+        self.outcomes(simulate(self.plant, first, controller=law, **options))
         filters = [cell for cell in self.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
         for cell in filters[:1]:  # its filter is also compiled
             simulate(self.plant, self.solutions[cell.policy], controller=self._controller(cell), **options)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.patches import Circle
@@ -15,6 +16,7 @@ from scipy.spatial import ConvexHull
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
+from lqrsim.problem.belief import Belief
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.mjcf_kinematics import placed
@@ -39,6 +41,9 @@ THING = "#a6761d"  # colour of what a run moved
 MOVED = 0.01  # way of an object that counts as moved, relative to the extent of the robot's
 SHAPES = "sphere", "capsule", "cylinder", "box"  # other geoms are drawn as their bounding boxes
 CERTIFIED = RUNS[0]
+SEEN = 80  # across a view, of the grid on which sensors are shown
+FINE = 1e-5  # m, of differences of readings
+DEEPEST = "#f5d36b"  # of the places that are seen best
 LONG = 0.45  # height over width, below which a view is as wide as the figure
 
 
@@ -78,6 +83,7 @@ class Views:
     moved: Sequence["MovedObject"] = ()
     balls: Sequence[tuple[Array, float, str]] = ()  # centres (3,) and radii, with their colours
     limits: tuple[Array, Array] | None = None  # lowest and highest corner; by default around the places
+    sensed: tuple[Belief, Array] | None = None  # and states (k, n): how well its sensors see the places is drawn
 
     @property
     def corners(self) -> tuple[Array, Array]:
@@ -111,6 +117,8 @@ class Views:
                 draw_in_plane(axes, flat, low, high, self.radius, plane=self.space.plane)
             direction = f", from {'above' if plane == (0, 1) else 'the side'}"
             axes.set_title(self.title + direction * (in_space and not self.balls))
+            if self.sensed is not None:
+                draw_sensed(axes, *self.sensed, low, high, along)
             for centre, radius, colour in self.balls:
                 across, up = centre[along]
                 axes.add_patch(Circle((across, up), radius, facecolor=colour, edgecolor="none", zorder=2))
@@ -301,6 +309,39 @@ def draw_moved(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -> 
                 axes.fill(*_outline(geom, low, high, plane).T, **looks)
         label = f"{moved.name.replace('_', ' ')}, moved"
         axes.plot(*moved.path[:, plane].T, color=THING, linewidth=1.0, zorder=2.5, label=label)
+
+
+def draw_sensed(axes: Axes, belief: Belief, states: Array, low: Array, high: Array, along: list[int]) -> None:
+    """Draw how well the readings of one period tell the position, as standard deviations in m, between two corners.
+
+    Args:
+      states: (k, n), of which the nearest has what is no place in the view: its height, heading and speed.
+      along: the axes of the view.
+    """
+    place = list(belief.robot.state_coordinates.position)
+    shown = [place[axis] for axis in along]
+    x, y = (np.linspace(low[axis], high[axis], SEEN) for axis in along)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    near = states[np.linalg.norm(points[:, None] - states[:, shown], axis=2).argmin(axis=1)]
+    near[:, shown] = points
+    seen = accuracy(belief, near).reshape(SEEN, SEEN)
+    levels = np.geomspace(seen.min(), max(np.quantile(seen, 0.9), 1.01 * seen.min()), 7)
+    shades = LinearSegmentedColormap.from_list("seen", [DEEPEST, "#ffffff"])
+    axes.contourf(x, y, np.log(seen), levels=np.log(levels), cmap=shades, zorder=0.5)
+    lines = axes.contour(x, y, seen, levels=levels[1:], colors="#b08f2a", linewidths=0.4, zorder=0.6)
+    axes.clabel(lines, fmt=lambda value: f"{value:.2g} m", fontsize=5)
+    axes.fill([], [], facecolor=DEEPEST, label="standard deviation of the position by readings alone")
+
+
+def accuracy(belief: Belief, states: Array) -> Array:
+    """Standard deviations (k,) in m with which readings in states (k, n) tell the position, over all directions."""
+    place = belief.robot.state_coordinates.position
+    deviations, information = belief.read(states)[1], np.zeros(len(states))
+    for axis in place:
+        step = FINE * np.eye(states.shape[1])[axis]
+        slopes = (belief.read(states + step)[0] - belief.read(states - step)[0]) / (2 * FINE)
+        information += np.square(slopes / deviations).sum(axis=1)
+    return np.sqrt(len(place) / np.maximum(information, 1e-24))
 
 
 def draw_tube(axes: Axes, ellipses: Ellipsoids, label: str, *, face: str, edge: str) -> None:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from lqrsim.annotations import Index, NonNegative, Want, checked
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_text
+from lqrsim.problem.belief import Belief
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
@@ -46,6 +48,7 @@ def plot_run(
     *,
     world: World,
     trial: Index = 0,
+    belief: Belief | None = None,
     style: Style = "screen",
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
@@ -60,6 +63,7 @@ def plot_run(
     Args:
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
       world: the obstacles, such as `scene.world`.
+      belief: of a plan in belief space, whose `solution` is `BeliefFeedback.plan`: how well its sensors see the places.
       style: "screen"; or for a paper "column", 3.4 inches wide, or "page", 7.1 inches, with text of 7 points.
     """
     if not 1 <= len(rollouts) <= len(RUNS):
@@ -75,6 +79,7 @@ def plot_run(
     with styles.figure(path, style=style) as figure:
         first = next(iter(rollouts.values()))
         views = (_of_positions if first.state_coordinates.position else _of_balls)(solution, rollouts, world, trial)
+        views = replace(views, sensed=_sensed(belief, solution))
         chances = [
             (run.times, run.collision_chance, color)
             for run, color in zip(rollouts.values(), RUNS, strict=False)
@@ -95,6 +100,10 @@ def plot_run(
         _convergence(figure.add_subplot(costs), solution)
         legend_below(figure, _entries(drawn[0]) | controls)
     return Path(path)
+
+
+def _sensed(belief: Belief | None, solution: Solution) -> tuple[Belief, Array] | None:
+    return None if belief is None else (belief, solution.trajectory.states[:, : belief.size])
 
 
 def _strips(count: int, style: Style) -> tuple[int, Panel]:
@@ -263,6 +272,7 @@ def plot_policy(
     world: World | None = None,
     radius: NonNegative = 0.0,
     tube: Tube | None = None,
+    belief: Belief | None = None,
     style: Style = "screen",
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
@@ -277,22 +287,26 @@ def plot_policy(
       radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle
         are grey. 0 leaves the grey out, which would be wrong for a robot of several balls.
       tube: of the solution, from `predict_tube`.
+      belief: of a solution in belief space: how well its sensors see the places.
     """
     world = World() if world is None else world
     if solution.cost_to_go is None:
         raise InputError(f"solution: got no cost-to-go ({solution.status.name}), want a solution of a completed solve")
-    if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
+    # In belief space the tube has the states of the mean.
+    planned = solution.trajectory.states
+    if tube is not None and not np.array_equal(tube.plan.states, planned[:, : tube.plan.states.shape[1]]):
         raise InputError("tube: got a tube of another plan, want one of the solution's plan")
     if tube is not None and not solution.policy.state_coordinates.position:
         raise InputError("tube: got a tube of a robot without a position, want None")
     with styles.figure(path, style=style) as figure:
-        draw_policy(figure, solution, world, radius, tube, style)
+        draw_policy(figure, solution, world, radius, tube, style, belief)
     return Path(path)
 
 
 def draw_policy(
-    figure: Figure, solution: Solution, world: World, radius: float, tube: Tube | None = None, style: Style = "screen"
-) -> None:
+    figure: Figure, solution: Solution, world: World, radius: float, tube: Tube | None = None, style: Style = "screen",
+    belief: Belief | None = None,
+) -> None:  # fmt: skip
     """Draw the figure of a policy."""
     policy = solution.policy
     space, chances = policy.state_coordinates, tube is not None and bool(tube.step_chance.any())
@@ -309,7 +323,7 @@ def draw_policy(
         title = "plan" if tube is None else "predicted tube"
         views = Views(
             title=title, space=space, world=world, radius=radius, places=plan, planes=planes_of(plan), paths=[path],
-            tubes=tubes,
+            tubes=tubes, sensed=_sensed(belief, solution),
         )  # fmt: skip
         parts = arrange(figure, [*views.panels(style), *curves], style)
         of_time = parts[len(views.planes) :]

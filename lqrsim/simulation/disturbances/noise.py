@@ -166,6 +166,7 @@ class DisplacedObstacles(GaussianDisturbance):
         return Uncertainty(obstacles=float(np.sqrt(np.mean(self._fit(self.std, self.along)[:axes] ** 2))))
 
 
+@checked
 @dataclass(frozen=True)
 class StateNoise(Disturbance):
     """The noise of a problem, `lqrsim.Noise`: the state jumps by M(x, u) w at the end of each control period.

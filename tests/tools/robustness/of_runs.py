@@ -18,6 +18,7 @@ DISTURBANCES: dict[str, dict[str, Any]] = {
     "MeasurementLatency": {"periods": 1}, "MotorLag": {"time_constant": 0.1},
     "Payload": {"mass": 0.1, "body": "create"},
     "Push": {"impulse": (1.0, 0.0, 0.0), "at": 0.1}, "Saturation": {"share": 0.5},
+    "StateNoise": {"noise": ls.Noise(0.1 * np.eye(3))},
     "SensorErrors": {"sensors": [Sensor("create_position", noise=0.01)], "strength": 1.0},
     **{
         kind: {"std": 0.1}
