@@ -63,14 +63,14 @@ def light(x: Any, u: Any, p: Any) -> list[Any]:
 LIGHT = NoisySensors(light, parameters={"floor": 1e-4, "light": 5.0})
 
 
-def light_dark(stray: float = float(np.sqrt(5))) -> ls.Problem:
+def light_dark(stray: float = float(np.sqrt(5)), *, averaged: bool = False) -> ls.Problem:
     """A point that is told its velocity; light at 5 m, the start at 2 m, known within `stray`, and the goal at 0."""
 
     def point(x: Any, u: Any, p: Any) -> list[Any]:
         return [x.x + u.vx, x.y + u.vy]
 
     dynamics = ls.Dynamics(point, states={"x": "m", "y": "m"}, controls={"vx": "m/s", "vy": "m/s"}, period=1.0)
-    belief = Belief(dynamics, dt=1.0, noise=ls.Noise(1e-4 * np.eye(2)), sensors=LIGHT)
+    belief = Belief(dynamics, dt=1.0, noise=ls.Noise(1e-4 * np.eye(2)), sensors=LIGHT, averaged=averaged)
     off = ls.QuadraticCost({"x": 1, "y": 1} | belief.uncertainty({"x": 400}), about={})
     return ls.Problem(
         dynamics=belief, dt=1.0, steps=25, initial=ls.FixedState(belief.state([2, 2], [stray, 1e-4])),

@@ -13,7 +13,7 @@ is the noise of the belief. Everything is formulas, with exact first and second 
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
-from itertools import chain
+from itertools import chain, product
 from statistics import NormalDist
 from typing import Annotated, Any, NamedTuple
 
@@ -95,10 +95,14 @@ class Belief(Dynamics):
       dt: control period in s.
       noise: noise on the robot's state in each period, a formula or a matrix.
       sensors: what is read at the end of each period.
+      averaged: whether the noise of a reading is its mean over the belief, rather than that at the mean: wherever the
+        noise changes over the covariance, the filter is too sure without it.
     """
 
     @checked
-    def __init__(self, dynamics: Dynamics, *, dt: Positive, noise: Noise, sensors: NoisySensors) -> None:
+    def __init__(
+        self, dynamics: Dynamics, *, dt: Positive, noise: Noise, sensors: NoisySensors, averaged: bool = False
+    ) -> None:
         check_kind("Belief: noise", noise, Noise, "a Noise")
         check_kind("Belief: sensors", sensors, NoisySensors, "NoisySensors(...)")
         for what, level in (("dynamics", dynamics.level), ("noise", noise.level)):
@@ -106,12 +110,12 @@ class Belief(Dynamics):
                 raise InputError(f"Belief: {what}: got a function of arrays, want a formula")
         dynamics.check_period(dt)
         noise.bind(dynamics)  # raises an exception if it does not fit
-        self.robot, self.process, self.sensors = dynamics, noise, sensors
+        self.robot, self.process, self.sensors, self.averaged = dynamics, noise, sensors, averaged
         space, controls = dynamics.state_coordinates, dynamics.control_coordinates
         names, units = space.names, space.units
         pairs = [(i, j) for i in range(len(names)) for j in range(i + 1)]
         super().__init__(
-            _key(dynamics, dt, noise, sensors),
+            _key(dynamics, dt, noise, sensors, averaged),
             states=dict(zip(names, units, strict=True)) | {f"root_{names[i]}_{names[j]}": units[i] for i, j in pairs},
             controls=dict(zip(controls.names, controls.units, strict=True)),
             parameters=_together(dynamics.parameters, noise.parameters, sensors.parameters),
@@ -309,10 +313,10 @@ class Belief(Dynamics):
         root = _cholesky(operations, [a + b for a, b in zip(turned, shaken, strict=True)], n)
         pairs, _, _ = self._sensing()
         at = dict(zip(means, mean, strict=True))
-        columns, now = [], mean
+        columns, now, before = [], mean, root
         for row, (reading, deviation) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
             slope = [name(sympy.sympify(reading.diff(state)).xreplace(at)) for state in means]
-            variance = name(deviation.xreplace(at) ** 2)
+            variance = self._variance(operations, deviation, means, mean, before)
             seen = [name(sum(slope[i] * root[i][j] for i in range(j, n))) for j in range(n)]
             sums = [variance]  # of the squares from the last to each
             for one in reversed(seen):
@@ -325,6 +329,28 @@ class Belief(Dynamics):
                 now = [name(a + one * share) for a, one in zip(now, column, strict=True)]
             root = _informed(operations, root, seen, sums)
         return _Step(operations, x, u, [*now, *(one for row in root for one in row)], columns)
+
+
+    def _variance(
+        self, operations: Operations, deviation: Any, means: list[Any], mean: list[Any], root: list[list[Any]]
+    ) -> Any:
+        """The variance of a reading of this deviation, in the belief before readings.
+
+        An average is that of two points on each column of the root, as of an unscented filter: exact where the variance
+        is a polynomial of degree 3, and always positive. Only columns that reach a state on which it depends count.
+        """
+        import sympy
+
+        name = operations.name
+        depends = [i for i, one in enumerate(means) if one in deviation.free_symbols] if self.averaged else []
+        if not depends:
+            return name(deviation.xreplace(dict(zip(means, mean, strict=True))) ** 2)
+        count, total = depends[-1] + 1, sympy.Integer(0)
+        for j, side in product(range(count), (1, -1)):
+            off = side * sympy.sqrt(sympy.Integer(count)).evalf()
+            place = {means[i]: name(mean[i] + off * root[i][j]) if j <= i else mean[i] for i in depends}
+            total += name(deviation.xreplace(place) ** 2)
+        return name(total / (2 * count))
 
 
 class _Innovations(Noise):
@@ -357,11 +383,13 @@ class _Innovations(Noise):
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
 
-def _key(dynamics: Dynamics, dt: float, noise: Noise, sensors: NoisySensors) -> Callable[[Any, Any, Any], Any]:
+def _key(
+    dynamics: Dynamics, dt: float, noise: Noise, sensors: NoisySensors, averaged: bool
+) -> Callable[[Any, Any, Any], Any]:
     """A function that refers to all that a belief is made of, by which its formulas are kept; nothing calls it."""
     parts = (
         dynamics.f, dynamics.discrete, dynamics.substeps, float(dt), noise.strength,
-        noise.function if noise.matrix is None else noise.matrix, sensors.function,
+        noise.function if noise.matrix is None else noise.matrix, sensors.function, averaged,
     )  # fmt: skip
 
     def belief(x: Any, u: Any, p: Any) -> Any:
