@@ -3,15 +3,19 @@
     python experiments/belief_space.py                                        # some minutes
     python experiments/belief_space.py --video docs/figures/belief_space.gif  # also a run of two plans
 
-light     The light-dark domain and its car: the smoother beside iLQR in belief space, from the same starts.
-spread    The predicted spread of runs of a light-dark plan, against drawn runs.
+light     The light-dark domain and its car: the smoother beside iLQR in belief space, from the same starts; with the
+          most likely readings also IPOPT, where CasADi is installed.
+spread    The predicted spread of runs of a light-dark plan, against drawn runs, with the noise of readings at the mean
+          of the belief and averaged over it.
 drive     The packaged drive among pillars, three of them beacons, in MuJoCo: how often plans fail.
 
 The domains are Platt, Tedrake, Kaelbling and Lozano-Perez (2010), and van den Berg, Patil and Alterovitz (2012), with
 the numbers of the public code of Abdulsamad (github.com/hanyas/trajopt).
 """
 
+import contextlib
 import dataclasses
+import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +25,8 @@ import mujoco
 import numpy as np
 from matplotlib.patches import Circle
 from paper.common import figure, picture
+from peers.common import Unavailable
+from peers.ipopt import casadi
 from runner import FolderSettings, Result, at_most, between, interval, opening, run, table
 
 import lqrsim as ls
@@ -98,11 +104,54 @@ def car() -> ls.Problem:
     )  # fmt: skip
 
 
-def compared(name: str, problem: ls.Problem, starts: int) -> list[Result]:
-    """Both solvers from the same controls: zero, and drawn ones. Each is compiled before it is timed."""
+def starts_of(problem: ls.Problem, starts: int) -> list[np.ndarray]:
+    """Zero controls, and drawn ones."""
     rng, size = np.random.default_rng(0), (problem.steps, len(problem.dynamics.control_coordinates))
-    given = [np.zeros(size), *(0.1 * rng.normal(size=size) for _ in range(starts - 1))]
+    return [np.zeros(size), *(0.1 * rng.normal(size=size) for _ in range(starts - 1))]
+
+
+def by_ipopt(name: str, problem: ls.Problem, starts: int) -> list[Result]:
+    """IPOPT on `light_dark` with the most likely readings, by multiple shooting, from the trajectories of the starts.
+
+    Its Kalman filter is one of matrices, written for itself. Raises Unavailable without CasADi.
+    """
+    ca, belief = casadi(), belief_of(problem)
+    x, u, n = ca.SX.sym("x", 5), ca.SX.sym("u", 2), belief.size
+    root, place = ca.SX(n, n), [(i, j) for i in range(n) for j in range(i + 1)]
+    for entry, at in enumerate(place):
+        root[at] = x[n + entry]
+    mean, floor = x[:n] + u, LIGHT.parameters["floor"]
+    noise = ca.diag(ca.vertcat(floor + (LIGHT.parameters["light"] - mean[0]) ** 2 / 2, floor))
+    predicted = root @ root.T + 1e-8 * ca.SX.eye(n)
+    after = ca.chol(predicted - predicted @ ca.solve(predicted + noise, predicted)).T
+    step = ca.Function("step", [x, u], [ca.vertcat(mean, *[after[at] for at in place])])
+    weights = ca.vertcat(1, 1, 400, 0, 0)
+    w = ca.MX.sym("w", 7, problem.steps)  # of a step: its control, and the belief after it
+    first = belief.state([2, 2], np.sqrt(np.diag(belief.covariance(problem.start))))
+    before = ca.horzcat(first, w[2:, :-1])
+    cost = (ca.sumsqr(w[:2, :]) + ca.sum2(weights.T @ before**2) + weights.T @ w[2:, -1] ** 2) / 2
+    gaps = ca.vec(w[2:, :] - step.map(problem.steps)(before, w[:2, :]))
+    options = {"print_time": False, "expand": True, "ipopt": {"print_level": 0, "sb": "yes", "max_iter": MOST}}
+    solver = ca.nlpsol("solver", "ipopt", {"x": ca.vec(w), "f": cost, "g": gaps}, options)
     rows = []
+    for start, controls in enumerate(starts_of(problem, starts)):
+        states = [first]
+        for control in controls:
+            states.append(belief.step(states[-1], control, problem.dt))
+        began = time.perf_counter()
+        found = solver(x0=np.hstack([controls, states[1:]]).ravel(), lbg=0.0, ubg=0.0)
+        seconds, stats = time.perf_counter() - began, solver.stats()
+        rows.append({
+            "problem": name, "solver": "IPOPT", "start": start,
+            "status": "CONVERGED" if stats["success"] else stats["return_status"], "cost": float(found["f"]),
+            "iterations": stats["iter_count"], "seconds": seconds,
+        })  # fmt: skip
+    return rows
+
+
+def compared(name: str, problem: ls.Problem, starts: int) -> list[Result]:
+    """Both solvers from the same controls. Each is compiled before it is timed."""
+    given, rows = starts_of(problem, starts), []
     for solver, solve in (("smooth", ls.smooth), ("ilqr", ls.ilqr)):
         solve(problem, start=given[0], max_iterations=1)
         for start, controls in enumerate(given):
@@ -120,12 +169,6 @@ def spread(problem: ls.Problem, solution: ls.Solution, trials: int) -> Result:
     """Standard deviations of the light-dark plan's end: of the state about the plan, and of the filter's error."""
     belief, plan, rng = belief_of(problem), solution.trajectory, np.random.default_rng(1)
     n, policy = belief.size, solution.policy
-    strayed = np.zeros((n, n))  # covariance of the mean, about the plan
-    for t in range(plan.steps):
-        a, b, _ = belief.linearize(plan.states[t], plan.controls[t], plan.dt)
-        moves = (a + b @ policy.gain[t])[:n, :n]
-        column = belief.innovations.matrices(belief, plan.states[t : t + 1], plan.controls[t : t + 1])[0, :n]
-        strayed = moves @ strayed @ moves.T + column @ column.T
     known = belief.covariance(plan.states[-1])
     beliefs = np.tile(plan.states[0], (trials, 1))
     root = np.linalg.cholesky(belief.covariance(plan.states[0]))
@@ -136,7 +179,7 @@ def spread(problem: ls.Problem, solution: ls.Solution, trials: int) -> Result:
         exact, deviations = belief.read(states)
         beliefs = belief.corrected(beliefs, controls, exact + deviations * rng.normal(size=exact.shape))
     found = {"of the state about the plan": states - plan.states[-1, :n], "of the filter": states - beliefs[:, :n]}
-    said = {"of the state about the plan": known + strayed, "of the filter": known}
+    said = {"of the state about the plan": ls.predict_tube(problem, solution).covariance[-1], "of the filter": known}
     return {what: {"said": float(np.sqrt(said[what][0, 0])), "found": deviation(off[:, 0])}
             for what, off in found.items()}  # fmt: skip
 
@@ -254,8 +297,9 @@ def driven(config: Config, result: Result) -> list[Result]:
             "plan": name, "status": plan.status.name, "iterations": len(plan.iterations),
             "nominal": nominal(plan.trajectory), "deviation": float(known.max()), "end": float(known[-1]),
         } | {how: interval(rate(count, config.trials)) for how, count in fails.items()})  # fmt: skip
-        tube = belief.covariance(plan.trajectory.states)[:, :2, :2]
-        shown[name] = dataclasses.replace(runs, tube=tube, collision_chance=np.zeros(len(tube)))
+        tube = ls.predict_tube(problems[name], plan)
+        rows[-1]["predicted"] = tube.collision_chance
+        shown[name] = tube.added_to(runs)
     draw(config, result, plant.world, {name: (problems[name], plan) for name, plan in plans.items()})
     if config.video is not None:
         names = "without seeing", "with seeing"
@@ -296,11 +340,17 @@ def main(config: Config) -> Result:
     config = at_most(config, trials=3, drawn=200)
     result, starts = opening(config), 2 if config.quick else STARTS
     problems = {"light-dark": light_dark()} | ({} if config.quick else {"car": car()})
-    result["light"] = [row for name, problem in problems.items() for row in compared(name, problem, starts)]
+    likely, problem = "light-dark, most likely readings", dataclasses.replace(light_dark(), noise=None)
+    result["light"] = [
+        row for name, one in ({likely: problem} | problems).items() for row in compared(name, one, starts)
+    ]
+    with contextlib.suppress(Unavailable):
+        result["light"] += by_ipopt(likely, problem, starts)
     result["spread"] = []
-    for stray in STRAYS:
-        problem = light_dark(stray)
-        result["spread"].append({"stray": stray} | spread(problem, ls.smooth(problem), config.drawn))
+    for averaged, stray in itertools.product((False, True), STRAYS):
+        problem = light_dark(stray, averaged=averaged)
+        said = {"noise": "averaged" if averaged else "at the mean", "stray": stray}
+        result["spread"].append(said | spread(problem, ls.smooth(problem), config.drawn))
     result["drive"] = driven(config, result)
     return result
 
@@ -320,11 +370,12 @@ def report(result: Result) -> str:
             f"{middle['cost']:.2f}", f"{middle['iterations']:.0f}", f"{middle['seconds']:.3f}",
         ])  # fmt: skip
     spreads = [
-        [f"{row['stray']:.2f}", what, f"{row[what]['said']:.4f}", between(row[what]["found"], ".4f")]
-        for row in result["spread"] for what in row if what != "stray"
+        [f"{row['stray']:.2f}", row["noise"], what, f"{row[what]['said']:.4f}", between(row[what]["found"], ".4f")]
+        for row in result["spread"] for what in row if what not in ("stray", "noise")
     ]  # fmt: skip
     driven = [
         [row["plan"], f"{row['nominal']:.1f}", f"{row['deviation']:.3f}", f"{row['end']:.3f}",
+         f"{100 * row['predicted']:.1f}",
          *(between([100 * part for part in row[how]], ".1f") for how in ("reached", "collided", "timed out"))]
         for row in result["drive"]
     ]  # fmt: skip
@@ -335,12 +386,12 @@ def report(result: Result) -> str:
         table(("problem", "solver", "converged", "least cost", "highest cost", "median cost", "iterations", "s"),
               solvers),
         f"Standard deviation (m) of x at the end of the light-dark plan, predicted and in {result['config']['drawn']}"
-        " drawn runs, by that of the start:",
-        table(("start (m)", "what", "predicted", "found, 95 %"), spreads),
+        " drawn runs, by that of the start, with the noise of readings taken at the mean or averaged over the belief:",
+        table(("start (m)", "noise of readings", "what", "predicted", "found, 95 %"), spreads),
         f"The differential drive in MuJoCo, {result['config']['trials']} trials of each plan, all with the same filter,"
         " noise and readings. The nominal cost is that of controls and end; deviations are of the position.",
-        table(("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "reached (%)", "collided (%)",
-               "timed out (%)"), driven),
+        table(("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "predicted to collide (%)",
+               "reached (%)", "collided (%)", "timed out (%)"), driven),
         picture(result, "belief_space",
                 "Plans, what they know within two standard deviations, and how well beacons are seen"),
     ])  # fmt: skip
