@@ -241,6 +241,35 @@ def test_a_step_is_that_of_an_extended_kalman_filter() -> None:
         np.testing.assert_allclose(columns @ columns.T, predicted - expected[1], atol=1e-14)
 
 
+def test_states_that_are_known_have_no_covariance() -> None:
+    """A step, its innovations and corrections, by matrices of the uncertain block; derivatives against differences."""
+    noise = ls.Noise(skids, size=3, parameters={"skid": 0.05})
+    near = ls.belief.NoisySensors(lambda x, u, p: beacons(x, u, p)[:2], parameters={"left": -2.0, "noise": 0.1})
+    of = ls.belief.Belief(robot(), dt=DT, noise=noise, sensors=near, uncertain=("y", "x"))
+    assert of.state_coordinates.names[3:] == ("root_x_x", "root_y_x", "root_y_y")
+    mean, u, block = np.array([0.4, -0.3, 0.7]), np.array([0.8, 0.5]), START[:2, :2]
+    state, readings = of.state(mean, np.pad(block, (0, 1))), np.array([2.6, 1.5])
+    after, a = robot().step(mean, u, DT), robot().linearize(mean, u, DT)[0][:2, :2]
+    m = of.process.matrices(robot(), mean[None], u[None])[0, :2]
+    predicted = a @ block @ a.T + m @ m.T
+    apart = after[:2] - [[-2.0, 0.0], [2.0, 0.0]]
+    expected = np.sqrt(np.square(apart).sum(axis=1) + 0.01)
+    h = apart / expected[:, None]
+    gain = predicted @ h.T @ np.linalg.inv(h @ predicted @ h.T + np.diag(0.1 * (0.1 + expected)) ** 2)
+    found = of.step(state, u, DT)
+    np.testing.assert_allclose(found[:3], after, atol=1e-14)
+    full = np.pad(predicted - gain @ h @ predicted, (0, 1))
+    np.testing.assert_allclose(of.covariance(found), full, atol=1e-14)
+    columns = of.innovations.matrices(of, state[None], u[None])[0, :3]
+    np.testing.assert_allclose(columns @ columns.T, np.pad(gain @ h @ predicted, (0, 1)), atol=1e-14)
+    given = of.corrected(state[None], u[None], readings[None])[0, :3]
+    np.testing.assert_allclose(given, after + np.pad(gain @ (readings - expected), (0, 1)), atol=1e-13)
+    assert all(check.good for check in ls.check_derivatives(of))
+    for names, message in ((("z",), "uncertain: got 'z'"), ((), "at least one state"), (("x", "x"), "at most once")):
+        with pytest.raises(ls.InputError, match=message):
+            ls.belief.Belief(robot(), dt=DT, noise=noise, sensors=near, uncertain=names)
+
+
 def test_derivatives_of_a_step_are_those_of_differences() -> None:
     """First and second ones; differences of Jacobians in steps of 1e-6 are good to some 1e-8."""
     of, rng = belief(), np.random.default_rng(1)

@@ -20,8 +20,9 @@ class BeliefFeedback(Controller):
     """The policy of a plan in belief space: controls affine in the mean and the root of the covariance.
 
     It reads the belief's sensors in place of measured states, from the end of the first period on, and begins with the
-    plan's first belief. `ReadingErrors` are their errors in a run, and the belief's `process` is the noise that the
-    filter assumes. A rollout's `controller_run` has `beliefs`, (T, K, N) at the knots at which there is a control.
+    plan's first belief. States that the belief takes as known are measured. `ReadingErrors` are the errors of readings
+    in a run, and the belief's `process` is the noise that the filter assumes. A rollout's `controller_run` has
+    `beliefs`, (T, K, N) at the knots at which there is a control.
 
     Args:
       problem: a problem whose dynamics are a `Belief`.
@@ -89,8 +90,10 @@ class BeliefRun(ControllerRun):
 
     def control(self, step: int, measured: Array) -> Array:
         policy = self._law.solution.policy
+        belief = self._law.belief
         if step:
-            self._now = self._law.belief.corrected(self._now, self._command, measured)
+            self._now = belief.corrected(self._now, self._command, measured[:, : belief.readings])
+        self._now[:, belief.known] = measured[:, belief.readings :]
         self._record.append(self._now)
         t = min(step, policy.steps - 1)
         self._command = self._evaluate(self._now, policy.gain[t], policy.offset[t], policy.nominal[t])

@@ -12,7 +12,7 @@ is the noise of the belief. Everything is formulas, with exact first and second 
 """
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, product
 from statistics import NormalDist
 from typing import Annotated, Any, NamedTuple
@@ -26,7 +26,18 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.edge_pushing import Operations, hessian_of, jacobian_of
 from lqrsim.codegen.sources import text_source
 from lqrsim.codegen.user_functions import check_signature, level_of, name_of, rows_of
-from lqrsim.errors import Array, InputError, check_array, check_kind, check_name, real, shaped, vectors_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_items,
+    check_kind,
+    check_name,
+    excerpt,
+    real,
+    shaped,
+    vectors_of,
+)  # fmt: skip
 from lqrsim.problem.dynamics import MOST_STEPS, Dynamics
 from lqrsim.problem.formulas import SymbolicConstraint
 from lqrsim.problem.noise import Noise
@@ -72,7 +83,7 @@ class _Step(NamedTuple):
     """A step of a belief in operations: their names.
 
     Attributes:
-      after: mean and root, (N,). columns: of the noise of the mean, (Y, n).
+      after: mean and root, (N,). columns: of the noise of the uncertain means, Y of them.
     """
 
     operations: Operations
@@ -97,12 +108,18 @@ class Belief(Dynamics):
       sensors: what is read at the end of each period.
       averaged: whether the noise of a reading is its mean over the belief, rather than that at the mean: wherever the
         noise changes over the covariance, the filter is too sure without it.
+      uncertain: the states of the robot with a covariance; by default all. The others are taken as known: in a run they
+        are the measured ones. With position and velocity alone a quadrotor has 12 + 21 states in place of 90.
+
+    Attributes:
+      rows: the numbers of the uncertain states. known: those of the others.
     """
 
     @checked
     def __init__(
-        self, dynamics: Dynamics, *, dt: Positive, noise: Noise, sensors: NoisySensors, averaged: bool = False
-    ) -> None:
+        self, dynamics: Dynamics, *, dt: Positive, noise: Noise, sensors: NoisySensors, averaged: bool = False,
+        uncertain: Sequence[str] | None = None,
+    ) -> None:  # fmt: skip
         check_kind("Belief: noise", noise, Noise, "a Noise")
         check_kind("Belief: sensors", sensors, NoisySensors, "NoisySensors(...)")
         for what, level in (("dynamics", dynamics.level), ("noise", noise.level)):
@@ -113,9 +130,14 @@ class Belief(Dynamics):
         self.robot, self.process, self.sensors, self.averaged = dynamics, noise, sensors, averaged
         space, controls = dynamics.state_coordinates, dynamics.control_coordinates
         names, units = space.names, space.units
-        pairs = [(i, j) for i in range(len(names)) for j in range(i + 1)]
+        chosen = names if uncertain is None else check_items("Belief: uncertain", uncertain, str, "names of states")
+        if not chosen or len({*chosen}) < len(chosen):
+            raise InputError(f"Belief: uncertain: got {excerpt(chosen)}, want at least one state, each at most once")
+        self.rows = sorted(names.index(check_name("Belief: uncertain", name, names)) for name in chosen)
+        self.known = [i for i in range(len(names)) if i not in self.rows]
+        pairs = [(i, j) for i in self.rows for j in self.rows if j <= i]
         super().__init__(
-            _key(dynamics, dt, noise, sensors, averaged),
+            _key(dynamics, dt, noise, sensors, averaged, self.rows),
             states=dict(zip(names, units, strict=True)) | {f"root_{names[i]}_{names[j]}": units[i] for i, j in pairs},
             controls=dict(zip(controls.names, controls.units, strict=True)),
             parameters=_together(dynamics.parameters, noise.parameters, sensors.parameters),
@@ -135,22 +157,25 @@ class Belief(Dynamics):
         return len(self.robot.state_coordinates)
 
     def state(self, mean: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
-        """The belief (N,) with a mean (n,) and a covariance (n, n), positive definite; or (n,) standard deviations."""
-        n = self.size
+        """The belief (N,) of a mean (n,) and a covariance (n, n), positive definite in the uncertain states; or (n,)
+        standard deviations.
+        """
+        n, rows = self.size, self.rows
         given = real("covariance", covariance)
         full = np.diag(check_array("covariance", given, (n,)) ** 2) if given.ndim == 1 else given
         try:
-            root = np.linalg.cholesky(check_array("covariance", full, (n, n)))
+            root = np.linalg.cholesky(check_array("covariance", full, (n, n))[np.ix_(rows, rows)])
         except np.linalg.LinAlgError:
             raise InputError("covariance: got one that is not positive definite, want every deviation > 0") from None
-        return np.concatenate([check_array("mean", mean, (n,)), root[np.tril_indices(n)]])
+        return np.concatenate([check_array("mean", mean, (n,)), root[np.tril_indices(len(rows))]])
 
     def covariance(self, states: npt.ArrayLike) -> Array:
-        """The covariances (..., n, n) of beliefs (..., N)."""
-        n = self.size
+        """The covariances (..., n, n) of beliefs (..., N), zero in states that are known."""
+        n, rows = self.size, np.array(self.rows)
         given = vectors_of("states", states, len(self.state_coordinates))
         root = np.zeros((*given.shape[:-1], n, n))
-        root[..., *np.tril_indices(n)] = given[..., n:]
+        i, j = np.tril_indices(len(rows))
+        root[..., rows[i], rows[j]] = given[..., n:]
         return root @ root.swapaxes(-1, -2)
 
     def uncertainty(self, weights: Mapping[str, float]) -> dict[str, float]:
@@ -162,7 +187,7 @@ class Belief(Dynamics):
         Returns:
           Name of an entry of the root -> its weight.
         """
-        names = self.robot.state_coordinates.names
+        names = [self.robot.state_coordinates.names[i] for i in self.rows]
         for name in weights:
             check_name("weights", name, names)
         return {
@@ -195,7 +220,7 @@ class Belief(Dynamics):
           chance: largest chance that an entry is negative, below a half.
         """
         parameters = check_kind("chance_constraint: parameters", parameters or {}, Mapping, "a dictionary by name")
-        n, names = self.size, tuple(self.robot.state_coordinates.names)
+        n, rows, names = self.size, self.rows, tuple(self.robot.state_coordinates.names)
         quantile = -NormalDist().inv_cdf(chance)
 
         @functools.wraps(function)
@@ -203,10 +228,10 @@ class Belief(Dynamics):
             from sympy import sqrt, sympify
 
             returned = function(symbolic.Vector(x[:n], names), u, p)
-            root, margins = _lower(x[n:], n), []
+            root, margins = _lower(x[n:], len(rows)), []
             for entry in returned if isinstance(returned, list | tuple) else [returned]:
-                slopes = [sympify(entry).diff(state) for state in x[:n]]
-                spread = sum(sum(slopes[i] * root[i][j] for i in range(j, n)) ** 2 for j in range(n))
+                slopes = [sympify(entry).diff(x[i]) for i in rows]
+                spread = sum(sum(slopes[i] * root[i][j] for i in range(j, len(rows))) ** 2 for j in range(len(rows)))
                 margins.append(entry - p.deviations * sqrt(spread))
             return margins
 
@@ -296,26 +321,26 @@ class Belief(Dynamics):
         """A step, in operations; with `read`, of a filter whose readings are the symbols w."""
         import sympy
 
-        n, operations = self.size, Operations()
-        name = operations.name
+        size, rows, operations = self.size, self.rows, Operations()
+        name, n = operations.name, len(rows)
         x = [sympy.Symbol(f"x{i}", real=True) for i in range(len(self.state_coordinates))]
         rates, means, u = self._formulas(self.robot.f)
         process = self.process
         if process.matrix is None:
-            entries, _, _ = self._formulas(lambda x, u, p: [*chain(*process._rows(process.function(x, u, p), n))])
+            entries, _, _ = self._formulas(lambda x, u, p: [*chain(*process._rows(process.function(x, u, p), size))])
         else:
             entries = [sympy.Float(one) if one else sympy.Integer(0) for one in process.matrix.ravel().tolist()]
         strength = sympy.Float(process.strength) if process.strength != 1 else sympy.Integer(1)
-        shaken = [[name(strength * one) for one in entries[i * process.size :][: process.size]] for i in range(n)]
-        mean, slopes = _moved(operations, rates, means, n, self.robot, float(self.period or 0))
-        root = _lower(x[n:], n)
+        shaken = [[name(strength * one) for one in entries[i * process.size :][: process.size]] for i in rows]
+        mean, slopes = _moved(operations, rates, means, rows, self.robot, float(self.period or 0))
+        root = _lower(x[size:], n)
         turned = [[name(sum(slopes[i][k] * root[k][j] for k in range(j, n))) for j in range(n)] for i in range(n)]
         root = _cholesky(operations, [a + b for a, b in zip(turned, shaken, strict=True)], n)
         pairs, _, _ = self._sensing()
         at = dict(zip(means, mean, strict=True))
         columns, now, before = [], mean, root
         for row, (reading, deviation) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
-            slope = [name(sympy.sympify(reading.diff(state)).xreplace(at)) for state in means]
+            slope = [name(sympy.sympify(reading.diff(means[i])).xreplace(at)) for i in rows]
             variance = self._variance(operations, deviation, means, mean, before)
             seen = [name(sum(slope[i] * root[i][j] for i in range(j, n))) for j in range(n)]
             sums = [variance]  # of the squares from the last to each
@@ -324,12 +349,15 @@ class Belief(Dynamics):
             column = [name(sum(root[i][j] * seen[j] for j in range(i + 1))) for i in range(n)]
             columns.append([name(one / sympy.sqrt(sums[0])) for one in column])
             if read:
-                off = sum((s * (a - b) for s, a, b in zip(slope, now, mean, strict=True)), name(reading.xreplace(at)))
+                off = sum(
+                    (s * (now[i] - mean[i]) for s, i in zip(slope, rows, strict=True)), name(reading.xreplace(at))
+                )
                 share = name((sympy.Symbol(f"w{row}", real=True) - off) / sums[0])
-                now = [name(a + one * share) for a, one in zip(now, column, strict=True)]
+                now = list(now)
+                for i, one in zip(rows, column, strict=True):
+                    now[i] = name(now[i] + one * share)
             root = _informed(operations, root, seen, sums)
         return _Step(operations, x, u, [*now, *(one for row in root for one in row)], columns)
-
 
     def _variance(
         self, operations: Operations, deviation: Any, means: list[Any], mean: list[Any], root: list[list[Any]]
@@ -342,14 +370,16 @@ class Belief(Dynamics):
         import sympy
 
         name = operations.name
-        depends = [i for i, one in enumerate(means) if one in deviation.free_symbols] if self.averaged else []
+        rows, symbols = self.rows, deviation.free_symbols if self.averaged else set[Any]()
+        depends = [i for i, row in enumerate(rows) if means[row] in symbols]
+        at = dict(zip(means, mean, strict=True))
         if not depends:
-            return name(deviation.xreplace(dict(zip(means, mean, strict=True))) ** 2)
+            return name(deviation.xreplace(at) ** 2)
         count, total = depends[-1] + 1, sympy.Integer(0)
         for j, side in product(range(count), (1, -1)):
             off = side * sympy.sqrt(sympy.Integer(count)).evalf()
-            place = {means[i]: name(mean[i] + off * root[i][j]) if j <= i else mean[i] for i in depends}
-            total += name(deviation.xreplace(place) ** 2)
+            moved = {means[rows[i]]: name(mean[rows[i]] + off * root[i][j]) for i in depends if j <= i}
+            total += name(deviation.xreplace(at | moved) ** 2)
         return name(total / (2 * count))
 
 
@@ -365,12 +395,12 @@ class _Innovations(Noise):
 
         made, belief = self._belief._step(), self._belief
         strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)
-        rows = list(range(belief.size))
+        rows = belief.rows
         name = made.operations.name
         flat = [name(strength * one) for column in made.columns for one in column]
         slopes = jacobian_of(made.operations, flat, [*made.x, *made.u])
         active = sorted({j for _, j in slopes})
-        values = {f"out[{i}, {k}]": flat[k * len(rows) + i] for i in rows for k in range(self.size)}
+        values = {f"out[{i}, {k}]": flat[k * len(rows) + i] for i in range(len(rows)) for k in range(self.size)}
         changes = {
             f"slopes[{at // len(rows)}, {at % len(rows)}, {active.index(j)}]": slope
             for (at, j), slope in slopes.items()
@@ -384,12 +414,12 @@ class _Innovations(Noise):
 
 
 def _key(
-    dynamics: Dynamics, dt: float, noise: Noise, sensors: NoisySensors, averaged: bool
+    dynamics: Dynamics, dt: float, noise: Noise, sensors: NoisySensors, averaged: bool, rows: list[int]
 ) -> Callable[[Any, Any, Any], Any]:
     """A function that refers to all that a belief is made of, by which its formulas are kept; nothing calls it."""
     parts = (
         dynamics.f, dynamics.discrete, dynamics.substeps, float(dt), noise.strength,
-        noise.function if noise.matrix is None else noise.matrix, sensors.function, averaged,
+        noise.function if noise.matrix is None else noise.matrix, sensors.function, averaged, rows,
     )  # fmt: skip
 
     def belief(x: Any, u: Any, p: Any) -> Any:
@@ -430,42 +460,44 @@ def _lower(entries: Any, n: int) -> list[list[Any]]:
 
 
 def _moved(
-    operations: Operations, rates: list[Any], x: list[Any], n: int, robot: Dynamics, dt: float
+    operations: Operations, rates: list[Any], x: list[Any], rows: list[int], robot: Dynamics, dt: float
 ) -> tuple[list[Any], list[list[Any]]]:
-    """The robot's state after a period and its Jacobian by the state, (n, n): those of `Dynamics.step`."""
+    """The robot's state after a period, (n,), and the Jacobian of some states by these: those of `Dynamics.step`."""
     import sympy
 
-    name, identity = operations.name, [[sympy.Integer(int(i == j)) for j in range(n)] for i in range(n)]
-    jacobian = [[rate.diff(one) for one in x] for rate in rates]
+    name, moved = operations.name, {*rows}  # with those that they move in turn
+    while more := {i for i, one in enumerate(rates) if i not in moved and one.free_symbols & {x[j] for j in moved}}:
+        moved |= more
+    jacobian = {i: {k: slope for k in moved if (slope := sympy.sympify(rates[i].diff(x[k]))) != 0} for i in moved}
+    identity = {i: [sympy.Integer(int(i == row)) for row in rows] for i in moved}
+    states, columns = range(len(x)), range(len(rows))
 
-    def at(state: list[Any], slopes: list[list[Any]]) -> tuple[list[Any], list[list[Any]]]:
+    def at(state: list[Any], slopes: dict[int, list[Any]]) -> tuple[list[Any], dict[int, list[Any]]]:
         place = dict(zip(x, state, strict=True))
-        value = [name(rate.xreplace(place)) for rate in rates]
-        own = [[name(sympy.sympify(one).xreplace(place)) for one in row] for row in jacobian]
-        return value, [[name(sum(own[i][k] * slopes[k][j] for k in range(n))) for j in range(n)] for i in range(n)]
+        own = {i: {k: name(one.xreplace(place)) for k, one in row.items()} for i, row in jacobian.items()}
+        changes = {
+            i: [name(sum(one * slopes[k][j] for k, one in row.items())) for j in columns] for i, row in own.items()
+        }
+        return [name(rate.xreplace(place)) for rate in rates], changes
 
     if robot.discrete:
-        return at(x, identity)
+        state, slopes = at(x, identity)
+        return state, [slopes[row] for row in rows]
     state, slopes, h = x, identity, sympy.Float(dt / robot.substeps)
     for _ in range(robot.substeps):
-        stages: list[tuple[list[Any], list[list[Any]]]] = []
+        stages: list[tuple[list[Any], dict[int, list[Any]]]] = []
         for share in (0, h / 2, h / 2, h):
-            k, K = stages[-1] if stages else (state, slopes)
-            stages.append(
-                at(
-                    [name(a + share * b) if share else a for a, b in zip(state, k, strict=True)],
-                    [[name(a + share * b) if share else a for a, b in zip(*rows, strict=True)]
-                     for rows in zip(slopes, K, strict=True)],
-                )
-            )  # fmt: skip
+            there, slopes_there = state, slopes
+            if share:
+                k, K = stages[-1]
+                there = [name(a + share * b) for a, b in zip(state, k, strict=True)]
+                slopes_there = {i: [name(slopes[i][j] + share * K[i][j]) for j in columns] for i in moved}
+            stages.append(at(there, slopes_there))
         weights = (h / 6, h / 3, h / 3, h / 6)
-        after = [name(state[i] + sum(w * k[i] for w, (k, _) in zip(weights, stages, strict=True))) for i in range(n)]
-        slopes = [
-            [name(slopes[i][j] + sum(w * K[i][j] for w, (_, K) in zip(weights, stages, strict=True))) for j in range(n)]
-            for i in range(n)
-        ]
-        state = after
-    return state, slopes
+        weighed = list(zip(weights, stages, strict=True))
+        state = [name(state[i] + sum(w * k[i] for w, (k, _) in weighed)) for i in states]
+        slopes = {i: [name(slopes[i][j] + sum(w * K[i][j] for w, (_, K) in weighed)) for j in columns] for i in moved}
+    return state, [slopes[row] for row in rows]
 
 
 def _cholesky(operations: Operations, B: list[list[Any]], n: int) -> list[list[Any]]:

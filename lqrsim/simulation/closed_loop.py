@@ -266,6 +266,8 @@ class ClosedLoop:
             self.effects.follow(step, states, controls)
             read = self._readings
             shown = states if read is None else read.follow(step, states, self._held(step))
+            if isinstance(read, BeliefReadings):
+                shown = np.hstack([shown, states[:, read.belief.known]])
             self.controller_run.control(step, shown)
         self.step, self.measured = 0, self.measure(0)
 
@@ -296,6 +298,8 @@ class ClosedLoop:
         shown, knot = measured, self.knot + step
         if self._readings is not None:
             shown = self._readings.arriving(knot, self.states, None if step else self._held(knot))
+            if isinstance(self._readings, BeliefReadings):
+                shown = np.hstack([shown, measured[:, self._readings.belief.known]])
         try:
             commands = _checked_commands(self.controller_run.control(knot, shown), shape)
             failed = _not_finite(commands)

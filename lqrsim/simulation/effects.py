@@ -187,15 +187,15 @@ class BeliefReadings:
     """
 
     def __init__(self, belief: Belief, effects: Effects) -> None:
-        self._belief, self._effects = belief, effects
+        self.belief, self._effects = belief, effects
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """The exact readings (K, Y) at a knot of the plan, before the run begins."""
-        return self._belief.read(states)[0]
+        return self.belief.read(states)[0]
 
     def arriving(self, step: int, states: Array, held: Array | None) -> Array:
         """The readings (K, Y) in the true states (K, n)."""
-        exact, deviations = self._belief.read(states)
+        exact, deviations = self.belief.read(states)
         return self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS]
 
 
