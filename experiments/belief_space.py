@@ -1,13 +1,14 @@
 """Plans that see: the outlook of the paper on belief space, beside iLQG in belief space, and what seeing is worth.
 
     python experiments/belief_space.py                                        # some minutes
-    python experiments/belief_space.py --video docs/figures/belief_space.gif  # also a run of two plans
+    python experiments/belief_space.py --video docs/figures/belief_space.gif --flight docs/figures/belief_flight.gif
 
 light     The light-dark domain and its car: the smoother beside iLQR in belief space, from the same starts; with the
           most likely readings also IPOPT, where CasADi is installed.
 spread    The predicted spread of runs of a light-dark plan, against drawn runs, with the noise of readings at the mean
           of the belief and averaged over it.
 drive     The packaged drive among pillars, three of them beacons, in MuJoCo: how often plans fail.
+fly       The same of the packaged quadrotor among beams, with a beacon, and a covariance of its position alone.
 
 The domains are Platt, Tedrake, Kaelbling and Lozano-Perez (2010), and van den Berg, Patil and Alterovitz (2012), with
 the numbers of the public code of Abdulsamad (github.com/hanyas/trajopt).
@@ -17,6 +18,7 @@ import contextlib
 import dataclasses
 import itertools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,8 +33,11 @@ from runner import FolderSettings, Result, at_most, between, interval, opening, 
 
 import lqrsim as ls
 from lqrsim.belief import Belief, BeliefFeedback, NoisySensors, ReadingErrors
+from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.stress.statistics import rate
+
+Nominal = Callable[[ls.Trajectory], float]  # the cost of controls and end
 
 BEACONS = (-0.95, -0.5), (-1.2, 0.8), (-1.1, 2.1)  # on three pillars
 MODELS = Path(__file__).parents[1] / "models"
@@ -45,6 +50,11 @@ STRAY = 0.03  # m and rad, of the start
 GOAL = {"x": 0.0, "y": 2.5, "heading": np.pi}
 ENDS = {"x": 5000.0, "y": 5000.0, "heading": 50.0}
 WEIGHTS = 10.0 ** np.linspace(0.6, 1.2, 25)  # of obstacles, for a plan that goes round them more widely
+BEACON = 0.2, 2.6, 0.0  # m, between two beams and a wall
+PERIOD, STEPS = 1 / 15, 75  # s, of the quadrotor
+AWAY, POSITION = 10.0, 200.0  # its weights of obstacles, and of the variance of the position
+FLIGHTS = np.linspace(10.0, 16.0, 7)  # of obstacles
+OFF, DRIFT = 0.05, 0.2  # m and m/s: standard deviations of its start, and of its measured velocities
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +66,9 @@ class Config(FolderSettings):
     drawn: int = 10_000
     """Runs of the light-dark plan."""
     video: Path | None = None
-    """FILE.gif or FILE.mp4 of two plans."""
+    """FILE.gif or FILE.mp4 of two plans of the drive."""
+    flight: Path | None = None
+    """The same of the quadrotor."""
 
 
 def light(x: Any, u: Any, p: Any) -> list[Any]:
@@ -249,16 +261,10 @@ def nominal(plan: ls.Trajectory) -> float:
     return float(30 * np.sum((plan.controls - 0.25) ** 2) + 0.5 * off @ (list(ENDS.values()) * off))
 
 
-def wider(blind: ls.Problem, world: ls.World, cost: float) -> ls.Solution:
-    """The plan without seeing that goes round the obstacles as widely as it can at about this nominal cost."""
-    radius, found = ls.DifferentialDrive().radius, list[ls.Solution]()
-    for weight in WEIGHTS:
-        away = ls.ObstacleCost(world, radius=radius, sharpness=10.0, weight=float(weight))
-        wide = dataclasses.replace(blind, stage_cost=ls.ControlCost([60.0, 60.0], about=[0.25, 0.25]) + away)
-        plan = ls.smooth(wide)
-        if plan.success:
-            found.append(plan)
-    return min(found, key=lambda plan: abs(nominal(plan.trajectory) - cost))
+def wider(wide: Callable[[float], ls.Problem], weights: Array, measure: Nominal, cost: float) -> ls.Solution:
+    """The plan without seeing, of those by weights of obstacles, whose nominal cost is nearest to this one."""
+    found = [plan for weight in weights if (plan := ls.smooth(wide(float(weight)))).success]
+    return min(found, key=lambda plan: abs(measure(plan.trajectory) - cost))
 
 
 def scene() -> ls.Scene:
@@ -280,34 +286,110 @@ def driven(config: Config, result: Result) -> list[Result]:
     """How often each plan fails in MuJoCo, with the same filter, noise and readings."""
     plant = ls.Plant(ls.DifferentialDrive(), scene())
     problems = drives(plant.world)
-    plans = {name: ls.smooth(problem) for name, problem in problems.items()}
-    blind, cost = problems["without seeing"], nominal(plans["with seeing"].trajectory)
-    problems["without seeing, wider"] = blind
-    plans["without seeing, wider"] = wider(blind, plant.world, cost)
-    belief, rows, shown = belief_of(blind), list[Result](), dict[str, ls.Rollout]()
+    plans = {name: (problem, ls.smooth(problem)) for name, problem in problems.items()}
+    blind, cost = problems["without seeing"], nominal(plans["with seeing"][1].trajectory)
+
+    def wide(weight: float) -> ls.Problem:
+        away = ls.ObstacleCost(plant.world, radius=plant.robot.radius, sharpness=10.0, weight=weight)
+        return dataclasses.replace(blind, stage_cost=ls.ControlCost([60.0, 60.0], about=[0.25, 0.25]) + away)
+
+    plans["without seeing, wider"] = blind, wider(wide, WEIGHTS, nominal, cost)
+    belief = belief_of(blind)
     met = [ls.disturbances.InitialStateError(STRAY), belief.process, ReadingErrors(belief)]
-    for name, plan in plans.items():
-        law = BeliefFeedback(problems[name], plan)
-        runs = ls.simulate(
-            plant, controller=law, disturbances=met, trials=config.trials, frames=config.video is not None
-        )
-        known = np.sqrt(np.trace(belief.covariance(plan.trajectory.states)[:, :2, :2], axis1=1, axis2=2))
+    draw(config, result, plant.world, plans)
+    view = {"camera": "top", "size": (560, 316), "fps": 8, "speed": 3.0}
+    return tried(config, plant, plans, met, nominal, config.video, view)
+
+
+def tried(
+    config: Config, plant: ls.Plant, plans: dict[str, tuple[ls.Problem, ls.Solution]], met: list[Any], measure: Nominal,
+    video: Path | None, view: dict[str, Any],
+) -> list[Result]:  # fmt: skip
+    """Rates of plans' outcomes, beside what is predicted; and a video of a trial that seeing saves."""
+    rows, shown = list[Result](), dict[str, ls.Rollout]()
+    for name, (problem, plan) in plans.items():
+        law, tube, belief = BeliefFeedback(problem, plan), ls.predict_tube(problem, plan), belief_of(problem)
+        runs = ls.simulate(plant, controller=law, disturbances=met, trials=config.trials, frames=video is not None)
+        place = list(belief.robot.state_coordinates.position)
+        known = np.sqrt(np.einsum("tii->ti", belief.covariance(plan.trajectory.states))[:, place].sum(axis=1))
         fails = {how: runs.outcome.count(how) for how in ("reached", "collided", "timed out")}
         rows.append({
             "plan": name, "status": plan.status.name, "iterations": len(plan.iterations),
-            "nominal": nominal(plan.trajectory), "deviation": float(known.max()), "end": float(known[-1]),
+            "nominal": measure(plan.trajectory), "deviation": float(known.max()), "end": float(known[-1]),
+            "predicted": tube.collision_chance,
         } | {how: interval(rate(count, config.trials)) for how, count in fails.items()})  # fmt: skip
-        tube = ls.predict_tube(problems[name], plan)
-        rows[-1]["predicted"] = tube.collision_chance
         shown[name] = tube.added_to(runs)
-    draw(config, result, plant.world, {name: (problems[name], plan) for name, plan in plans.items()})
-    if config.video is not None:
+    if video is not None:
         names = "without seeing", "with seeing"
         lost = [np.array([one != "reached" for one in shown[name].outcome]) for name in names]
         trial = int(np.argmax(lost[0] & ~lost[1]))
-        ls.render([shown[name] for name in names], config.video, trial=trial, titles=names, camera="top",
-                  overlays=("plan", "trace", "tube", "caption"), size=(560, 316), fps=8, speed=3.0)  # fmt: skip
+        ls.render([shown[name] for name in names], video, trial=trial, titles=names,
+                  overlays=("plan", "trace", "tube", "caption"), **view)  # fmt: skip
     return rows
+
+
+def beacon(x: Any, u: Any, p: Any) -> list[Any]:
+    """The position relative to the beacon, measured the worse the farther it is."""
+    off = [one - there for one, there in zip((x.x, x.y, x.z), BEACON, strict=True)]
+    deviation = p.least + p.growth * sum(one**2 for one in off)
+    return [(one, deviation) for one in off]
+
+
+def cage() -> ls.Scene:
+    """The cage of beams with the beacon and light about it, which are only drawn."""
+    spec = mujoco.MjSpec.from_file(str(MODELS / "cage.xml"))
+    for k, (size, opacity) in enumerate(((0.1, 1.0), (0.4, 0.3), (0.7, 0.2))):
+        spec.worldbody.add_geom(
+            name=f"light_{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[size, 0, 0], pos=BEACON,
+            rgba=[1.0, 0.8, 0.1, opacity], contype=0, conaffinity=0,
+        )  # fmt: skip
+    return scene_from_xml(spec.to_xml(), "cage")
+
+
+def flown(config: Config) -> list[Result]:
+    """The same for the quadrotor, which measures its attitude well, its velocity badly, and its position by a beacon.
+
+    The belief has a covariance of the position alone, which drifts with the noise of the measured velocity.
+    """
+    scenario = ls.scenarios.quadrotor()
+    robot, plant = scenario.robot, ls.Plant(scenario.robot, cage())
+    start, goal = scenario.problem.start, scenario.problem.weighed_goal
+    assert start is not None
+    assert goal is not None
+    names, first = robot.dynamics.state_coordinates.names, np.repeat([OFF, 0.0, 0.0, 0.0], 3)
+    belief = Belief(
+        robot.dynamics, dt=PERIOD, noise=ls.Noise(np.diag(np.repeat([DRIFT * PERIOD, 0.0, 0.0, 0.0], 3))),
+        sensors=NoisySensors(beacon, parameters={"least": 0.02, "growth": 0.3}), uncertain=("x", "y", "z"),
+    )  # fmt: skip
+    effort = ls.ControlCost(np.full(4, 20.0), about=np.full(4, ls.Quadrotor().hover_force))
+    ends, about = dict.fromkeys(names, 500.0), dict(zip(names, goal.tolist(), strict=True))
+
+    def wide(weight: float) -> ls.Problem:
+        away = ls.ObstacleCost(plant.world, radius=robot.radius, sharpness=10.0, weight=weight)
+        return ls.Problem(
+            dynamics=belief, dt=PERIOD, steps=STEPS, initial=ls.FixedState(belief.state(start, first)),
+            stage_cost=effort + away, final_cost=ls.QuadraticCost(ends, about=about),
+        )  # fmt: skip
+
+    def measure(plan: ls.Trajectory) -> float:
+        off = plan.states[-1, :12] - goal
+        return float(10 * np.sum((plan.controls - ls.Quadrotor().hover_force) ** 2) + 250 * off @ off)
+
+    blind = wide(AWAY)
+    along, at_end = (belief.uncertainty(dict.fromkeys("xyz", weight)) for weight in (POSITION, 500.0))
+    seeing = dataclasses.replace(
+        blind, stage_cost=blind.stage_cost + ls.QuadraticCost(along, about={}), noise=belief.innovations,
+        final_cost=ls.QuadraticCost(ends | at_end, about=about),
+    )  # fmt: skip
+    plans = {name: (one, ls.smooth(one)) for name, one in (("without seeing", blind), ("with seeing", seeing))}
+    cost = measure(plans["with seeing"][1].trajectory)
+    plans["without seeing, wider"] = blind, wider(wide, FLIGHTS, measure, cost)
+    met = [
+        ls.disturbances.InitialStateError(tuple(first.tolist())), ReadingErrors(belief),
+        ls.disturbances.MeasurementNoise((0.0,) * 3 + (DRIFT,) * 3 + (0.0,) * 6),
+    ]  # fmt: skip
+    view = {"size": (560, 316), "fps": 8, "speed": 1.0}
+    return tried(config, plant, plans, met, measure, config.flight, view)
 
 
 def draw(config: Config, result: Result, world: ls.World, plans: dict[str, tuple[ls.Problem, ls.Solution]]) -> None:
@@ -351,7 +433,7 @@ def main(config: Config) -> Result:
         problem = light_dark(stray, averaged=averaged)
         said = {"noise": "averaged" if averaged else "at the mean", "stray": stray}
         result["spread"].append(said | spread(problem, ls.smooth(problem), config.drawn))
-    result["drive"] = driven(config, result)
+    result["drive"], result["fly"] = driven(config, result), flown(config)
     return result
 
 
@@ -373,12 +455,16 @@ def report(result: Result) -> str:
         [f"{row['stray']:.2f}", row["noise"], what, f"{row[what]['said']:.4f}", between(row[what]["found"], ".4f")]
         for row in result["spread"] for what in row if what not in ("stray", "noise")
     ]  # fmt: skip
-    driven = [
-        [row["plan"], f"{row['nominal']:.1f}", f"{row['deviation']:.3f}", f"{row['end']:.3f}",
-         f"{100 * row['predicted']:.1f}",
-         *(between([100 * part for part in row[how]], ".1f") for how in ("reached", "collided", "timed out"))]
-        for row in result["drive"]
-    ]  # fmt: skip
+    tables = {
+        name: [
+            [row["plan"], f"{row['nominal']:.1f}", f"{row['deviation']:.3f}", f"{row['end']:.3f}",
+             f"{100 * row['predicted']:.1f}",
+             *(between([100 * part for part in row[how]], ".1f") for how in ("collided", "reached", "timed out"))]
+            for row in result[name]
+        ] for name in ("drive", "fly")
+    }  # fmt: skip
+    headings = ("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "predicted to collide (%)",
+                "collided (%)", "reached (%)", "timed out (%)")  # fmt: skip
     return "\n\n".join([
         "## Plans that see",
         "The light-dark domain and its car, from zero and random controls. Costs are expectations; medians are of the"
@@ -390,8 +476,10 @@ def report(result: Result) -> str:
         table(("start (m)", "noise of readings", "what", "predicted", "found, 95 %"), spreads),
         f"The differential drive in MuJoCo, {result['config']['trials']} trials of each plan, all with the same filter,"
         " noise and readings. The nominal cost is that of controls and end; deviations are of the position.",
-        table(("plan", "nominal cost", "largest deviation (m)", "at the end (m)", "predicted to collide (%)",
-               "reached (%)", "collided (%)", "timed out (%)"), driven),
+        table(headings, tables["drive"]),
+        "The quadrotor in the same way. It measures its attitude well and its velocity badly, and sees its position"
+        " by a beacon; its belief has a covariance of the position alone.",
+        table(headings, tables["fly"]),
         picture(result, "belief_space",
                 "Plans, what they know within two standard deviations, and how well beacons are seen"),
     ])  # fmt: skip
