@@ -388,7 +388,7 @@ def flown(config: Config) -> list[Result]:
         ls.disturbances.InitialStateError(tuple(first.tolist())), ReadingErrors(belief),
         ls.disturbances.MeasurementNoise((0.0,) * 3 + (DRIFT,) * 3 + (0.0,) * 6),
     ]  # fmt: skip
-    view = {"size": (560, 316), "fps": 8, "speed": 1.0}
+    view = {"camera": "top", "size": (640, 460), "fps": 8, "speed": 1.0}
     return tried(config, plant, plans, met, measure, config.flight, view)
 
 

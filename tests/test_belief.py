@@ -33,9 +33,10 @@ def linear_readings(x: Any, u: Any, p: Any) -> list[Any]:
     return [(sum(H[i, j] * x[j] for j in range(2)), float(R[i])) for i in range(2)]
 
 
-def linear_belief() -> ls.belief.Belief:
+def linear_belief(delay: int = 0) -> ls.belief.Belief:
     dynamics = ls.Dynamics(linear, states={"x": "m", "v": "m/s"}, controls={"a": "N", "b": "N"}, period=DT)
-    return ls.belief.Belief(dynamics, dt=DT, noise=ls.Noise(M), sensors=ls.belief.NoisySensors(linear_readings))
+    sensors = ls.belief.NoisySensors(linear_readings, delay=delay)
+    return ls.belief.Belief(dynamics, dt=DT, noise=ls.Noise(M), sensors=sensors)
 
 
 def unicycle(x: Any, u: Any, p: Any) -> list[Any]:
@@ -114,6 +115,33 @@ def test_the_predicted_covariance_is_that_of_drawn_runs() -> None:
     variances = np.diag(expected)
     errors = np.sqrt((np.outer(variances, variances) + expected**2) / trials)
     assert (np.abs(found - expected) < 4.5 * errors).all()
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_late_and_lost_readings_are_taken_at_their_time(delay: int) -> None:
+    """The controls of a run are of the mean by a Kalman filter of matrices that has only what arrived; to rounding."""
+    of, steps, trials, rng = linear_belief(delay), 8, 3, np.random.default_rng(7)
+    problem = ls.Problem(
+        dynamics=of, dt=DT, steps=steps, initial=ls.FixedState(of.state([1.0, -0.5], START[:2, :2])),
+        stage_cost=ls.QuadraticCost({"x": 2.0, "v": 1.0}, about={}) + ls.ControlCost([0.5, 0.3]),
+        final_cost=ls.QuadraticCost({"x": 2.0}, about={}),
+    )  # fmt: skip
+    run = ls.belief.BeliefFeedback(problem, ls.smooth(problem)).start(trials)
+    readings = rng.normal(size=(steps, trials, 2))
+    readings[rng.random(readings.shape) < 0.4] = np.nan
+    late = np.full((delay, trials, 2), np.nan)
+    controls = [run.control(t, shown) for t, shown in enumerate([*late, *readings][:steps])]
+    for t, k in np.ndindex(steps, trials):
+        mean, covariance = np.array([1.0, -0.5]), START[:2, :2]
+        for i in range(t):
+            mean, covariance = A @ mean + B @ controls[i][k], A @ covariance @ A.T + M @ M.T
+            got = np.isfinite(readings[i + 1, k]) & (i + 1 <= t - delay)
+            h, y = H[got], readings[i + 1, k][got]
+            gain = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + np.diag(R[got] ** 2))
+            mean, covariance = mean + gain @ (y - h @ mean), covariance - gain @ h @ covariance
+        belief = run.beliefs[t, k]
+        np.testing.assert_allclose(belief[:2], mean, atol=1e-12)
+        np.testing.assert_allclose(of.covariance(belief), covariance, atol=1e-12)
 
 
 def test_averaged_noise_is_that_of_the_readings_drawn() -> None:
@@ -293,7 +321,7 @@ def test_derivatives_of_a_step_are_those_of_differences() -> None:
 
 def drive(scenario: ls.Scenario, **changed: Any) -> ls.Problem:
     """The packaged drive, two seconds along a wall with a beacon."""
-    sensors = ls.belief.NoisySensors(beacons, parameters={"left": -2.0, "noise": 0.05})
+    sensors = ls.belief.NoisySensors(beacons, parameters={"left": -2.0, "noise": 0.05}, delay=1)
     noise = ls.Noise(0.01 * np.eye(3))
     of = ls.belief.Belief(scenario.robot.dynamics, dt=DT, noise=noise, sensors=sensors)
     given: dict[str, Any] = {
@@ -353,7 +381,8 @@ def belief_scenario() -> ls.Scenario:
     problem = drive(scenario)
     of = problem.dynamics
     assert isinstance(of, ls.belief.Belief)
-    met = (ls.disturbances.InitialStateError(0.1), ls.disturbances.StateNoise(of.process), ls.belief.ReadingErrors(of))
+    lost = ls.belief.ReadingErrors(of, loss=0.2)
+    met = (ls.disturbances.InitialStateError(0.1), ls.disturbances.StateNoise(of.process), lost)
     return dataclasses.replace(scenario, name="along a wall", problem=problem, disturbances=met, goal_radius=0.1)
 
 
@@ -370,6 +399,7 @@ def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> Non
     found = results.outcomes(cell)
     assert found.outcome.tolist() == list(run.outcome)
     assert 0 < results.tally(cell)["reached"] < 20
+    assert "loss 0.2" in " ".join(run.disturbances)
     whole = found.outcome != "collided"
     np.testing.assert_array_equal(found.goal[whole], run.goal_distance[whole])
     stored = ls.stress.Results(tmp_path / "runs", scenario=setup.scenario)

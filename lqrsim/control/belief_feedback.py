@@ -64,7 +64,8 @@ class BeliefFeedback(Controller):
     @property
     def digest(self) -> str:
         data, first = self.belief.data, self.solution.trajectory.states[0]
-        return sha256(self.solution.policy.digest, self.belief.step_source.digest, data, first)[:16]
+        late = str(self.belief.sensors.delay)
+        return sha256(self.solution.policy.digest, self.belief.step_source.digest, data, first, late)[:16]
 
     @property
     def coordinates(self) -> Spaces:
@@ -75,26 +76,33 @@ class BeliefRun(ControllerRun):
     """K trials of a run.
 
     Attributes:
-      beliefs: at each knot so far, with its readings, (t, K, N).
+      beliefs: at each knot so far, with the readings that arrived, (t, K, N).
     """
 
     def __init__(self, law: BeliefFeedback, trials: int) -> None:
         policy = law.solution.policy
         self._law, self._evaluate = law, evaluator(policy.state_coordinates, policy.control_coordinates)
-        self._now, self._command = np.tile(law.solution.trajectory.states[0], (trials, 1)), np.empty((0, 0))
-        self._record: list[Array] = []
+        self._read = np.tile(law.solution.trajectory.states[0], (trials, 1))  # at the last knot whose readings arrived
+        self._commands, self._known, self._record = list[Array](), list[Array](), list[Array]()
 
     @property
     def beliefs(self) -> Array:
         return np.array(self._record)
 
     def control(self, step: int, measured: Array) -> Array:
-        policy = self._law.solution.policy
-        belief = self._law.belief
-        if step:
-            self._now = belief.corrected(self._now, self._command, measured[:, : belief.readings])
-        self._now[:, belief.known] = measured[:, belief.readings :]
-        self._record.append(self._now)
+        policy, belief = self._law.solution.policy, self._law.belief
+        readings, late = measured[:, : belief.readings], belief.sensors.delay
+        self._known.append(measured[:, belief.readings :])
+        if not step:
+            self._read[:, belief.known] = self._known[0]
+        if step > late:
+            self._read = belief.corrected(self._read, self._commands.pop(0), readings)
+            self._read[:, belief.known] = self._known[step - late]
+        now = self._read.copy()
+        for command in self._commands:  # whose readings have not arrived
+            now = belief.corrected(now, command, np.full_like(readings, np.nan))
+        now[:, belief.known] = self._known[step]
+        self._record.append(now)
         t = min(step, policy.steps - 1)
-        self._command = self._evaluate(self._now, policy.gain[t], policy.offset[t], policy.nominal[t])
-        return self._command
+        self._commands.append(self._evaluate(now, policy.gain[t], policy.offset[t], policy.nominal[t]))
+        return self._commands[-1]

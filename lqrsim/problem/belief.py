@@ -67,16 +67,19 @@ class NoisySensors:
         reading a pair: what is read in this state, and the standard deviation of its noise, which must be positive.
         Noises are independent. Read an angle by its sine and cosine, which do not count turns.
       parameters: name -> value, as in `Dynamics`.
+      delay: control periods after which readings arrive in a run. The filter takes them at their time; a plan takes
+        them as if they came at once.
     """
 
     @checked
     def __init__(
-        self, function: Callable[[Any, Any, Any], Any], *, parameters: Mapping[str, float] | None = None
-    ) -> None:
+        self, function: Callable[[Any, Any, Any], Any], *, parameters: Mapping[str, float] | None = None,
+        delay: Annotated[int, Bounds(at_least=0, at_most=1000)] = 0,
+    ) -> None:  # fmt: skip
         if level_of(function, None) == "compiled":
             raise InputError(f"NoisySensors: got the numba function {name_of(function)}, want one of SymPy symbols")
         check_signature(function, ("x", "u", "p"))
-        self.function, self.parameters = function, symbolic.check_parameters(parameters)
+        self.function, self.parameters, self.delay = function, symbolic.check_parameters(parameters), delay
 
 
 class _Step(NamedTuple):
@@ -238,12 +241,15 @@ class Belief(Dynamics):
         return SymbolicConstraint(margin, parameters={**parameters, "deviations": quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
-        """The beliefs (K, N) of the extended Kalman filter one period later, with readings (K, Y) at its end."""
+        """The beliefs (K, N) of the extended Kalman filter one period later, with readings (K, Y) at its end; NaN for those
+        that are lost.
+        """
         size = len(self.state_coordinates)
         states = shaped("states", states, (None, size))
         controls = shaped("controls", controls, (len(states), len(self.control_coordinates)))
         readings = shaped("readings", readings, (len(states), self.readings))
-        return self._each("corrected", size, states, controls, readings)
+        lost = np.isnan(readings)
+        return self._each("corrected", size, states, controls, np.hstack([np.where(lost, 0.0, readings), 1.0 - lost]))
 
     def read(self, states: Array) -> tuple[Array, Array]:
         """The exact readings (K, Y) in states (K, n) of the robot, and the standard deviations of their noise."""
@@ -318,7 +324,7 @@ class Belief(Dynamics):
         return symbolic.trace(function, *names, list(self.parameters), constants=self.constants)
 
     def _step(self, *, read: bool = False) -> _Step:
-        """A step, in operations; with `read`, of a filter whose readings are the symbols w."""
+        """A step, in operations; with `read`, of a filter: w are its readings, then 1 for each that is not lost."""
         import sympy
 
         size, rows, operations = self.size, self.rows, Operations()
@@ -342,7 +348,8 @@ class Belief(Dynamics):
         for row, (reading, deviation) in enumerate(zip(pairs[::2], pairs[1::2], strict=True)):
             slope = [name(sympy.sympify(reading.diff(means[i])).xreplace(at)) for i in rows]
             variance = self._variance(operations, deviation, means, mean, before)
-            seen = [name(sum(slope[i] * root[i][j] for i in range(j, n))) for j in range(n)]
+            arrived = sympy.Symbol(f"w{len(pairs) // 2 + row}", real=True) if read else sympy.Integer(1)
+            seen = [name(arrived * sum(slope[i] * root[i][j] for i in range(j, n))) for j in range(n)]
             sums = [variance]  # of the squares from the last to each
             for one in reversed(seen):
                 sums.insert(0, name(sums[0] + one**2))

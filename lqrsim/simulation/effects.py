@@ -187,16 +187,21 @@ class BeliefReadings:
     """
 
     def __init__(self, belief: Belief, effects: Effects) -> None:
-        self.belief, self._effects = belief, effects
+        self.belief, self._effects, self._taken = belief, effects, list[Array]()
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
-        """The exact readings (K, Y) at a knot of the plan, before the run begins."""
-        return self.belief.read(states)[0]
+        """The exact readings (K, Y) that arrive at a knot of the plan, before the run begins."""
+        return self._late(self.belief.read(states)[0])
 
     def arriving(self, step: int, states: Array, held: Array | None) -> Array:
-        """The readings (K, Y) in the true states (K, n)."""
+        """The readings (K, Y) that arrive in the true states (K, n), NaN for those that are lost."""
         exact, deviations = self.belief.read(states)
-        return self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS]
+        return self._late(self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS])
+
+    def _late(self, taken: Array) -> Array:
+        self._taken.append(taken)
+        arrived = len(self._taken) > self.belief.sensors.delay
+        return self._taken.pop(0) if arrived else np.full_like(taken, np.nan)
 
 
 class _Streams(Sequence[np.random.Generator]):

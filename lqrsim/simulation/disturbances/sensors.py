@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.annotations import NonNegative, checked
+from lqrsim.annotations import NonNegative, Share, checked
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_items, check_kind, check_name, keep
 from lqrsim.problem.belief import Belief
@@ -96,19 +96,24 @@ class ReadingErrors(Disturbance):
 
     Args:
       belief: the belief.
-      strength: factor of the standard deviations.
+      loss: chance that a reading is lost, each by itself.
+      strength: factor of the standard deviations and of the chance of a loss.
     """
 
     belief: Belief
+    loss: Share = 0.0
     strength: NonNegative = 1.0
 
     _scales = "strength"
 
     def describe(self, plant: Plant) -> str:
-        return f"errors of {self.belief.readings} readings, times {self.strength:g}"
+        lost = f", loss {self.loss:g}" if self.loss else ""
+        return f"errors of {self.belief.readings} readings{lost}, times {self.strength:g}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         errors = self.strength * normal(generators, plan.steps + 1, self.belief.readings)
+        if self.loss:
+            errors[uniform(generators, *errors.shape[1:]) < self.strength * self.loss] = np.nan
 
         def read(step: int, readings: Mapping[str, Array]) -> dict[str, Array]:
             found = dict(readings)
