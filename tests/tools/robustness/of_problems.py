@@ -163,8 +163,8 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         }, 0.3),
         **{f"{kind}.among": ({"self": robot, "world": place.plant.world},) for kind, robot in known.items()},
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
-        "NoisySensors": ({"function": light, "parameters": {"least": 0.1}},),
-        "Belief": (of_belief,),
+        "NoisySensors": ({"function": light, "parameters": {"least": 0.1}, "delay": 1},),
+        "Belief": (of_belief | {"averaged": True, "uncertain": ("x", "y")},),
         "Belief.state": ({"self": belief, "mean": np.zeros(3), "covariance": np.eye(3)},),
         "Belief.covariance": ({"self": belief, "states": np.ones((2, 9))},),
         "Belief.chance_constraint": (
@@ -182,7 +182,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Belief.with_parameters": ({"self": belief, "least": 0.2},),
         "Belief.with_substeps": ({"self": place.problem.dynamics, "count": 2},),  # a map has none
         "BeliefFeedback": ({"problem": planned, "solution": ls.smooth(planned)}, 0.5),
-        "ReadingErrors": ({"belief": belief, "strength": 1.0},),
+        "ReadingErrors": ({"belief": belief, "loss": 0.1, "strength": 1.0},),
         "ReadingErrors.scaled": ({"self": ls.belief.ReadingErrors(belief), "strength": 2.0},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),
