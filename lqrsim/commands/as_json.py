@@ -1,6 +1,5 @@
 """Results as plain dictionaries, for `--json`. docs/json.md describes them."""
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -241,8 +241,9 @@ class Belief(Dynamics):
         return SymbolicConstraint(margin, parameters={**parameters, "deviations": quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
-        """The beliefs (K, N) of the extended Kalman filter one period later, with readings (K, Y) at its end; NaN for those
-        that are lost.
+        """The beliefs (K, N) of the extended Kalman filter one period later.
+
+        Its readings (K, Y) are taken at the end of the period; NaN are lost.
         """
         size = len(self.state_coordinates)
         states = shaped("states", states, (None, size))
