@@ -40,10 +40,10 @@ MOST = 300  # largest number of iterations
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 # A sketch with a free duration whose cost is this many times that of the best plan leads to no better one.
 PROMISING = 1.1
-# Durations from which ways are sketched, relative to the stated one, and whether they are free then: each where none
-# before has led to a plan. The largest number of iterations of a sketch, its tolerance, that of constraints in their
-# units, and that of what is worth going on from, violations and gaps.
-SKETCHED = (1.0, True), (1.5, True), (0.25, True), (1.0, False), (2.0, False)
+# Durations from which ways are sketched, relative to the stated one, and whether they are free then: in turn until one
+# leads to a plan, and one more, as that plan may be a poor one. The largest number of iterations of a sketch, its
+# tolerance, that of constraints in their units, and that of what is worth going on from, violations and gaps.
+SKETCHED = (1.0, True), (1.0, False), (1.5, True), (2.0, True), (0.25, True), (2.0, False)
 SKETCH, ROUGH, KEPT, WORTH = 100, 1e-2, 1e-4, 1e-2
 FREED = Barrier(1.0, 0.02, near=False)  # beginning of the interior point from another plan
 # Tolerance of the search for durations of segments: their ends go to whole knots, one in some hundred.
@@ -52,6 +52,7 @@ NEAR_SEGMENTS = 1e-4
 # beginning then, and its tolerance. Of plans for the race of 19 waypoints in 400 to 800 steps, 10 of 10 were put right;
 # with `LITTLE` 4 of 6, and with the duration of the segments 5 of 6.
 LONGER, CLOSING, CLOSED = 1.01, Barrier(1e-3, 2e-3, near=False), 1e-3
+PART_WAY = (1.0, 0.25)  # parts of the way to the duration at which a search has failed, from one of which it goes on
 FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
 
 
@@ -110,7 +111,8 @@ class DurationSearch:
         found, sketches = list(ways(stated, stages)), list[Sketch]()
         spent = dict.fromkeys((way.name for way in found), 0)
         for share, freed in SKETCHED:
-            for way in found:
+            last = bool(sketches)
+            for way in [one for one in found if one.name not in {made.way for made in sketches}]:
                 with stop.reporting("smooth", self._attentive), stop.heeding():
                     made = self._sketched(way, share, free if freed else None)
                     self._total += made.iterations
@@ -119,7 +121,7 @@ class DurationSearch:
                         sketches.append(made._replace(iterations=spent[way.name]))
                 if stop.due:
                     return
-            if sketches:
+            if last:
                 break
         far = spent.keys() - {one.way for one in sketches}
         self.candidates += (
@@ -214,18 +216,25 @@ class DurationSearch:
         """Find the best duration near a plan's.
 
         A search that ends elsewhere may only have ended far from the constraints. It goes on from a plan of the
-        duration at which it ended, as long as such plans become cheaper.
+        duration at which it ended or, if there is none, of one a part of the way there; as long as such plans become
+        cheaper.
         """
+        tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
         while not self._budget.over:
             _, ordinary, found = self._find(begin, self._budget)
             if found.solved or not np.isfinite(found.plan.states).all() or self._stop.due:
                 return
-            start = found.trajectory(ordinary.dt)
-            again = self._solved(ordinary, replace(settings, start=start, starts=None))
-            least = min(self._rank(one) for one in self._fixed)
-            self._fixed.append(again)
-            missed, cost = self._rank(again)
-            if not again.success or not (missed, cost + FELL * abs(cost)) < least:
+            least, end = min(self._rank(one) for one in self._fixed), found.trajectory(ordinary.dt)
+            for share in PART_WAY if least[0] == 0 else PART_WAY[:1]:
+                dt = begin.dt + share * (end.dt - begin.dt)
+                start = end if share == 1 else replace(begin, dt=dt)
+                fixed = settled(self._problem, dt * self._problem.steps)
+                again = self._solved(fixed, replace(tries, start=start, starts=None))
+                self._fixed.append(again)
+                missed, cost = self._rank(again)
+                if again.success and (missed, cost + FELL * abs(cost)) < least:
+                    break
+            else:
                 return
             begin = again.trajectory
 
