@@ -105,6 +105,19 @@ def test_a_plan_between_corners_is_no_saddle() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    "name", ["unicycle1_v2/wall_0", "car1_v0/bugtrap_0", "acrobot_v0/swing_up_empty", "quadrotor_v0/recovery"]
+)
+def test_no_plan_of_these_is_found_along_the_first_sketches(name: str) -> None:
+    """They take another duration, a duration a part of the way, or another axis; the published plan is no faster."""
+    case = CASES[name]
+    solution = ls.smooth(statements.in_least_time(case), time_limit=600)
+    assert solution.status is ls.Status.CONVERGED
+    assert case.published is not None
+    assert solution.trajectory.horizon < case.published
+
+
+@pytest.mark.long
 def test_the_search_from_outside_leaves_a_trap() -> None:
     """A straight line leads nowhere there."""
     plan = outside.found(CASES["unicycle1_v0/bugtrap_0"])

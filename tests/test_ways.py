@@ -13,7 +13,7 @@ import lqrsim as ls
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.stages import Stages
-from lqrsim.solvers.ways import ways
+from lqrsim.solvers.ways import _other_axes, ways
 
 PLANE = {"x": "m", "y": "m", "a": "rad"}
 FALLING = {**PLANE, "vx": "m/s", "vy": "m/s", "w": "rad/s"}
@@ -123,6 +123,28 @@ def test_upside_down_a_robot_rights_itself_by_the_shorter_turn_or_the_other() ->
         assert end == pytest.approx(2 * np.pi * round(end / (2 * np.pi)), abs=1e-6)
         horizons.append(solution.trajectory.horizon)
     assert horizons[0] == pytest.approx(horizons[1], rel=1e-3)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
+def test_a_large_turn_also_leads_about_other_axes(turn: list[float]) -> None:
+    """By half of the turn aside, perpendicular to it; a turn by less than a right angle goes straight."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: ls.rotations.vector_rate(x, u), states=dict.fromkeys(("rx", "ry", "rz"), "rad"),
+        controls=dict.fromkeys(("wx", "wy", "wz"), "rad/s"), rotation_vectors=[("rx", "ry", "rz")],
+    )  # fmt: skip
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=60, initial=ls.FixedState(turn), stage_cost=ls.ControlCost(np.ones(3)),
+        final_cost=ls.QuadraticCost(np.ones(3), about=np.zeros(3)),
+    )  # fmt: skip
+    line, size = np.linspace(turn, np.zeros(3), 61), float(np.linalg.norm(turn))
+    drawn = [way.states for way in _other_axes(problem, line)]
+    assert bool(drawn) == (size > np.pi / 2)
+    for states in drawn:
+        np.testing.assert_allclose(states[[0, -1]], line[[0, -1]], atol=1e-12)
+        aside = states[30] - line[30]
+        assert np.linalg.norm(aside) == pytest.approx(size / 2)
+        assert abs(aside @ turn) < 1e-12 * size**2
+    assert len(np.unique(np.round(drawn, 6), axis=0)) == len(drawn)
 
 
 def test_a_robot_that_cannot_stop_drives_half_a_circle_to_turn_round() -> None:
