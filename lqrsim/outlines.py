@@ -1,4 +1,4 @@
-"""Parts of a robot's outline: boxes in the plane by their corners, and capsules as chains of balls.
+"""Parts of a robot's outline: boxes by their corners, and capsules as chains of balls.
 
 A capsule is the set of points within `radius` of a segment, such as the link of an arm. Balls of the same radius,
 evenly spaced along the segment, are inside it. Between two balls, `spacing` apart, the capsule protrudes by
@@ -16,6 +16,7 @@ from numbers import Real
 from typing import Any
 
 from lqrsim.errors import InputError, check_number, excerpt
+from lqrsim.rotations import rotate
 
 MOST = 10_000  # largest number of balls in a chain
 
@@ -106,35 +107,42 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
             raise InputError(f"between: got {given} ({type(error).__name__}), want points of expressions") from None
 
 
-class Box(namedtuple("Box", ("length", "width"))):
-    """A box in the plane, for the hulls of `CollisionSpheres`.
+class Box(namedtuple("Box", ("length", "width", "height"))):
+    """A box, for the hulls of `CollisionSpheres`.
 
     Attributes:
-      length: its extent along the direction of its angle, in metres, above 0.
-      width: its extent across, in metres, above 0.
+      length: its extent along its first axis, in metres, above 0.
+      width: its extent along the second, in metres, above 0.
+      height: its extent along the third, in metres, above 0; None in the plane.
     """
 
     __slots__ = ()
 
-    def __new__(cls, length: float, width: float) -> "Box":
-        sizes = {"length": length, "width": width}
-        return super().__new__(cls, *(check_number(f"Box: {name}", one, above=0.0) for name, one in sizes.items()))
+    def __new__(cls, length: float, width: float, height: float | None = None) -> "Box":
+        sizes = {"length": length, "width": width} | ({} if height is None else {"height": height})
+        checked = [check_number(f"Box: {name}", one, above=0.0) for name, one in sizes.items()]
+        return super().__new__(cls, *checked, *[None] * (3 - len(checked)))
 
-    def corners(self, center: Sequence[Any], angle: Any) -> list[list[Any]]:
-        """The four corners, counterclockwise: SymPy expressions, or numbers.
+    def corners(self, center: Sequence[Any], turn: Any) -> list[list[Any]]:
+        """Its four corners, counterclockwise, or in space its eight: SymPy expressions, or numbers.
 
         Args:
-          center: its 2 coordinates in metres.
-          angle: its angle in rad, from the first axis to its length.
+          center: its 2 or 3 coordinates in metres.
+          turn: its angle in rad, from the first axis of the plane to its length; in space its rotation vector.
         """
-        if isinstance(angle, Real):
-            from math import cos, sin
-        else:
-            from sympy import cos, sin
         try:
-            (x, y), c, s = center, cos(angle) / 2, sin(angle) / 2
+            if self.height is not None:
+                (x, y, z), sides = center, ((-0.5, 0.5),) * 3
+                ends = [[a * b for a, b in zip(self, end, strict=True)] for end in itertools.product(*sides)]
+                return [[a + b for a, b in zip((x, y, z), rotate(turn, end), strict=True)] for end in ends]
+            if isinstance(turn, Real):
+                from math import cos, sin
+            else:
+                from sympy import cos, sin
+            (x, y), c, s = center, cos(turn) / 2, sin(turn) / 2
             ends = [(a * self.length, b * self.width) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             return [[x + a * c - b * s, y + a * s + b * c] for a, b in ends]
         except Exception as error:  # entries that are not numbers
-            given = f"{excerpt(center)} and {excerpt(angle)} ({type(error).__name__})"
-            raise InputError(f"corners: got {given}, want 2 coordinates and an angle") from None
+            given = f"{excerpt(center)} and {excerpt(turn)} ({type(error).__name__})"
+            wanted = "2 coordinates and an angle" if self.height is None else "3 coordinates and a rotation vector"
+            raise InputError(f"corners: got {given}, want {wanted}") from None

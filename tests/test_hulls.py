@@ -1,13 +1,16 @@
-"""Robots that are convex polygons: distances, costs and plans."""
+"""Robots and obstacles that are convex hulls, in a plane and in space: distances, costs and plans."""
 
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples
-from scipy.spatial import ConvexHull
+from scipy.optimize import nnls
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.codegen.distances import hull_distances
@@ -52,16 +55,21 @@ WALL = ls.Obstacle("wall", "plane", np.array([0.0, -1.0, 0.0]), np.eye(3)[:, [2,
 
 
 def separated(own: Array, other: Array) -> float:
-    """The signed distance of two polygons: that of the origin to Qhull's hull of all differences of their corners."""
-    apart = (own[:, None] - other[None]).reshape(-1, 2)
-    hull = ConvexHull(apart)
-    depth = float(hull.equations[:, -1].max())
-    if depth <= 0:
+    """The signed distance of two hulls: that of the origin to Qhull's hull M of all differences of their corners.
+
+    Outside it is the least |sum w m| for weights w of the corners m. With least squares of (sum w m, sum w - 1) the
+    weights are the same up to their sum, which SciPy's nonnegative least squares find.
+    """
+    apart = (own[:, None] - other[None]).reshape(-1, own.shape[1])
+    try:
+        depth = float(ConvexHull(apart).equations[:, -1].max())
+    except QhullError:  # flat
+        depth = 0.0
+    if depth < 0:
         return depth
-    ends = apart[hull.simplices]
-    sides = ends[:, 1] - ends[:, 0]
-    share = np.clip(-(ends[:, 0] * sides).sum(axis=1) / (sides**2).sum(axis=1), 0.0, 1.0)
-    return float(np.linalg.norm(ends[:, 0] + share[:, None] * sides, axis=1).min())
+    size = np.abs(apart).max()
+    weights, _ = nnls(np.vstack([apart.T / size, np.ones(len(apart))]), np.eye(own.shape[1] + 1)[-1], maxiter=10_000)
+    return float(np.linalg.norm(weights @ apart) / weights.sum())
 
 
 @settings(max_examples=examples(60))
@@ -78,7 +86,7 @@ def test_distances_are_those_of_the_difference_of_both(seed: int, count: int, ba
     corners = corners[::-1] if backwards else corners
     x, y, angle = rng.uniform(-1, 1, 3)
     length, width = rng.uniform(0.1, 2.0, 2)
-    world = ls.World([box(x, y, length, width, 3 * angle, int(rng.integers(3)))])
+    world = ls.World([box(x, y, length, width, 3 * angle, int(rng.integers(3)))]).upright()
     others = np.array(ls.types.Box(length, width).corners((x, y), 3 * float(angle)))
 
     def distance(places: Array) -> float:
@@ -95,16 +103,94 @@ def test_distances_are_those_of_the_difference_of_both(seed: int, count: int, ba
             assert (once + again) / 2 == pytest.approx(pulls[0, 0, 0, k, i], abs=1e-4)
 
 
+def distance(own: Array, world: ls.World) -> float:
+    return float(hull_distances(world, own[None], [len(own)])[0].min())
+
+
+def drawn(seed: int) -> tuple[Array, Array]:
+    """The corners of two hulls, apart or not; some of them boxes with parallel faces, flat or a point."""
+    rng = np.random.default_rng(seed)
+    own, other = (rng.normal(size=(rng.integers(1, 12), 3)) * rng.uniform(0.1, 1.0) for _ in range(2))
+    if rng.random() < 0.3:
+        sides = [rng.integers(1, 4, 3) / 4 for _ in range(2)]
+        own, other = (np.array(ls.types.Box(*one).corners((0, 0, 0), (0, 0, 0)), dtype=float) for one in sides)
+        return own + rng.integers(-4, 5, 3) / 4, other
+    return own + rng.normal(size=3) * rng.choice([0.2, 1.0, 3.0]), other
+
+
+@settings(max_examples=examples(100))
+@given(st.integers(0, 2**32 - 1))
+def test_distances_in_space_are_those_of_the_difference_of_both(seed: int) -> None:
+    """To rounding; slopes as in the plane."""
+    own, other = drawn(seed)
+    world = ls.World([ls.Obstacle.of_corners("rock", other)])
+    found, pulls = hull_distances(world, own[None], [len(own)])
+    assert found[0, 0, 0] == pytest.approx(separated(own, other), abs=1e-12)
+    assert np.linalg.norm(pulls[0, 0, 0].sum(axis=0)) == pytest.approx(1.0, abs=1e-9)  # where it moves as one
+    step = np.random.default_rng(seed).normal(size=own.shape)
+    ahead, behind = distance(own + 1e-6 * step, world), distance(own - 1e-6 * step, world)
+    once, again = (ahead - found[0, 0, 0]) / 1e-6, (found[0, 0, 0] - behind) / 1e-6
+    if abs(once - again) < 1e-4:  # no kink between the two
+        assert (once + again) / 2 == pytest.approx((pulls[0, 0, 0] * step).sum(), abs=1e-3)
+
+
+@settings(max_examples=examples(30))
+@given(st.integers(0, 2**32 - 1))
+def test_a_distance_belongs_to_the_place_of_both_alone(seed: int) -> None:
+    """It stays if both move or swap, and changes no more than one of them moves."""
+    (own, other), rng = drawn(seed), np.random.default_rng(seed)
+    found = distance(own, ls.World([ls.Obstacle.of_corners("rock", other)]))
+    turn, moved, step = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3), rng.normal(size=3) / 10
+    there = ls.Obstacle("rock", "mesh", moved, turn, np.ones(3), corners=other)
+    assert distance(own @ turn.T + moved, ls.World([there])) == pytest.approx(found, abs=1e-12)
+    assert distance(other, ls.World([ls.Obstacle.of_corners("rock", own)])) == pytest.approx(found, abs=1e-12)
+    ahead = distance(own + step, ls.World([ls.Obstacle.of_corners("rock", other)]))
+    assert abs(ahead - found) <= np.linalg.norm(step) + 1e-12
+
+
+SIZES = {
+    "plane": (0.0, 0.0, 0.0), "sphere": (0.4, 0.0, 0.0), "capsule": (0.3, 0.7, 0.0), "cylinder": (0.4, 0.5, 0.0),
+    "box": (0.3, 0.5, 0.2),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_distances_to_primitives_are_mujocos(kind: str) -> None:
+    """Its tolerance of distances of convex bodies is 1e-6 m; for overlaps it finds no less than the least depth."""
+    size = SIZES[kind]
+    rng, turn = np.random.default_rng(1), Rotation.random(rng=0)
+    thing = ls.Obstacle(kind, kind, np.array([0.1, 0.2, 0.3]), turn.as_matrix(), np.array(size))
+    rock = rng.normal(size=(9, 3)) * 0.2
+    rock -= rock[ConvexHull(rock).vertices].mean(axis=0)
+    numbers = {name: " ".join(map(str, np.ravel(one))) for name, one in {
+        "size": size if kind != "plane" else (1, 1, 1), "rock": rock, "turn": turn.as_quat(scalar_first=True),
+    }.items()}  # fmt: skip
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><mesh name="rock" vertex="{numbers["rock"]}"/></asset><worldbody>
+        <geom type="{kind}" size="{numbers["size"]}" pos="0.1 0.2 0.3" quat="{numbers["turn"]}"/>
+        <body mocap="true"><geom type="mesh" mesh="rock"/></body></worldbody></mujoco>"""
+    )
+    data, apart = mujoco.MjData(model), 0
+    for one in Rotation.random(60, rng=rng):
+        data.mocap_pos[0], data.mocap_quat[0] = rng.normal(size=3) * 0.6, one.as_quat(scalar_first=True)
+        mujoco.mj_kinematics(model, data)
+        found = distance(one.apply(rock) + data.mocap_pos[0], ls.World([thing]))
+        theirs = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None)
+        apart += found > 0
+        assert found == pytest.approx(theirs, abs=2e-6) if found > 0 else found >= theirs - 1e-6
+    assert 5 < apart < 60
+
+
 def test_round_obstacles_and_planes() -> None:
     """Against closed forms: a rectangle's distance to a disc's centre, and its lowest corner's to a plane."""
     own = np.array(CAR.corners((0.0, 0.0), 0.0))
-    distances = hull_distances(ls.World([ROUND, WALL]), own[None], [4])[0][0, 0]
+    distances = hull_distances(ls.World([ROUND, WALL]).upright(), own[None], [4])[0][0, 0]
     away = np.hypot(0.4 - 0.25, 0.7 - 0.125) - 0.2
     np.testing.assert_allclose(distances, [away, 1.0 - 0.125], atol=1e-12)
 
 
 def problem(**changed: Any) -> ls.Problem:
-    start, goal = np.zeros(4), np.array([2.6, 0.0, 0.0, 0.0])
+    start, goal = np.array([0.0, 0.01, 0.0, 0.0]), np.array([2.6, 0.0, 0.0, 0.0])
     stated: dict[str, Any] = {
         "dynamics": DYNAMICS, "dt": 0.1, "steps": 90, "initial": ls.FixedState(start),
         "stage_cost": ls.ControlCost([1.0, 0.1]), "final_cost": ls.QuadraticCost(np.zeros(4), about=goal),
@@ -128,13 +214,74 @@ def test_a_plan_passes_a_gap_that_no_ball_passes() -> None:
     assert solution.clearance.min() == pytest.approx(least, abs=1e-9)
 
 
+PLANK = ls.types.Box(0.5, 0.4, 0.06)
+SLOT = 0.7  # rad, by which a slot leans, of 0.2 m, into which the plank fits only on edge
+
+
+def plank(x, p):
+    """At height 0, turned by b about the vertical and then by a about its length."""
+    rotate = ls.rotations.rotate
+    turned = (rotate([0, 0, x.b], corner) for corner in PLANK.corners((0, 0, 0), (x.a, 0, 0)))
+    return [[x.px + a, x.py + b, c] for a, b, c in turned]
+
+
+def gliding(x, u, p):
+    """Who banks turns."""
+    from sympy import cos, sin
+
+    return [u.v * cos(x.b), u.v * sin(x.b), u.bank, -x.a]
+
+
+GLIDER = ls.Dynamics(
+    gliding, states={"px": "m", "py": "m", "a": "rad", "b": "rad"}, controls={"v": "m/s", "bank": "rad/s"},
+    position=("px", "py"), angles=("a", "b"), control_limits={"v": (0.0, 1.0), "bank": (-2.0, 2.0)},
+)  # fmt: skip
+
+
+def lips() -> list[Array]:
+    """The corners of what bounds the slot above and below."""
+    across = np.array([0.0, -np.sin(SLOT), np.cos(SLOT)])
+    places = (np.array([1.2, 0.0, 0.0]) + side * (0.1 + 0.5) * across for side in (-1, 1))
+    return [np.array(ls.types.Box(0.2, 3.0, 1.0).corners(one, (SLOT, 0.0, 0.0)), dtype=float) for one in places]
+
+
+def test_a_plank_banks_through_a_slot() -> None:
+    """It keeps 2 cm from both lips by `separated` at the knots, and does not touch them between these."""
+    world = ls.World([ls.Obstacle.of_corners(f"lip {k}", one) for k, one in enumerate(lips())])
+    hull = ls.CollisionSpheres(plank, 0.0, hulls=[8])
+    goal = np.array([2.4, 0.0, 0.0, 0.0])
+    solution = ls.smooth(
+        ls.Problem(
+            dynamics=GLIDER,
+            dt=0.05,
+            steps=80,
+            initial=ls.FixedState(np.zeros(4)),
+            stage_cost=ls.ControlCost([0.1, 0.1]),
+            final_cost=ls.QuadraticCost([100.0, 10.0, 10.0, 10.0], about=goal),
+            constraints=[ls.Clearance(world, balls=hull, margin=0.02)],
+        )
+    )
+    assert solution.status is ls.Status.CONVERGED, solution
+    shape = ls.Clearance(world, balls=hull).in_world(GLIDER)
+
+    def least(states: Array) -> float:
+        places = shape.places(states)
+        return min(separated(place, one) for place in places for one in lips())
+
+    states = solution.trajectory.states
+    assert least(states) == pytest.approx(0.02, abs=1e-6)
+    assert np.abs(states[:, 2]).max() > 0.3  # it banks
+    between = np.linspace(0, 80, 321)
+    assert least(np.stack([np.interp(between, np.arange(81), one) for one in states.T], axis=1)) > 0
+
+
 def test_costs_and_slopes() -> None:
     """The cost is the sum over hulls and obstacles; its gradient and the clearance's slopes against differences."""
     world, x = ls.World([*WORLD.obstacles, ROUND, WALL]), np.array([0.3, 0.1, 0.4, -0.2])
     term = ls.ObstacleCost(world, balls=HULLS, sharpness=3.0, weight=0.5).bind(DYNAMICS)
     shape = ls.Clearance(world, balls=HULLS).in_world(DYNAMICS)
     places = shape.places(x)
-    distances = hull_distances(world, places[:, :2][None], [4, 4])[0][0]
+    distances = hull_distances(world.upright(), places[:, :2][None], [4, 4])[0][0]
     value, gradient, _ = evaluate(term, x, np.zeros(2))
     assert value == pytest.approx(0.5 * np.exp(-3.0 * distances).sum(), rel=1e-12)
     clearance, slopes = shape.with_slopes(x[None], range(4))

@@ -50,12 +50,14 @@ from lqrsim.kernels import (
     entry_points,
     estimation,
     exponential,
+    hull_distance,
     interior_point,
     iterations,
     linear_algebra,
     mjcf_distances,
     mjcf_dynamics,
     model_functions,
+    obstacle_distances,
     policy_evaluation,
     projection,
     restoration,
@@ -909,22 +911,34 @@ class TestParts:
         """Apart and overlapping, of each kind of obstacle in the plane."""
         kinds = {"plane": np.eye(3)[:, [1, 2, 0]], "sphere": np.eye(3), "box": np.eye(3)}
         world = ls.World([ls.Obstacle(k, k, np.zeros(3), turn, np.array([0.4, 0.3, 1.0])) for k, turn in kinds.items()])
+        world = ls.World([*world.obstacles, ls.Obstacle.of_corners("wedge", [[0.3, 0.2], [0.9, 0.3], [0.5, 0.7]])])
         balls = ls.CollisionSpheres(square, 0.05, hulls=[4])
         for x in (X, 10 * X):
             of_term(ls.ObstacleCost(world, balls=balls, sharpness=3.0).bind(CART), x)
             of_constraint(ls.Clearance(world, balls=balls).bind(CART), x=x)
-        corners, count, parts = (
-            np.tile(np.array(square(X, None), dtype=float), (2, 1)),
-            len(world),
-            np.array([0.0, 4.0]),
-        )
-        flat, out, pulls = np.zeros((2, 12)), np.zeros(2 * count), np.zeros((2 * count, 12))
-        flat.reshape(2, 4, 3)[..., :2] = corners.reshape(2, 4, 2)
-        data = np.array(world.table).ravel()
-        replay(
-            source_of(signed_distance), {}, "hull_distances", count, 2, 1, data, parts, 1, flat,
-            np.zeros((2 * count, 3)), out, pulls,
-        )  # fmt: skip
+        flat, count, parts = np.zeros((2, 12)), len(world), np.array([0.0, 4.0])
+        flat.reshape(2, 4, 3)[..., :2] = square(X, None)
+        out, pulls = np.zeros(2 * count), np.zeros((2 * count, 12))
+        given = count, 2, 1, world.upright().table, parts, 1, flat, np.zeros((2 * count, 3)), out, pulls
+        replay(source_of(obstacle_distances), {}, "hull_distances", *given)
+
+    @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])
+    def test_hulls_in_space(self, seed: int) -> None:
+        """Apart, overlapping and touching, of all corners, of some, and of one."""
+        rng, source = np.random.default_rng(seed), source_of(hull_distance)
+        rock = ls.Obstacle.of_corners("rock", rng.normal(size=(9, 3)) * 0.4)
+        pillar = ls.Obstacle("pillar", "cylinder", np.zeros(3), np.eye(3), np.array([0.2, np.inf, 0.0]))
+        table = ls.World([rock, pillar, *WORLD.obstacles]).table
+        for number, count in itertools.product(range(2 + len(WORLD)), (1, 2, 7)):
+            for off in (0.0, 0.4, 1.5):
+                corners = rng.normal(size=(count, 3)) * 0.3 + off
+                given = table, declarations.ROW * number, corners.ravel(), 0, count, np.zeros(3 * count)
+                replay(source, {}, "hull_distance", *given)
+        box = np.array(ls.types.Box(0.4, 0.4, 0.4).corners((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), dtype=float)
+        table = ls.World([ls.Obstacle.of_corners("box", box), ls.Obstacle.of_corners("plate", box * [1, 1, 0])]).table
+        for number, off in itertools.product(range(2), (0.0, 0.4, 0.4 + 1e-9)):
+            given = table, declarations.ROW * number, (box + np.array([off, 0, 0])).ravel(), 0, 8, np.zeros(24)
+            replay(source, {}, "hull_distance", *given)
 
     @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])
     def test_obstacles_in_the_plane_and_in_space(self, seed: int) -> None:
@@ -934,10 +948,11 @@ class TestParts:
         data, points = np.array(WORLD.table).ravel(), rng.uniform(-1.2, 1.6, size=(6, 3))
         points[:2, 2] = 0.05
         count = len(WORLD)
+        rock = np.array(ls.World([ls.Obstacle.of_corners("rock", points[:4])]).table)
+        for number, table in ((count, data), (1, rock)):
+            given = number, 6, 3, table, points, np.zeros((2 * number, 3)), np.zeros(6)
+            replay(source_of(obstacle_distances), {}, "nearest", *given)
         source = source_of(signed_distance)
-        replay(source, {}, "nearest", count, 6, 3, data, points, np.zeros((2 * count, 3)), np.zeros(6))
-        normals = np.zeros((6 * count, 3))
-        replay(source, {}, "each_with_normal", count, 6, data, points, np.zeros(6 * count), normals)
         at = np.zeros(3), np.zeros((3, 3))
         for i in range(count):  # at the rim of the cylinder, in the box and about it
             place = WORLD.obstacles[i].position + rng.normal(size=3) * 0.25

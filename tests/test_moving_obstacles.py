@@ -12,6 +12,7 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
+from lqrsim.kernels.declarations import ROW
 from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.simulation.collisions import FINEST
 
@@ -33,7 +34,7 @@ class TestWorld:
         points = rng.uniform(-2, 2, (4, len(plane)))
         first, last = world.moved(seconds).seen_by(plane, offset), world.seen_by(plane, offset).moved(seconds)
         np.testing.assert_allclose(first.distance(points), last.distance(points), rtol=0, atol=1e-12)
-        by_tables = ls.World([replace(ball, position=world.tables([0.0, seconds])[-1, 0, 1:4])])
+        by_tables = ls.World([replace(ball, position=world.tables([0.0, seconds])[0][-ROW:][1:4])])
         np.testing.assert_allclose(
             by_tables.seen_by(plane, offset).distance(points), first.distance(points), rtol=0, atol=1e-12
         )

@@ -52,12 +52,12 @@ class Crocoddyl:
         weights = [np.diag(told.control_weight), told.nominal, np.diag(told.final_weight), told.goal]
         space = problem.control_coordinates
         weights += [space.low, space.high] if box else [np.full(len(space), side) for side in (-np.inf, np.inf)]
-        numbers, obstacles = np.concatenate([scalars, *weights]), np.ascontiguousarray(told.world.table)
+        numbers, obstacles = np.concatenate([scalars, *weights]), told.world.table
         self._library = _library()
         self._steps = problem.steps
         self._workspace = ctypes.c_void_p(
             self._library.make(
-                int(told.robot == ls.Quadrotor.name), int(box), problem.steps, at(numbers), len(obstacles),
+                int(told.robot == ls.Quadrotor.name), int(box), problem.steps, at(numbers), len(told.world),
                 at(obstacles),
             )
         )  # fmt: skip

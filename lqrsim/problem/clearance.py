@@ -10,7 +10,8 @@ import numpy.typing as npt
 from lqrsim.annotations import NonNegative, checked
 from lqrsim.errors import Array, InputError, check_array, check_number, real
 from lqrsim.kernels.declarations import ROW, N, stack
-from lqrsim.kernels.signed_distance import hull_distance, signed_distance, signed_distance_derivatives
+from lqrsim.kernels.hull_distance import hull_distance
+from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
@@ -94,8 +95,8 @@ class Clearance(KeepsClear, Constraint):
             rows = list(zip(distances.parts, distances.obstacles, strict=True))
             columns = [max(number, 0) % margins.shape[1] for number in distances.obstacles]
             return ConstraintTerm.of_residual(distances, margins, columns, describe)
-        tables, shared = world.tables(times), 0 if shape.centers is None else 3 * shape.balls
-        own = np.array([*margins.shape, len(world), len(tables), *shape.parts, *margins.ravel(), *tables.ravel()])
+        (tables, count), shared = world.tables(times), 0 if shape.centers is None else 3 * shape.balls
+        own = np.concatenate([[*margins.shape, len(world), count], shape.parts, margins.ravel(), tables])
         source, data, functions = shape.placed(__name__, own)
         return ConstraintTerm(source, data, len(rows), describe, shared=shared, functions=functions)
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.distances import distances_with_normals, hull_distances, signed_distance, signed_distance_displaced
+from lqrsim.codegen.distances import hull_distances, signed_distance, signed_distance_displaced
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
@@ -19,8 +19,7 @@ from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, ev
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.scenes.scene import Scene
-from lqrsim.scenes.world import ROW, World
-from lqrsim.scenes.world import signed_distance as signed_distance_of_one
+from lqrsim.scenes.world import World
 
 TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
 
@@ -92,7 +91,7 @@ class ShapeInWorld:
       dynamics: the robot's dynamics. world: the obstacles, in the coordinates of the places.
       radii: radii of the balls, or hulls, in m, (P,); for geoms, the radius of the largest geom.
       names: their names. centers: the centres of the balls; None for one ball at the robot's position.
-      hulls: number of balls of each hull; None for balls by themselves.
+      hulls: number of balls of each hull; None for balls by themselves among primitives.
     """
 
     dynamics: Dynamics
@@ -127,9 +126,14 @@ class ShapeInWorld:
         return centers.filling(kernel), np.concatenate([centers.data, own]), centers.functions
 
     @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of balls of each part: of each hull, or 1."""
+        return self.hulls or (1,) * len(self.radii)
+
+    @property
     def balls(self) -> int:
         """The number of balls."""
-        return sum(self.hulls) if self.hulls else len(self.radii)
+        return sum(self.sizes)
 
     @property
     def parts(self) -> Array:
@@ -164,43 +168,23 @@ class ShapeInWorld:
 
         Both belong to the nearest ball, or hull.
         """
-        knots, count, size = np.arange(len(states))[:, None], self.balls, states.shape[1]
+        knots, moved_by = np.arange(len(states))[:, None], list(self.moved_by)
         if self.centers is None:
-            distances, normals = distances_with_normals(self.world, states[:, list(self.moved_by)])
-            return distances - self.radii, normals @ np.eye(size)[np.ix_(self.moved_by, along)]
-        places, slopes = evaluate_slopes(self.centers, count, states)
-        if self.hulls:
-            clearance, pulls = hull_distances(self.world, places, self.hulls)
-            clearance = clearance - self.radii[:, None]
-            first = np.cumsum([0, *self.hulls[:-1]])
-            moved = np.zeros((*clearance.shape, len(along)))
-            for part, (begin, corners) in enumerate(zip(first, self.hulls, strict=True)):
-                moves = slopes[:, begin : begin + corners][..., list(along)]
-                moved[:, part] = np.einsum("kocd,kcdi->koi", pulls[:, part, :, :corners], moves)
-            nearest, obstacle = clearance.argmin(axis=1), np.arange(len(self.world))
-            return clearance[knots, nearest, obstacle], moved[knots, nearest, obstacle]
-        distances, normals = distances_with_normals(self.world, places.reshape(-1, places.shape[-1]))
-        clearance = distances.reshape(len(states), count, -1) - self.radii[:, None]
-        nearest, obstacle = clearance.argmin(axis=1), np.arange(len(self.world))
-        normals = normals.reshape(len(states), count, -1, places.shape[-1])[knots, nearest, obstacle]
-        moves = slopes[knots, nearest][..., list(along)]
-        return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
+            places, slopes = self.places(states), np.eye(states.shape[1])[None, None, moved_by].repeat(len(states), 0)
+        else:
+            places, slopes = evaluate_slopes(self.centers, self.balls, states)
+        distances, pulls = hull_distances(self.world, places, self.sizes)
+        clearance = distances - self.radii[:, None]
+        chosen = knots, clearance.argmin(axis=1), np.arange(len(self.world))
+        corners = np.cumsum([0, *self.sizes[:-1]])[:, None] + np.arange(max(self.sizes))  # of each part
+        moves = slopes[knots[..., None], np.minimum(corners, self.balls - 1)[chosen[1]]][..., list(along)]
+        return clearance[chosen], np.einsum("kocd,kocdi->koi", pulls[chosen][..., : moves.shape[-2]], moves)
 
     def nearest(self, places: Array, displaced: Array) -> int:
         """The number of the obstacle that is nearest at places (B, 2 or 3), when displaced by (O, 3)."""
-        if self.hulls:
-            distances, _ = hull_distances(self.world, places[None], self.hulls, displaced[None])
-            larger = self.radii - self.radii.min()
-            return int((distances[0] - larger[:, None]).min(axis=0).argmin())
-        points, table = np.zeros((len(places), 3)), self.world.table.ravel()
-        points[:, : places.shape[1]] = places
-        found = np.full(len(self.world), np.inf)
+        distances, _ = hull_distances(self.world, places[None], self.sizes, displaced[None])
         larger = self.radii - self.radii.min()  # a radius that all share changes no order, except by rounding
-        for point, radius in zip(points, larger, strict=True):
-            there = (point - displaced).tolist()  # relative to each displaced obstacle
-            own = [signed_distance_of_one(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
-            found = np.minimum(found, own)
-        return int(np.argmin(found))
+        return int((distances[0] - larger[:, None]).min(axis=0).argmin())
 
     def travel(self, before: Array, after: Array) -> Array:
         """The largest distance that any point moves on a straight line between places, (...) in m."""
@@ -210,17 +194,14 @@ class ShapeInWorld:
         """The place in an obstacle of a state, which may have NaNs, and the remedy, as texts; None if it is clear."""
         if not len(self.world):
             return None
-        ends = np.cumsum(self.hulls or (1,) * self.balls)[:-1]
+        ends = np.cumsum(self.sizes)[:-1]
         for name, radius, corners in zip(self.names, self.radii, np.split(self.places(state), ends), strict=True):
             if np.isnan(corners).any():
                 continue
             place = corners.mean(axis=0)
-            if self.hulls:
-                distances = hull_distances(self.world, corners[None], [len(corners)])[0][0, 0] - radius
-            else:
-                distances = self.world.distances(place) - radius
+            distances = hull_distances(self.world, corners[None], [len(corners)])[0][0, 0] - radius
             if distances.min() < 0:
-                what, whose = (f"with {name!r} ", "its radius") if self.centers else ("", "the robot's radius")
+                what, whose = (f"with {name!r} ", "its radius") if name else ("", "the robot's radius")
                 at, deep = ", ".join(f"{value:g}" for value in place), -distances.min()
                 obstacle = self.world.names[int(distances.argmin())]
                 where = f"{what}at ({at}) m, {deep:.3g} m inside obstacle {obstacle!r}"
@@ -302,11 +283,14 @@ def shape_in(
         centers = balls.bind(dynamics)
         seen = centers.world_seen(world, space)
         if not balls.hulls:
-            return ShapeInWorld(dynamics, seen, balls.radii, balls.names, centers)
-        seen.check_upright()
+            hulls = (1,) * len(balls) if seen.has_meshes else None
+            return ShapeInWorld(dynamics, seen, balls.radii, balls.names, centers, hulls)
         radii = balls.radii[np.cumsum([0, *balls.hulls[:-1]])]
+        seen = seen.upright() if centers.in_plane else seen
         return ShapeInWorld(dynamics, seen, radii, balls.names, centers, balls.hulls)
     seen = world.seen_by(space.plane, space.offset) if space.position else World()
+    if seen.has_meshes:
+        return ShapeInWorld(dynamics, seen, np.array([radius]), ("",), SphereCenters.at(space.position), (1,))
     return ShapeInWorld(dynamics, seen, np.array([radius]))
 
 
@@ -372,7 +356,7 @@ def _same(one: World, other: World) -> bool:
             mine.kind == its.kind
             and all(
                 np.array_equal(getattr(mine, name), getattr(its, name))
-                for name in ("position", "rotation", "size", "velocity")
+                for name in ("position", "rotation", "size", "velocity", "corners")
             )
             for mine, its in zip(one.obstacles, other.obstacles, strict=True)
         )

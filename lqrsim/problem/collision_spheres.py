@@ -37,11 +37,10 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.kernels import differences, sphere_centers, user_functions
+from lqrsim.kernels.obstacle_distances import MOST_CORNERS
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
-
-MOST_CORNERS = 64  # of a polygon; its distances to a box take time in proportion to it
 
 
 @checked
@@ -70,6 +69,17 @@ class SphereCenters(Term):
         """The obstacles in the coordinates of the places."""
         return world.seen_by(space.plane or "xy", space.offset) if self.in_plane else world.seen_by(SPACE)
 
+    @classmethod
+    def at(cls, position: tuple[int, ...]) -> "SphereCenters":
+        """The centre of a robot that is one ball at its position, of 2 or 3 states."""
+        values = [f"out[{i}] = x[{state}]" for i, state in enumerate(position)] + ["out[2] = 0.0"] * (
+            len(position) == 2
+        )
+        slopes = [f"slopes[{i}, {state}] = 1.0" for i, state in enumerate(position)]
+        written = ["def places(x, data, out):", *values, "def places_jacobian(x, data, out, slopes):", *values, *slopes]
+        text = "\n".join(line if line.startswith("def") else f"    {line}" for line in written)
+        return cls(text, np.zeros(0), position, len(position) == 2)
+
     def filling(self, kernel: Source) -> Source:
         """The kernel of a cost or a constraint, with these places.
 
@@ -92,7 +102,7 @@ class CollisionSpheres:
     `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all balls clear. The `balls` of a `Robot`
     are its collision shape in simulation; a robot without balls is one ball at its position. `Capsule` makes chains.
 
-    In a plane, `hulls` makes convex polygons of them, with exact distances, such as the boxes of a car and its trailer:
+    `hulls` makes convex hulls of them, with exact distances, such as the boxes of a car and its trailer in the plane:
 
         car, trailer = ls.types.Box(0.5, 0.25), ls.types.Box(0.3, 0.25)
 
@@ -103,7 +113,8 @@ class CollisionSpheres:
 
         ls.CollisionSpheres(outline, 0.0, hulls=[4, 4], names=["car", "trailer"])
 
-    A hull of two balls is a capsule. Overlapping polygons have the negative length of the shortest move that ends it.
+    A hull of two balls is a capsule. The distance for an overlap is the length, below 0, of the shortest move that ends
+    it.
 
     To compute the centres in another way, subclass this class and write `bind`.
 
@@ -114,9 +125,8 @@ class CollisionSpheres:
         position, see `World.seen_by`. The parameters of the dynamics are
         attributes of p.
       radii: (K,) radii of the balls, in metres; with hulls also one for all.
-      hulls: number of balls of each hull, in the order of the balls, which is the order of its corners round it, in
-        either direction. Balls of one hull have one radius. By default each ball is by itself. Hulls need places in the
-        plane of the robot's position, and obstacles that stand upright on it.
+      hulls: number of balls of each hull, in the order of the balls. Balls of one hull have one radius. By default each
+        ball is by itself. Obstacles of hulls in a plane stand upright on it.
       names: names of the balls, or hulls, in messages; by default "ball 0", "ball 1", ..., or "hull 0", ....
       sites: names of sites or geoms in the robot's MJCF, one per ball, or None. A `Plant` checks that each of them has
         its centre where the formula puts the ball.
@@ -284,10 +294,7 @@ class CollisionSpheres:
         return size
 
     def _check_plane(self, size: int, space: Coordinates) -> None:
-        """Raises InputError for points in a plane if the robot's position is in space, and for hulls in space."""
-        if size == 3 and self.hulls is not None:
-            wanted = "2 for hulls; in space an MjcfRobot has boxes and meshes, with geoms=robot.geoms"
-            raise InputError(f"{self.name}: got points of 3 coordinates, want {wanted}")
+        """Raises InputError for points in a plane if the robot's position is in space."""
         if size == 2 and len(space.position) == 3:
             raise InputError(f"{self.name}: got points of 2 coordinates for a position in space, want 3")
 

@@ -9,7 +9,8 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, check_number
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
 from lqrsim.kernels.exponential import exponential
-from lqrsim.kernels.signed_distance import hull_distance, signed_distance, signed_distance_derivatives
+from lqrsim.kernels.hull_distance import hull_distance
+from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.costs import Cost, CostTerm
@@ -79,9 +80,8 @@ class ObstacleCost(KeepsClear, Cost):
             return CostTerm.of_residual(
                 distances, source_of(__name__, AT=distances.numbers), numbers, first=1, nonconvex_in=axes, factor=WEIGHT
             )
-        tables = shape.world.tables(times)
-        sizes = self.sharpness, self.weight, len(shape.world), len(tables)
-        numbers = np.concatenate([sizes, shape.parts, tables.ravel()])
+        tables, count = shape.world.tables(times)
+        numbers = np.concatenate([[self.sharpness, self.weight, len(shape.world), count], shape.parts, tables])
         source, data, functions = shape.placed(__name__, numbers)
         return CostTerm(
             source, data, nonconvex_in=shape.moved_by or None, factor=len(data) - len(numbers) + WEIGHT,

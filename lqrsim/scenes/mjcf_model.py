@@ -462,8 +462,9 @@ class MjcfModel:
         taken = {one.get("name") for one in root.iter("geom")}
         section = ElementTree.SubElement(root, "worldbody")
         for one in world.obstacles:
-            if one.kind not in KINDS:
-                raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(KINDS)}")
+            drawn = [kind for kind in KINDS if kind != "mesh"]
+            if one.kind not in drawn:
+                raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(drawn)}")
             if one.name in taken:
                 raise InputError(f"moving: got {one.name}, which is a geom of the robot's MJCF, want another name")
             turn = np.zeros(4)

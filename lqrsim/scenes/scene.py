@@ -24,15 +24,14 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import Want, checked
-from lqrsim.errors import InputError, check_count, check_items, check_name, excerpt, free_name
+from lqrsim.errors import Array, InputError, check_count, check_items, check_name, excerpt, free_name
 from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco
 from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
-from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
+from lqrsim.scenes.world import FLAT, KINDS, OTHER_KINDS, Obstacle, World
 
 _FLAGS = mujoco.mjtDisableBit
-_FLAT = 1e-9  # m, thickness of geoms without one
 
 Choice = bool | Sequence[str] | Callable[[Any], bool]  # a choice of obstacles; see `load_scene`
 
@@ -174,7 +173,7 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
     taken, types = set(names), model.geom_type.tolist()
     kind_of = {one: mujoco.mjtGeom(one).name.removeprefix("mjGEOM_").lower() for one in set(types)}
     places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-    sizes, still = model.geom_size.copy(), np.zeros(3)
+    sizes, still, none = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
     found: list[Obstacle] = []
     for geom in geoms:
         kind = kind_of[types[geom]]
@@ -185,16 +184,27 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
                 ' or contype="0" conaffinity="0" if it is only to be drawn; or obstacles= to choose others; or an'
                 " MjcfRobot, which has MuJoCo's distances"
             )
-        position, size = places[geom], np.zeros(3) if kind == "plane" else sizes[geom]
-        if kind in OTHER_KINDS:
-            middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], _FLAT)
+        position, size, corners = places[geom], np.zeros(3) if kind == "plane" else sizes[geom], none
+        if kind == "mesh" or kind in OTHER_KINDS:
+            middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], FLAT)
             position = position + axes[geom] @ middle
-        found.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still))
+            corners = _hull_of(model, int(model.geom_dataid[geom])) - middle if kind == "mesh" else none
+        found.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still, corners))
     planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
     for i, one in enumerate(found):
         if one.kind in ("capsule", "cylinder") and all(_walled_off(one, end, planes) for end in (-1, 1)):
             found[i] = replace(one, size=np.array([one.size[0], np.inf, 0.0]))
     return found
+
+
+def _hull_of(model: mujoco.MjModel, mesh: int) -> Array:
+    """The corners (C, 3) of a mesh's convex hull, with which MuJoCo lets it collide; without one, all its corners."""
+    first, graph = int(model.mesh_vertadr[mesh]), int(model.mesh_graphadr[mesh])
+    corners = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])].astype(np.float64)
+    if graph < 0:
+        return corners
+    count = int(model.mesh_graph[graph])
+    return corners[model.mesh_graph[graph + 2 + count : graph + 2 + 2 * count]]
 
 
 def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:

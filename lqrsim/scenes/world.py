@@ -1,4 +1,6 @@
-"""Obstacles as geometric primitives, and the world, a set of them. `kernels/signed_distance.py` has the distances."""
+"""Obstacles, primitives and convex hulls, and the world, a set of them; distances are in `kernels/signed_distance.py`
+and `kernels/hull_distance.py`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -11,20 +13,22 @@ import numpy.typing as npt
 from lqrsim.annotations import Finite, OneOf, Want, checked
 from lqrsim.errors import Array, InputError, check_array, check_name, check_text, keep, real
 from lqrsim.kernels.declarations import ROW
+from lqrsim.kernels.hull_distance import hull_distance
 from lqrsim.kernels.signed_distance import signed_distance
 
 # Spaces of a position: "xyz", or a plane by its two axes in their order.
 SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 
-KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
+KINDS = ("plane", "sphere", "capsule", "cylinder", "box", "mesh")
 # MuJoCo's types for which no distance is implemented here. Robots from an MJCF use MuJoCo's distances.
-OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
+OTHER_KINDS = ("ellipsoid", "hfield", "sdf")
+FLAT = 1e-9  # m, thickness of what has none
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """One primitive, with sizes and axes as in MuJoCo.
+    """One primitive or convex hull, with sizes and axes as in MuJoCo. `of_corners` makes a hull.
 
     Attributes:
       kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` computes
@@ -34,8 +38,11 @@ class Obstacle:
         lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths, and for other kinds the half lengths of the bounding box; plane (0, 0, 0).
+        Boxes, and meshes along their local z, may be infinite.
       velocity: (3,) in m/s, of an obstacle that moves in a straight line; `position` is its position at time 0. Plans
         take the velocity into account; in the scene that MuJoCo simulates, the obstacle stands still.
+      corners: (C, 3) in local axes, in metres, of a mesh, which is their convex hull; from `position`, which is the
+        middle of the bounding box.
     """
 
     name: str
@@ -44,6 +51,7 @@ class Obstacle:
     rotation: Array
     size: Array
     velocity: Array = field(default_factory=lambda: np.zeros(3))
+    corners: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         check_text("obstacle: name", self.name, "a name", at_most=1000)
@@ -58,14 +66,34 @@ class Obstacle:
         if (size[:used] <= 0).any():
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
         keep(self, size=size, velocity=check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
+        keep(self, corners=check_array(f"obstacle {self.name!r}: corners", self.corners, (None, 3)))
+        if (self.kind == "mesh") != bool(len(self.corners)):
+            wanted = "at least one" if self.kind == "mesh" else f"none for a {self.kind}"
+            raise InputError(f"obstacle {self.name!r}: corners: got {len(self.corners)}, want {wanted}")
+
+    @classmethod
+    def of_corners(cls, name: str, corners: npt.ArrayLike, *, velocity: npt.ArrayLike = (0.0, 0.0, 0.0)) -> "Obstacle":
+        """The convex hull of points (C, 3) in the world, in m; of points (C, 2), a prism that is infinitely high."""
+        points = real(f"obstacle {name!r}: corners", corners)
+        if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
+            raise InputError(
+                f"obstacle {name!r}: corners: got shape {points.shape}, want (C, 2) or (C, 3), at least one"
+            )
+        flat, size = np.zeros((len(points), 3)), np.full(3, np.inf)
+        flat[:, : points.shape[1]] = points
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        size[: points.shape[1]] = np.maximum(high - low, FLAT)[: points.shape[1]] / 2
+        return cls(name, "mesh", (low + high) / 2, np.eye(3), size, real("velocity", velocity), flat - (low + high) / 2)
 
     @classmethod
     def _of_mujoco(
-        cls, name: str, kind: str, position: Array, rotation: Array, size: Array, velocity: Array
+        cls, name: str, kind: str, position: Array, rotation: Array, size: Array, velocity: Array, corners: Array
     ) -> "Obstacle":
         """Make an obstacle that MuJoCo has compiled, without checks: there can be tens of thousands."""
         made = object.__new__(cls)
-        vars(made).update(name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity)
+        vars(made).update(
+            name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity, corners=corners
+        )
         return made
 
     @property
@@ -76,7 +104,12 @@ class Obstacle:
                 f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)}; or an MjcfRobot, with"
                 " geoms=robot.geoms, whose distances are MuJoCo's"
             )
-        return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), self.size])
+        size = (
+            (0.0, len(self.corners), self.size[2] if self.size[2] == np.inf else 0.0)
+            if len(self.corners)
+            else self.size
+        )
+        return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), size])
 
 
 @checked
@@ -105,27 +138,38 @@ class World:
 
     @cached_property
     def table(self) -> Array:
-        """The obstacles as numbers, (len(self), ROW)."""
-        return np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
+        """The obstacles as compiled code reads them: `ROW` numbers of each, then the corners of meshes."""
+        return self.tables([0.0])[0]
 
     @cached_property
     def moving(self) -> bool:
         """Whether any obstacle moves."""
         return any(obstacle.velocity.any() for obstacle in self.obstacles)
 
+    @cached_property
+    def has_meshes(self) -> bool:
+        """Whether any obstacle is a convex hull of corners."""
+        return any(obstacle.kind == "mesh" for obstacle in self.obstacles)
+
     def displacements(self, times: npt.ArrayLike) -> Array:
         """The displacements (K, len(self), 3) in m of the obstacles at times (K,) in s since time 0 of the run."""
         velocities = np.array([obstacle.velocity for obstacle in self.obstacles]).reshape(len(self), 3)
         return np.multiply.outer(check_array("times", times, (None,)), velocities)
 
-    def tables(self, times: npt.ArrayLike) -> Array:
-        """The obstacles as compiled code reads them at times (K,) in s, (K or, if none moves, 1, len(self), ROW)."""
-        if not self.moving:
-            return self.table[None]
-        moved = self.displacements(times)
-        tables = np.repeat(self.table[None], len(moved), axis=0)
+    def tables(self, times: npt.ArrayLike) -> tuple[Array, int]:
+        """The same at times (K,) in s: K tables or, if nothing moves, one, then the corners; and the number of tables.
+
+        The row of a mesh says where its corners are, from the row on.
+        """
+        moved = self.displacements(times) if self.moving else np.zeros((1, len(self), 3))
+        rows = np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
+        tables = np.repeat(rows[None], len(moved), axis=0)
         tables[:, :, 1:4] += moved
-        return tables
+        first = tables.size + np.cumsum([0, *(one.corners.size for one in self.obstacles)])[:-1]
+        meshes = [number for number, one in enumerate(self.obstacles) if len(one.corners)]
+        begin = ROW * np.arange(len(moved) * len(self)).reshape(tables.shape[:2])
+        tables[:, meshes, 13] = (first - begin)[:, meshes]
+        return np.concatenate([tables.ravel(), *(one.corners.ravel() for one in self.obstacles)]), len(moved)
 
     @checked
     def moved(self, seconds: Finite) -> "World":
@@ -188,26 +232,12 @@ class World:
             ]
         )
 
-    def check_upright(self) -> None:
-        """Raises InputError unless each obstacle of a plane has an outline in it that does not depend on the height."""
-        for one in self.obstacles:
-            axis = np.abs(one.rotation[2])  # how much of each local axis is along the normal of the plane
-            high, flat = abs(one.position[2]), np.flatnonzero(axis < 1e-9)
-            match one.kind:
-                case "plane":
-                    good = bool(axis[2] < 1e-9)
-                case "sphere":
-                    good = not high
-                case "capsule" | "cylinder":
-                    good = bool(axis[2] > 1 - 1e-9) and high <= one.size[1]
-                case _:
-                    good = len(flat) == 2 and bool(np.isfinite(one.size[flat]).all())
-                    good = good and bool(high <= one.size[int(axis.argmax())])
-            if not good:
-                raise InputError(
-                    f"obstacle {one.name!r}: got a {one.kind} across the plane of hulls=, want it upright on the plane,"
-                    " and of finite width; or balls without hulls"
-                )
+    def upright(self) -> "World":
+        """The obstacles of a plane as infinite prisms, for hulls in it.
+
+        Raises InputError if the outline of one depends on the height.
+        """
+        return World([_prism(one) for one in self.obstacles])
 
     def distances(self, point: npt.ArrayLike) -> Array:
         """The signed distances in metres to each obstacle, (len(self),), of a point (2,) or (3,); negative inside.
@@ -215,8 +245,11 @@ class World:
         A point (2,) is for a world that is seen by a robot in the plane, in its coordinates.
         """
         x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
-        data = self.table.ravel()
-        return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
+        return np.array([
+            hull_distance(self.table, ROW * i, np.array([x, y, z]), 0, 1, np.empty(3)) if one.kind == "mesh"
+            else signed_distance(self.table, ROW * i, x, y, z)
+            for i, one in enumerate(self.obstacles)
+        ])  # fmt: skip
 
     def distance(self, points: npt.ArrayLike) -> Array:
         """The signed distance in m to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
@@ -246,6 +279,28 @@ def _parallel(obstacle: Obstacle, across: int) -> bool:
     return obstacle.kind == "plane" and bool(abs(abs(obstacle.rotation[across, 2]) - 1) < 1e-9)
 
 
+def _prism(one: Obstacle) -> Obstacle:
+    """An obstacle of a plane as an infinite prism. Raises InputError if its outline depends on the height."""
+    axis = np.abs(one.rotation[2])  # how much of each local axis is along the normal of the plane
+    up, high, size = int(axis.argmax()), abs(one.position[2]), one.size.copy()
+    size[up] = np.inf
+    match one.kind:
+        case "plane" if axis[2] < 1e-9:
+            return one
+        case "sphere" if not high:
+            return replace(one, kind="cylinder", rotation=np.eye(3), size=np.array([one.size[0], np.inf, 0.0]))
+        case "capsule" | "cylinder" if axis[2] > 1 - 1e-9 and high <= one.size[1]:
+            return replace(one, kind="cylinder", size=np.array([one.size[0], np.inf, 0.0]))
+        case "box" if axis[up] > 1 - 1e-9 and high <= one.size[up] and np.isfinite(np.delete(size, up)).all():
+            return replace(one, size=size)
+        case "mesh" if axis[2] > 1 - 1e-9 and one.size[2] == np.inf:
+            return one
+    raise InputError(
+        f"obstacle {one.name!r}: got a {one.kind} across the plane of hulls=, want it upright on the plane, and of"
+        " finite width; or balls without hulls"
+    )
+
+
 def _from_above(obstacle: Obstacle) -> Obstacle:
     """The obstacle with infinite height; planes are unchanged. Raises InputError if it is tilted."""
     upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # flags of a vertical local axis
@@ -260,6 +315,10 @@ def _from_above(obstacle: Obstacle) -> Obstacle:
         case "box" if upright.any():
             size[upright] = np.inf
             return replace(obstacle, size=size)
+        case "mesh" if obstacle.size[2] < np.inf or upright[2]:  # its outline, from whatever side
+            corners = obstacle.corners @ obstacle.rotation.T * (1, 1, 0)
+            half = np.maximum(np.abs(corners).max(axis=0), FLAT)
+            return replace(obstacle, rotation=np.eye(3), size=np.array([*half[:2], np.inf]), corners=corners)
     raise InputError(
         f"obstacle {obstacle.name!r}: got a tilted {obstacle.kind}, want it upright for a robot that moves in the plane"
     )

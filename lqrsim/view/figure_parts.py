@@ -231,6 +231,9 @@ def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
         up = np.linspace(0, np.pi, 13)
         local = np.broadcast_arrays(np.cos(around) * np.sin(up), np.sin(around) * np.sin(up), np.cos(up))
         local = radius * np.stack(local)
+    elif len(obstacle.corners):
+        ends = np.array([[low[2], high[2]]]) - obstacle.position[2] if np.isinf(obstacle.size[2]) else np.zeros((1, 2))
+        local = obstacle.corners.T[:, :, None] + np.array([0, 0, 1])[:, None, None] * ends
     elif obstacle.kind not in ("capsule", "cylinder"):  # a box, or the bounding box
         ring = obstacle.size[:2, None] * np.array([[-1, -1, 1, 1, -1], [-1, 1, 1, -1, -1]])
         ends = obstacle.size[2] * np.array([-1, 1])

@@ -233,8 +233,8 @@ class Overlays:
             if moving is not None and kind != "plane":
                 size = np.minimum(moving.sizes[i], 10 * self.recorded.model.stat.extent)
                 places = moving.positions[i] + times[:, None] * moving.velocities[i]
-                name = f"moving {moving.names[i]}"
-                yield MovingBody(name, MOVING, "", kind, size, moving.rotations[i], times, places)
+                name, shape = f"moving {moving.names[i]}", "box" if kind == "mesh" else kind  # the box about a hull
+                yield MovingBody(name, MOVING, "", shape, size, moving.rotations[i], times, places)
 
     def _of_cost(self, solution: Solution | None) -> Ellipsoids:
         """The ellipsoids in which the solution's total cost is near its minimum."""

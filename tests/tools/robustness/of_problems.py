@@ -239,7 +239,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "CollisionSpheres.centres": ({"self": balls, "dynamics": cart, "states": [[0.1, 0.2]]},),
         "SphereCenters": ({field.name: getattr(places, field.name) for field in dataclasses.fields(places)},),
         "Box": ({"length": 0.4, "width": 0.2},),
-        "Box.corners": ({"self": ls.types.Box(0.4, 0.2), "center": (0.0, 1.0), "angle": 0.3},),
+        "Box.corners": ({"self": ls.types.Box(0.4, 0.2), "center": (0.0, 1.0), "turn": 0.3},),
         "Capsule": ({"length": 0.4, "radius": 0.03, "tolerance": 0.002},),
         "Capsule.between": ({"self": ls.types.Capsule(0.4, 0.1, 0.02), "start": (0, 0, 0), "end": [1.0, 2.0, 3.0]},),
         "SymbolicCost": ({"function": bowl, "parameters": {"a": 1.0}, "convex": True},),

@@ -1,0 +1,413 @@
+"""The signed distance of a robot's convex hull to an obstacle, in space and in a plane. Written in the kernels' subset.
+
+Let M be the set of all differences of a point of the robot and a point of the obstacle. The signed distance is that of
+the origin to M: apart, the length of M's shortest vector, by the method of Gilbert, Johnson and Keerthi; for an
+overlap, the depth below M's nearest face, by an expanding polytope within M. That is the shortest move that ends the
+overlap. Both know M by its *supports*, its farthest points in a direction.
+
+An infinite obstacle makes M a prism without ends, whose faces are edges of its projection. In a plane all are infinite.
+"""
+
+from math import copysign, inf, sqrt
+
+from lqrsim.kernels.declarations import compact, outline, stack, zeros
+from lqrsim.kernels.signed_distance import signed_distance_derivatives
+
+STEPS = 60  # largest number of supports; corners need fewer, the rim of a cylinder some 20
+MESH = 5  # the kind of an obstacle that is a hull of corners, of which its row says where they are, and how many
+POINTS, FACES = 64, 256  # largest numbers of a polytope within M
+ROUNDING = 1e-14  # error of a distance, relative to the size of M
+TOUCHING = 1e-12  # distance, relative to the size of M, below which both touch
+SHORT = 1e-6  # length, relative to the size of M, below which a difference has lost its direction
+CORNER = 3  # index in a point of M, after its coordinates: the number of the robot's corner
+
+
+@outline
+def hull_distance(data, row, corners, first, count, pulls) -> float:
+    """The signed distance; write its derivatives in the robot's corners to pulls (3 count,).
+
+    Args:
+      corners: the robot's corners, from the one numbered `first` on, in any order.
+    """
+    simplex, weights, normal, axis, curve = zeros(4, 4), zeros(4), stack(3), zeros(3), stack(3, 3)
+    if count == 1 and data[row] != MESH:
+        x, y, z = corners[3 * first], corners[3 * first + 1], corners[3 * first + 2]
+        return signed_distance_derivatives(data, row, x, y, z, pulls, curve)
+    for k in range(3 * count):
+        pulls[k] = 0.0
+    if data[row] == 0:
+        return distance_to_plane(data, row, corners, first, count, pulls)
+    write_axis(data, row, axis)
+    distance = shortest(data, row, corners, first, count, axis, simplex, weights, normal)
+    if not distance > 0:
+        distance = nearest_face(data, row, corners, first, count, axis, simplex, weights, normal)
+    for k in range(4):
+        corner = 3 * int(simplex[k, CORNER])
+        for i in range(3):
+            pulls[corner + i] += weights[k] * normal[i]
+    return distance - rounding_radius(data, row)
+
+
+def distance_to_plane(data, row, corners, first, count, pulls):
+    """The distance of the lowest corner."""
+    least, lowest = inf, 0
+    for k in range(count):
+        distance = 0.0
+        for i in range(3):
+            distance += data[row + 6 + 3 * i] * (corners[3 * (first + k) + i] - data[row + 1 + i])
+        if distance < least:
+            least, lowest = distance, k
+    for i in range(3):
+        pulls[3 * lowest + i] = data[row + 6 + 3 * i]
+    return least
+
+
+def shortest(data, row, corners, first, count, axis, simplex, weights, normal):
+    """The length of M's shortest vector, or 0 for an overlap; write its direction.
+
+    Write the points of M of which the vector is a mean, at most 4, and their weights; the other weights are 0.
+    """
+    v, size, square, reach = stack(3), 0, inf, 0.0
+    for i in range(3):
+        v[i] = corners[3 * first + i] - data[row + 1 + i]
+    for _ in range(STEPS):
+        write_support(data, row, corners, first, count, axis, -v[0], -v[1], -v[2], simplex[size])
+        reach = max(reach, dot(simplex[size], simplex[size]))
+        if square < inf and square - dot(v, simplex[size]) <= ROUNDING * sqrt(square * reach):
+            break
+        left = reduce(simplex, size, square, weights, v)
+        if left == 0:
+            break
+        size, square = left, dot(v, v)
+        if square <= TOUCHING * TOUCHING * reach:
+            return 0.0
+    prism = dot(axis, axis) > 0
+    if square <= SHORT * SHORT * reach and size == (2 if prism else 3):
+        write_normal(simplex, prism, axis, normal)
+        scale = copysign(1.0, dot(normal, v))
+    else:
+        scale = 1 / sqrt(square)
+        normal[0], normal[1], normal[2] = v[0], v[1], v[2]
+    for i in range(3):
+        normal[i] *= scale
+    return dot(normal, v)
+
+
+def reduce(simplex, size, square, weights, v):
+    """Reduce a simplex, with a point added at `size`, to the face with the point nearest to the origin.
+
+    Write that point to v, and its weights; return the number of points. Return 0 if none is nearer than the square of
+    the distance so far says.
+    """
+    which, trial, nearest = stack(4), stack(4), stack(3)
+    best, kept, faces = square, 0, 1 if size == 0 else 2 if size == 1 else 4 if size == 2 else 8
+    for face in range(faces):  # the new point, with any of the others
+        number = write_face(face, size, which)
+        if weigh(simplex, number, which, trial) and least_of(trial, number) >= 0:
+            write_mean(simplex, number, which, trial, nearest)
+            if dot(nearest, nearest) < best:
+                best, kept = dot(nearest, nearest), face + 1
+                v[0], v[1], v[2] = nearest[0], nearest[1], nearest[2]
+    if kept == 0:
+        return 0
+    number = write_face(kept - 1, size, which)
+    weigh(simplex, number, which, trial)
+    for k in range(4):  # the new point, the first of the face, goes last
+        weights[k] = 0.0
+    for k in range(number):
+        source = int(which[(k + 1) % number])
+        weights[k] = trial[(k + 1) % number]
+        for i in range(4):
+            simplex[k, i] = simplex[source, i]
+    return number
+
+
+def write_face(face, size, which):
+    """Write the points of a face: the one at `size`, and those before it that the face's bits say; their number."""
+    which[0], number, bits = float(size), 1, face
+    for k in range(size):
+        if bits % 2 == 1:
+            which[number] = float(k)
+            number += 1
+        bits = bits // 2
+    return number
+
+
+def weigh(points, number, which, weights):
+    """Write the weights of points by which their mean is, of all points of the affine hull, nearest to the origin.
+
+    Return whether they exist.
+    """
+    sides, origin, across = stack(3, 3), points[int(which[0])], stack(3)
+    for k in range(number - 1):
+        for i in range(3):
+            sides[k, i] = points[int(which[k + 1]), i] - origin[i]
+    if number == 2:
+        size = dot(sides[0], sides[0])
+        weights[1] = -dot(origin, sides[0]) / size if size > 0 else -1.0
+    elif number > 2:
+        if number == 3:
+            cross(sides[0], sides[1], sides[2])
+        cross(sides[1], sides[2], across)
+        size = dot(sides[0], across)
+        if size == 0:
+            return False
+        weights[1] = -dot(origin, across) / size
+        cross(sides[2], sides[0], across)
+        weights[2] = -dot(origin, across) / size
+        cross(sides[0], sides[1], across)
+        weights[number - 1] = -dot(origin, across) / size if number == 4 else weights[2]
+    weights[0] = 1.0
+    for k in range(1, number):
+        weights[0] -= weights[k]
+    return True
+
+
+def write_mean(points, number, which, weights, mean):
+    """Write the mean of points by their weights."""
+    for i in range(3):
+        mean[i] = 0.0
+        for k in range(number):
+            mean[i] += weights[k] * points[int(which[k]), i]
+
+
+def least_of(weights, number):
+    """The least of some weights."""
+    least = weights[0]
+    for k in range(1, number):
+        least = min(least, weights[k])
+    return least
+
+
+@compact
+def nearest_face(data, row, corners, first, count, axis, simplex, weights, normal):
+    """The depth of the origin in M, below 0; write the direction out of it, from the obstacle to the robot.
+
+    Write the points of the nearest face, and their weights. If M is flat, the depth is 0, and both stay.
+    """
+    points, faces, normals, depths = stack(POINTS, 4), stack(FACES, 3), stack(FACES, 3), stack(FACES)
+    reach, total, size, face, prism = 0.0, 0, 4, 0, dot(axis, axis) > 0
+    reach = write_seed(data, row, corners, first, count, axis, points, normal)
+    if reach == 0:
+        return 0.0
+    if prism:  # the third point of each face is the direction of the axis
+        points[3, 0], points[3, 1], points[3, 2] = axis[0], axis[1], axis[2]
+    for k in range(3 if prism else 4):
+        one, two = ((k + 1) % 3, 3) if prism else ((k + 1 + k % 2) % 4, (k + 2 - k % 2) % 4)
+        total = add_face(points, k, one, two, prism, faces, normals, depths, total)
+    within = ROUNDING * reach
+    while True:
+        for k in range(total):
+            if k == 0 or depths[k] < depths[face]:
+                face = k
+        if size == POINTS or 2 * total > FACES:
+            break
+        x, y, z = normals[face, 0], normals[face, 1], normals[face, 2]
+        write_support(data, row, corners, first, count, axis, x, y, z, points[size])
+        if dot(normals[face], points[size]) <= depths[face] + within:
+            break
+        total = add_point(points, size, face, prism, within, faces, normals, depths, total)
+        size, face = size + 1, 0
+    return -choose(points, face, within, prism, faces, normals, depths, total, simplex, weights, normal)
+
+
+@compact
+def add_face(points, i, j, k, prism, faces, normals, depths, total):
+    """Add a face, its normal by the right hand, and the origin's depth below it; return the number of faces."""
+    one, two, normal = stack(3), stack(3), normals[total]
+    for m in range(3):
+        one[m] = points[j, m] - points[i, m]
+        two[m] = points[k, m] - (0.0 if prism else points[i, m])
+    cross(one, two, normal)
+    length = sqrt(dot(normal, normal))
+    for m in range(3):
+        normal[m] = normal[m] / length if length > 0 else 0.0
+    faces[total, 0], faces[total, 1], faces[total, 2] = float(i), float(j), float(k)
+    depths[total] = dot(normal, points[i]) if length > 0 else inf
+    return total + 1
+
+
+@compact
+def add_point(points, new, face, prism, within, faces, normals, depths, total):
+    """Add a point beyond a face: it replaces the faces that it sees. Return the number of faces."""
+    seen, end = stack(FACES), total
+    for k in range(total):
+        seen[k] = 1.0 if k == face or dot(normals[k], points[new]) > depths[k] - within else 0.0
+    for k in range(total):
+        if seen[k] == 1:
+            for side in range(1 if prism else 0, 3):
+                one, two = faces[k, side], faces[k, (side + 1) % 3]
+                if not has_side(faces, seen, total, two, one) and end < FACES:
+                    if prism and one == 3:
+                        end = add_face(points, int(two), new, 3, prism, faces, normals, depths, end)
+                    elif prism:
+                        end = add_face(points, new, int(one), 3, prism, faces, normals, depths, end)
+                    else:
+                        end = add_face(points, int(one), int(two), new, prism, faces, normals, depths, end)
+    left = 0
+    for k in range(end):
+        if k >= total or seen[k] == 0:
+            for i in range(3):
+                faces[left, i], normals[left, i] = faces[k, i], normals[k, i]
+            depths[left] = depths[k]
+            left += 1
+    return left
+
+
+@compact
+def has_side(faces, seen, total, one, two):
+    """Whether a face that is seen has the side from a point to another."""
+    for k in range(total):
+        if seen[k] == 1:
+            for side in range(3):
+                if faces[k, side] == one and faces[k, (side + 1) % 3] == two:
+                    return True
+    return False
+
+
+@compact
+def choose(points, face, within, prism, faces, normals, depths, total, simplex, weights, normal):
+    """Of the faces in the nearest one's plane write that below which the origin is; return the depth."""
+    trial, number, best = stack(4), 2 if prism else 3, -inf
+    for k in range(total):
+        alike = depths[k] <= depths[face] + within and weigh(points, number, faces[k], trial)
+        if alike and least_of(trial, number) > best:
+            best = least_of(trial, number)
+            for i in range(3):
+                weights[i] = trial[i] if i < number else 0.0
+                normal[i] = -normals[k, i]
+                for m in range(4):
+                    simplex[i, m] = points[int(faces[k, i]), m]
+    weights[3] = 0.0
+    return max(depths[face], 0.0)
+
+
+@compact
+def write_seed(data, row, corners, first, count, axis, points, normal):
+    """Write four points of M that are in no plane, and return its size; of a prism three, in no line.
+
+    Return 0 if M is flat, and write the normal.
+    """
+    basis, off, trial, known, reach = zeros(4, 3), stack(3), stack(4), 1 if dot(axis, axis) > 0 else 0, 0.0
+    for i in range(3):
+        basis[0, i] = axis[i]
+    write_support(data, row, corners, first, count, axis, 1.0, 0.5, 0.25, points[0])
+    for k in range(1, 4 - known):
+        widest = -1.0
+        for side in range(6):
+            for i in range(3):
+                off[i] = (1.0 if side < 3 else -1.0) if i == side % 3 else 0.0
+            length = remove(basis, known + k - 1, off)
+            if length > 0.5:  # of three directions, one is this far from those before
+                write_support(data, row, corners, first, count, axis, off[0], off[1], off[2], trial)
+                if widest < 0:
+                    normal[0], normal[1], normal[2] = off[0] / length, off[1] / length, off[2] / length
+                    widest = 0.0
+                for i in range(3):
+                    off[i] = trial[i] - points[0, i]
+                length = remove(basis, known + k - 1, off)
+                if length > widest:
+                    widest = length
+                    for i in range(4):
+                        points[k, i] = trial[i]
+                    for i in range(3):
+                        basis[known + k - 1, i] = off[i] / length
+        reach = max(reach, widest)
+        if widest <= TOUCHING * reach:
+            return 0.0
+    cross(basis[known], basis[known + 1], off)
+    if (dot(off, basis[0]) if known == 1 else -dot(off, basis[2])) < 0:
+        for i in range(4):
+            points[1, i], points[2, i] = points[2, i], points[1, i]
+    return reach
+
+
+@compact
+def remove(basis, known, vector):
+    """Remove the parts of a vector along the first directions of a basis; return the length of what is left."""
+    for k in range(known):
+        part = dot(basis[k], vector)
+        for i in range(3):
+            vector[i] -= part * basis[k, i]
+    return sqrt(dot(vector, vector))
+
+
+def write_normal(points, prism, axis, normal):
+    """Write the unit normal of three points, or of two of a prism's."""
+    one, two = stack(3), stack(3)
+    for i in range(3):
+        one[i] = points[1, i] - points[0, i]
+        two[i] = axis[i] if prism else points[2, i] - points[0, i]
+    cross(one, two, normal)
+    length = sqrt(dot(normal, normal))
+    for i in range(3):
+        normal[i] = normal[i] / length if length > 0 else 0.0
+
+
+def write_support(data, row, corners, first, count, axis, x, y, z, point):
+    """Write M's farthest point in a direction, and the number of the robot's corner."""
+    farthest, corner = -inf, 0
+    for k in range(count):
+        at = 3 * (first + k)
+        along = x * corners[at] + y * corners[at + 1] + z * corners[at + 2]
+        if along > farthest:
+            farthest, corner = along, k
+    write_obstacle_support(data, row, -x, -y, -z, point)
+    for i in range(3):
+        point[i] = corners[3 * (first + corner) + i] - point[i]
+    along = dot(axis, point)
+    for i in range(3):
+        point[i] -= along * axis[i]
+    point[CORNER] = float(corner)
+
+
+def write_obstacle_support(data, row, x, y, z, point):
+    """Write the obstacle's farthest point in a direction, without what `rounding_radius` adds and what is infinite."""
+    kind, half, local = data[row], data[row + 14], zeros(3)
+    a = data[row + 4] * x + data[row + 7] * y + data[row + 10] * z
+    b = data[row + 5] * x + data[row + 8] * y + data[row + 11] * z
+    c = data[row + 6] * x + data[row + 9] * y + data[row + 12] * z
+    if (kind == 2 or kind == 3) and half < inf:
+        local[2] = copysign(half, c)
+        across = sqrt(a * a + b * b)
+        if kind == 3 and across > 0:
+            local[0], local[1] = a / across * data[row + 13], b / across * data[row + 13]
+    elif kind == 4:
+        local[0] = copysign(data[row + 13], a) if data[row + 13] < inf else 0.0
+        local[1] = copysign(data[row + 14], b) if data[row + 14] < inf else 0.0
+        local[2] = copysign(data[row + 15], c) if data[row + 15] < inf else 0.0
+    elif kind == MESH:
+        farthest, corner, at = -inf, 0, row + int(data[row + 13])
+        for k in range(int(half)):
+            along = a * data[at + 3 * k] + b * data[at + 3 * k + 1] + c * data[at + 3 * k + 2]
+            if along > farthest:
+                farthest, corner = along, at + 3 * k
+        local[0], local[1], local[2] = data[corner], data[corner + 1], data[corner + 2]
+    for i in range(3):
+        turn = row + 4 + 3 * i
+        point[i] = data[row + 1 + i] + data[turn] * local[0] + data[turn + 1] * local[1] + data[turn + 2] * local[2]
+
+
+def rounding_radius(data, row):
+    """The radius by which an obstacle goes beyond its supports."""
+    kind = data[row]
+    return data[row + 13] if kind == 1 or kind == 2 or (kind == 3 and data[row + 14] == inf) else 0.0
+
+
+def write_axis(data, row, axis):
+    """Write the direction in which an obstacle is infinite, to an array of zeros."""
+    for k in range(3):
+        long = data[row + 14] == inf and k == 2 and (data[row] == 2 or data[row] == 3)
+        if long or (data[row + 13 + k] == inf and data[row] >= 4):
+            for i in range(3):
+                axis[i] = data[row + 4 + 3 * i + k]
+
+
+def dot(a, b):
+    """The product of two vectors (3,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a, b, out):
+    """Write a x b."""
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
