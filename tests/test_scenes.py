@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lqrsim.errors import InputError
 from lqrsim.robots.mjcf import MjcfRobot
@@ -133,7 +134,6 @@ def test_a_bar_is_infinite_where_both_its_ends_are_in_walls(scene_of, bar, half_
     ("asset", "geom", "kind"),
     [
         ("", '<geom name="egg" type="ellipsoid" size="1 2 3"/>', "ellipsoid"),
-        ('<mesh name="m" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/>', '<geom name="egg" type="mesh" mesh="m"/>', "mesh"),
         (
             '<hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/>',
             '<geom name="egg" type="hfield" hfield="h"/>',
@@ -147,6 +147,23 @@ def test_an_obstacle_without_a_distance_is_refused_by_name(scene_of, asset, geom
         scene_of(text=text)
     drawn = scene_of(text=text.replace('name="egg"', 'name="egg" contype="0" conaffinity="0"'))
     assert len(drawn.world) == 0
+
+
+def test_a_mesh_is_its_convex_hull(scene_of):
+    """Of a star without its inner corners, in MuJoCo's place; to the precision of single numbers in meshes."""
+    star = "0 0 .9  .1 .1 .1  .8 0 0  -.1 .1 0  0 .7 0  -.6 0 0  0 -.5 0  0 0 -.4"
+    geom = '<geom name="star" type="mesh" mesh="star" pos="1 2 3" euler="10 20 30"/>'
+    mesh = f'<mesh name="star" vertex="{star}"/>'
+    scene = scene_of(text=f"<mujoco><asset>{mesh}</asset><worldbody>{geom}</worldbody></mujoco>")
+    (obstacle,) = scene.world.obstacles
+    spikes = np.array(star.split(), dtype=float).reshape(-1, 3)[[0, 2, 4, 5, 6, 7]]
+    expected = Rotation.from_euler("XYZ", [10, 20, 30], degrees=True).apply(spikes) + np.array([1, 2, 3])
+    found = obstacle.corners @ obstacle.rotation.T + obstacle.position
+    assert len(found) == 6
+    for one in expected:
+        assert np.linalg.norm(found - one, axis=1).min() < 1e-6
+    above = scene.world.seen_by("xy")  # its outline
+    assert above.distance(expected[:, :2]).max() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_scene_of_ones_own_includes_the_packaged_robots_and_files_beside_it(tmp_path):

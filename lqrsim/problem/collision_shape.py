@@ -287,6 +287,11 @@ def shape_in(
             return ShapeInWorld(dynamics, seen, balls.radii, balls.names, centers, hulls)
         radii = balls.radii[np.cumsum([0, *balls.hulls[:-1]])]
         seen = seen.upright() if centers.in_plane else seen
+        for one in seen.obstacles:
+            if one.kind == "box" and np.isinf(one.size).sum() > 1:
+                raise InputError(
+                    f"obstacle {one.name!r}: got a box that is infinite in two directions, want one of them"
+                )
         return ShapeInWorld(dynamics, seen, radii, balls.names, centers, balls.hulls)
     seen = world.seen_by(space.plane, space.offset) if space.position else World()
     if seen.has_meshes:

@@ -7,8 +7,8 @@ collide if contype or conaffinity is not zero, and contacts are not switched off
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
 - planes are walls, floors and ceilings, infinite, at any drawn size, and solid behind. A plane that is parallel to the
   plane in which a robot moves, such as the floor that it drives on, does not bound the robot (`World.seen_by`);
-- plane, sphere, capsule, cylinder and box have a distance. Other types are refused by name, not left out. A robot from
-  an MJCF uses MuJoCo's distances, to all types;
+- plane, sphere, capsule, cylinder, box and mesh have a distance; a mesh is its convex hull, as in contacts. Other types
+  are refused by name, not left out. A robot from an MJCF uses MuJoCo's distances, to all types;
 - a cylinder or capsule counts as infinite if both ends lie on or behind planes, because nothing can reach them.
 
 `obstacles=` of `load_scene` chooses other obstacles, by names or by a function. `MjcfRobot` leaves out geoms that are

@@ -318,6 +318,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "name": "box", "kind": "box", "position": np.zeros(3), "rotation": np.eye(3), "size": np.ones(3)
         },),
         "World": ({"obstacles": [box]},),
+        "Obstacle.of_corners": (
+            {"call": ls.Obstacle.of_corners, "name": "rock", "corners": np.eye(3), "velocity": np.ones(3)},
+        ),
         "World.seen_by": ({"self": world, "plane": "xz", "offset": 0.5},),
         "World.moved": ({"self": world, "seconds": 0.5},),
         "World.displacements": ({"self": world, "times": [0.0, 0.5]},),
