@@ -294,6 +294,21 @@ def test_costs_and_slopes() -> None:
     assert shape.nearest(places, np.zeros((4, 3))) == int(distances.min(axis=0).argmin())
 
 
+def test_a_ball_among_hulls() -> None:
+    """Its distance is that of its centre, less its radius; the cost's gradient against differences."""
+    world = ls.World([ls.Obstacle.of_corners("wedge", [[0.3, 0.2], [0.9, 0.3], [0.5, 0.7]]), WALL])
+    x = np.array([0.2, 0.1, 0.4, -0.2])
+    shape = ls.Clearance(world, radius=0.05).in_world(DYNAMICS)
+    assert shape.clearance(shape.places(x)) == pytest.approx(world.distance(x[:2]) - 0.05, abs=1e-12)
+    assert shape.inside(np.array([0.5, 0.4, 0.0, 0.0])) is not None
+    term = ls.ObstacleCost(world, radius=0.05, sharpness=3.0).bind(DYNAMICS)
+    value, gradient, _ = evaluate(term, x, np.zeros(2))
+    assert value == pytest.approx(np.exp(-3.0 * (world.distances(x[:2]) - 0.05)).sum(), rel=1e-12)
+    for i, step in enumerate(1e-6 * np.eye(4)):
+        more, less = (evaluate(term, x + side * step, np.zeros(2))[0] for side in (1, -1))
+        assert gradient[i] == pytest.approx((more - less) / 2e-6, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
@@ -306,6 +321,9 @@ def test_costs_and_slopes() -> None:
         (lambda: ls.CollisionSpheres(outline, 0.0, hulls=[0]), "hulls: got 0"),
         (lambda: ls.types.Box(0.0, 1.0), "Box: length: got 0"),
         (lambda: CAR.corners((1.0, 2.0, 3.0), 0.0), "want 2 coordinates and an angle"),
+        (lambda: PLANK.corners((1.0, 2.0), 0.0), "want 3 coordinates and a rotation vector"),
+        (lambda: ls.Obstacle.of_corners("rock", [1.0, 2.0]), "corners: got shape (2,), want (C, 2) or (C, 3)"),
+        (lambda: ls.Obstacle("rock", "mesh", np.zeros(3), np.eye(3), np.ones(3)), "corners: got 0, want at least one"),
     ],
 )
 def test_bad_input_is_named(make: Any, said: str) -> None:
