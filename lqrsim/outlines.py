@@ -124,7 +124,7 @@ class Box(namedtuple("Box", ("length", "width", "height"))):
         return super().__new__(cls, *checked, *[None] * (3 - len(checked)))
 
     def corners(self, center: Sequence[Any], turn: Any) -> list[list[Any]]:
-        """Its four corners, counterclockwise, or in space its eight: SymPy expressions, or numbers.
+        """The four corners, counterclockwise, or in space the eight corners: SymPy expressions, or numbers.
 
         Args:
           center: its 2 or 3 coordinates in metres.

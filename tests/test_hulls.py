@@ -323,7 +323,10 @@ def test_a_ball_among_hulls() -> None:
         (lambda: CAR.corners((1.0, 2.0, 3.0), 0.0), "want 2 coordinates and an angle"),
         (lambda: PLANK.corners((1.0, 2.0), 0.0), "want 3 coordinates and a rotation vector"),
         (lambda: ls.Obstacle.of_corners("rock", [1.0, 2.0]), "corners: got shape (2,), want (C, 2) or (C, 3)"),
-        (lambda: ls.Obstacle("rock", "mesh", np.zeros(3), np.eye(3), np.ones(3)), "corners: got 0, want at least one"),
+        (
+            lambda: ls.World([ls.Obstacle("rock", "mesh", np.zeros(3), np.eye(3), np.ones(3))]).table,
+            "obstacle 'rock': got a mesh, want one of: plane, sphere, capsule, cylinder, box, mesh with corners",
+        ),
     ],
 )
 def test_bad_input_is_named(make: Any, said: str) -> None:

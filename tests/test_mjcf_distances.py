@@ -498,20 +498,20 @@ def test_a_start_inside_an_obstacle_names_the_body_and_the_exclude(tmp_path: Pat
 
 
 def test_what_cannot_be_an_obstacle_is_refused_in_one_line(tmp_path: Path) -> None:
-    file = arm_file(tmp_path)
+    file = arm_file(tmp_path, "ellipsoid")
     with pytest.raises(InputError, match=r"obstacles: got 'poost', want one of: .*post"):
         ls.MjcfRobot(file, obstacles=("poost",))
     with pytest.raises(InputError, match=r"obstacles: got 'post', want a tuple of names: \('post',\)"):
         ls.MjcfRobot(file, obstacles="post")
     with pytest.raises(InputError, match=r"obstacles: got AttributeError"):
         ls.MjcfRobot(file, obstacles=lambda geom: geom.colour)
-    with pytest.raises(InputError, match=r"got the obstacle 'post' of type mesh, .*MjcfRobot"):
+    with pytest.raises(InputError, match=r"got the obstacle 'post' of type ellipsoid, .*MjcfRobot"):
         ls.load_scene(file)
     assert ls.load_scene(file, obstacles=("floor",)).world.names == ("floor",)
     robot, other = ls.MjcfRobot(file), ls.World([ls.Obstacle("egg", "sphere", np.zeros(3), np.eye(3), np.full(3, 0.1))])
     with pytest.raises(InputError, match=r"geoms: got the obstacle 'egg', which is not one of the robot's MJCF, want"):
         ls.Clearance(other, geoms=robot.geoms).bind(robot.dynamics)
-    with pytest.raises(InputError, match=r"obstacle 'post': got a mesh, want one of: plane"):
+    with pytest.raises(InputError, match=r"obstacle 'post': got a ellipsoid, want one of: plane"):
         ls.Clearance(robot.scene.world, balls=robot.balls).bind(robot.dynamics)
     cost = ls.ControlCost(np.ones(3)) + ls.ObstacleCost(robot.scene.world, geoms=robot.geoms)
     bad: dict[str, Any] = {

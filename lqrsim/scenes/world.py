@@ -67,9 +67,8 @@ class Obstacle:
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
         keep(self, size=size, velocity=check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
         keep(self, corners=check_array(f"obstacle {self.name!r}: corners", self.corners, (None, 3)))
-        if (self.kind == "mesh") != bool(len(self.corners)):
-            wanted = "at least one" if self.kind == "mesh" else f"none for a {self.kind}"
-            raise InputError(f"obstacle {self.name!r}: corners: got {len(self.corners)}, want {wanted}")
+        if len(self.corners) and self.kind != "mesh":
+            raise InputError(f"obstacle {self.name!r}: corners: got {len(self.corners)}, want none for a {self.kind}")
 
     @classmethod
     def of_corners(cls, name: str, corners: npt.ArrayLike, *, velocity: npt.ArrayLike = (0.0, 0.0, 0.0)) -> "Obstacle":
@@ -99,10 +98,10 @@ class Obstacle:
     @property
     def row(self) -> Array:
         """This obstacle as `ROW` numbers."""
-        if self.kind not in KINDS:
+        if self.kind not in KINDS or (self.kind == "mesh" and not len(self.corners)):
             raise InputError(
-                f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)}; or an MjcfRobot, with"
-                " geoms=robot.geoms, whose distances are MuJoCo's"
+                f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)} with corners; or an"
+                " MjcfRobot, with geoms=robot.geoms, whose distances are MuJoCo's"
             )
         size = (
             (0.0, len(self.corners), self.size[2] if self.size[2] == np.inf else 0.0)
