@@ -46,7 +46,9 @@ def faults(text: str) -> Iterator[tuple[int, int, str]]:
             between = [*zip(node.values, node.values[1:], strict=False)]
         elif isinstance(node, ast.Compare):
             between = [*zip([node.left, *node.comparators], node.comparators, strict=False)]
-        elif isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+        elif (
+            isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool)
+        ):
             yield *place(node), repr(1.1 * node.value if isinstance(node.value, float) else node.value + 1)
         for left, right in between:
             first, last = place(left)[1], place(right)[0]
