@@ -431,7 +431,7 @@ class Problem(OneVersion):
         return tuple(kept for part in parts if (kept := part.kept_clear) is not None)
 
     def terms(self, which: str) -> tuple[CostTerm, ...]:
-        """Those of "initial", "stage_cost" or "final_cost", bound."""
+        """The bound terms of "initial", "stage_cost" or "final_cost"."""
         return self._terms[check_name("which", which, self._terms)]
 
     @property
