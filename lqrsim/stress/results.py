@@ -255,6 +255,7 @@ class Results:
 
     @checked
     def path(self, shard: Shard) -> Path:
+        """The path of a shard's file."""
         if shard.cell >= len(self.cells):
             raise InputError(f"shard: cell: got {shard.cell}, want a whole number from 0 to {len(self.cells) - 1}")
         return self.folder / "shards" / shard.file
@@ -267,6 +268,7 @@ class Results:
                 yield self.table(shard)
 
     def table(self, shard: Shard) -> Table:
+        """The rows of a shard."""
         path = self.path(shard)
         if not path.is_file():
             trials = f"{shard.first} to {shard.first + shard.count - 1}"

@@ -260,6 +260,7 @@ class Campaign(Setup):
 
     @checked
     def disturbances(self, cell: Cell) -> list[Disturbance]:
+        """The disturbances of a cell's trials."""
         check_name("cell: sweep", cell.sweep, self.sweeps)
         return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
