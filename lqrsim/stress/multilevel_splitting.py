@@ -198,7 +198,7 @@ class CountedScore:
         return scores
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Splitting:
     """What the pilot run and the repetitions do with vectors (k, d) and their scores (k,)."""
 
