@@ -158,7 +158,8 @@ class World:
     def tables(self, times: npt.ArrayLike) -> tuple[Array, int]:
         """The same at times (K,) in s: K tables or, if nothing moves, one, then the corners; and the number of tables.
 
-        The row of a mesh says where its corners are, from the row on.
+        In place of its size the row of a mesh has the place of its corners, from the row on, their number, and inf for a
+        prism or 0.
         """
         moved = self.displacements(times) if self.moving else np.zeros((1, len(self), 3))
         rows = np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
