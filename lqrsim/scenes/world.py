@@ -103,11 +103,8 @@ class Obstacle:
                 f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)} with corners; or an"
                 " MjcfRobot, with geoms=robot.geoms, whose distances are MuJoCo's"
             )
-        size = (
-            (0.0, len(self.corners), self.size[2] if self.size[2] == np.inf else 0.0)
-            if len(self.corners)
-            else self.size
-        )
+        mesh = 0.0, len(self.corners), np.inf if self.size[2] == np.inf else 0.0
+        size = mesh if len(self.corners) else self.size
         return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), size])
 
 
@@ -158,8 +155,8 @@ class World:
     def tables(self, times: npt.ArrayLike) -> tuple[Array, int]:
         """The same at times (K,) in s: K tables or, if nothing moves, one, then the corners; and the number of tables.
 
-        In place of its size the row of a mesh has the place of its corners, from the row on, their number, and inf for a
-        prism or 0.
+        In place of its size the row of a mesh has the place of its corners, from the row on, their number, and inf for
+        a prism, else 0.
         """
         moved = self.displacements(times) if self.moving else np.zeros((1, len(self), 3))
         rows = np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
