@@ -15,7 +15,7 @@ from lqrsim.codegen.distances import hull_distances, signed_distance, signed_dis
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
-from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, evaluate, evaluate_slopes
+from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, evaluate, evaluate_slopes, one_at
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.scenes.scene import Scene
@@ -295,7 +295,7 @@ def shape_in(
         return ShapeInWorld(dynamics, seen, radii, balls.names, centers, balls.hulls)
     seen = world.seen_by(space.plane, space.offset) if space.position else World()
     if seen.has_meshes:
-        return ShapeInWorld(dynamics, seen, np.array([radius]), ("",), SphereCenters.at(space.position), (1,))
+        return ShapeInWorld(dynamics, seen, np.array([radius]), ("",), one_at(space.position), (1,))
     return ShapeInWorld(dynamics, seen, np.array([radius]))
 
 

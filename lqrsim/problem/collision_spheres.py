@@ -69,17 +69,6 @@ class SphereCenters(Term):
         """The obstacles in the coordinates of the places."""
         return world.seen_by(space.plane or "xy", space.offset) if self.in_plane else world.seen_by(SPACE)
 
-    @classmethod
-    def at(cls, position: tuple[int, ...]) -> "SphereCenters":
-        """The centre of a robot that is one ball at its position, of 2 or 3 states."""
-        values = [f"out[{i}] = x[{state}]" for i, state in enumerate(position)] + ["out[2] = 0.0"] * (
-            len(position) == 2
-        )
-        slopes = [f"slopes[{i}, {state}] = 1.0" for i, state in enumerate(position)]
-        written = ["def places(x, data, out):", *values, "def places_jacobian(x, data, out, slopes):", *values, *slopes]
-        text = "\n".join(line if line.startswith("def") else f"    {line}" for line in written)
-        return cls(text, np.zeros(0), position, len(position) == 2)
-
     def filling(self, kernel: Source) -> Source:
         """The kernel of a cost or a constraint, with these places.
 
@@ -87,6 +76,15 @@ class SphereCenters(Term):
           kernel: the source of the kernel.
         """
         return kernel.filled(places=self.code, places_jacobian=self.code)
+
+
+def one_at(position: tuple[int, ...]) -> SphereCenters:
+    """The centre of a robot that is one ball at its position, of 2 or 3 states."""
+    values = [f"out[{i}] = x[{state}]" for i, state in enumerate(position)] + ["out[2] = 0.0"] * (len(position) == 2)
+    slopes = [f"slopes[{i}, {state}] = 1.0" for i, state in enumerate(position)]
+    lines = ["def places(x, data, out):", *values, "def places_jacobian(x, data, out, slopes):", *values, *slopes]
+    text = "\n".join(line if line.startswith("def") else f"    {line}" for line in lines)
+    return SphereCenters(text, np.zeros(0), position, len(position) == 2)
 
 
 class CollisionSpheres:
