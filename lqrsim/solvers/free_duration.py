@@ -219,7 +219,6 @@ class DurationSearch:
         duration at which it ended or, if there is none, of one a part of the way there; as long as such plans become
         cheaper.
         """
-        tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
         while not self._budget.over:
             _, ordinary, found = self._find(begin, self._budget)
             if found.solved or not np.isfinite(found.plan.states).all() or self._stop.due:
@@ -229,7 +228,7 @@ class DurationSearch:
                 dt = begin.dt + share * (end.dt - begin.dt)
                 start = end if share == 1 else replace(begin, dt=dt)
                 fixed = settled(self._problem, dt * self._problem.steps)
-                again = self._solved(fixed, replace(tries, start=start, starts=None))
+                again = self._solved(fixed, replace(settings, start=start, starts=None))
                 self._fixed.append(again)
                 missed, cost = self._rank(again)
                 if again.success and (missed, cost + FELL * abs(cost)) < least:
