@@ -1,6 +1,8 @@
 """The problems of dynobench, as stated for lqrsim, and the check that is independent of it."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import dynobench
 import numpy as np
@@ -13,6 +15,8 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.solvers import free_duration
+from lqrsim.solvers.ways import Way
 
 BY_ROBOT = {case.robot: case for case in CASES.values()}
 PARKING, EMPTY = CASES["unicycle1_v0/parallelpark_0"], CASES["quad2d_v0/empty_0"]
@@ -115,6 +119,24 @@ def test_no_plan_of_these_is_found_along_the_first_sketches(name: str) -> None:
     assert solution.status is ls.Status.CONVERGED
     assert case.published is not None
     assert solution.trajectory.horizon < case.published
+
+
+@pytest.mark.long
+def test_a_plan_that_pushes_against_many_limits_is_certified(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An acrobot that swings for long, along which errors grow 1e9-fold, so that no Newton step improves the plan.
+
+    What the interior point leaves of each row then adds up to more than the tolerance, unless it goes on.
+    """
+    found = free_duration.ways
+
+    def one(*arguments: Any) -> Iterator[Way]:
+        yield from (way for way in found(*arguments) if way.name.endswith("a turn more of q1 and q2"))
+
+    monkeypatch.setattr(free_duration, "ways", one)
+    monkeypatch.setattr(free_duration, "SKETCHED", ((2.0, False),))
+    solution = ls.smooth(statements.in_least_time(CASES["acrobot_v0/swing_up_empty"]), time_limit=600)
+    assert solution.trajectory.horizon == pytest.approx(6.3658, abs=1e-4)
+    assert solution.status is ls.Status.CONVERGED
 
 
 @pytest.mark.long

@@ -53,6 +53,7 @@ NEAR_SEGMENTS = 1e-4
 # with `LITTLE` 4 of 6, and with the duration of the segments 5 of 6.
 LONGER, CLOSING, CLOSED = 1.01, Barrier(1e-3, 2e-3, near=False), 1e-3
 PART_WAY = (1.0, 0.25)  # parts of the way to the duration at which a search has failed, from one of which it goes on
+FINER = 0.3  # part of the tolerance for a plan that is not certified; where errors grow 1e9-fold, 0.1 is mere rounding
 FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
 
 
@@ -237,13 +238,16 @@ class DurationSearch:
                 return
             begin = again.trajectory
 
-    def _find(self, begin: Trajectory, budget: Budget) -> tuple[bool, Problem, Found]:
-        """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
+    def _find(self, begin: Trajectory, budget: Budget, share: float = 1.0) -> tuple[bool, Problem, Found]:
+        """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan.
+
+        `share` is of the tolerance.
+        """
         problem, settings, before = self._problem, self._settings, len(budget.log)
         with self._stop.reporting("smooth", self._attentive):
             ordinary, found = find_duration(
-                problem, begin, tolerance=settings.final(problem), violation=settings.violation_tolerance(problem),
-                budget=budget, price=settings.price,
+                problem, begin, tolerance=share * settings.final(problem),
+                violation=settings.violation_tolerance(problem), budget=budget, price=settings.price,
             )  # fmt: skip
         self._total += len(budget.log) - before
         cheaper = found.solved and (self.best is None or found.measures.cost < self.best[1].measures.cost)
@@ -270,14 +274,13 @@ class DurationSearch:
 
     def solution(self) -> Solution:
         """The best plan, finished with its duration; or the best for a fixed duration, if none was found."""
-        settings = replace(self._settings, starts=None)
         if self.best is not None:
-            ordinary, found = self.best
-            m, n = found.plan.controls.shape[1], found.plan.states.shape[1]
-            summary = f"a plan of {ordinary.steps * ordinary.dt:.6g} s"
-            gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
-            guess = InitialGuess(gain, found.plan.controls, summary, found=found, log=log)
-            return self._described(self._solved(ordinary, replace(settings, start=guess)))  # its log begins with this
+            finished = self._finished(*self.best)
+            # Each row is within the tolerance; all together may not be, where Newton's method fails that would end it.
+            again = Budget(self._settings.max_iterations, self._stop)
+            if finished.status is Status.NOT_CERTIFIED and self._find(finished.trajectory, again, FINER)[0]:
+                finished = self._finished(*self.best)
+            return self._described(finished)
         first, last, chosen = self._fixed[0], self._fixed[-1], min(self._fixed, key=self._rank)
         if last.status is Status.INFEASIBLE and not chosen.success and not self._stop.due:
             said = f"even in {last.trajectory.horizon:g} s {last.detail}"
@@ -294,6 +297,14 @@ class DurationSearch:
             chosen, status=status, detail=detail.removesuffix("; "), iterations=log,
             remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
         ))  # fmt: skip
+
+    def _finished(self, ordinary: Problem, found: Found) -> Solution:
+        """What becomes of a plan with its duration held. The log begins with that of the search for it."""
+        m, n = found.plan.controls.shape[1], found.plan.states.shape[1]
+        summary = f"a plan of {ordinary.steps * ordinary.dt:.6g} s"
+        gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
+        guess = InitialGuess(gain, found.plan.controls, summary, found=found, log=log)
+        return self._solved(ordinary, replace(self._settings, starts=None, start=guess))
 
     def _described(self, solution: Solution) -> Solution:
         """The solution with the free duration among its options, in words, and with all that was tried."""
