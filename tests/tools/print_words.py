@@ -2,9 +2,10 @@
 
 Kinds: `status` (meanings and remedies), `solve` (summaries of the solves of tests/test_remedies.py), `warning`,
 `error`, `say` (details, summaries, progress, figures), `help`.
-Values that are filled in are shown as `{}`. Run it as `python tests/tools/print_words.py [KIND ...]`.
+Values that are filled in are shown as `{}`.
 """
 
+import argparse
 import ast
 import contextlib
 import io
@@ -22,10 +23,11 @@ CODE = ("kernels", "codegen")  # rooms with programs as texts, of which only err
 
 
 def main() -> int:
-    kinds = sys.argv[1:] or KINDS
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"some of {', '.join(KINDS)}; by default all")
+    kinds = parser.parse_args().kinds or KINDS
     if unknown := set(kinds) - set(KINDS):
-        print(f"got {', '.join(sorted(unknown))}, want some of {', '.join(KINDS)}")
-        return 2
+        parser.error(f"got {', '.join(sorted(unknown))}, want some of {', '.join(KINDS)}")
     found: dict[str, list[str]] = {kind: [] for kind in KINDS}
     for path in sorted(PACKAGE.rglob("*.py")):
         place = path.relative_to(PACKAGE)
