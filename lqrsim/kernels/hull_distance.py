@@ -191,7 +191,7 @@ def nearest_face(data, row, corners, first, count, axis, simplex, weights, norma
     if reach == 0:
         return 0.0
     if prism:  # the third point of each face is the direction of the axis
-        points[3, 0], points[3, 1], points[3, 2] = axis[0], axis[1], axis[2]
+        points[3, 0], points[3, 1], points[3, 2], points[3, CORNER] = axis[0], axis[1], axis[2], 0.0
     for k in range(3 if prism else 4):
         one, two = ((k + 1) % 3, 3) if prism else ((k + 1 + k % 2) % 4, (k + 2 - k % 2) % 4)
         total = add_face(points, k, one, two, prism, faces, normals, depths, total)
