@@ -340,7 +340,8 @@ def test_a_filter_becomes_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.long
-def test_beliefs() -> None:
+def test_beliefs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     names = run_page("belief_space.md")  # which has assertions of its own
     assert names["solution"].success
     assert names["plan"].success
