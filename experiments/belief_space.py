@@ -139,7 +139,8 @@ def by_ipopt(name: str, problem: ls.Problem, starts: int) -> list[Result]:
     step = ca.Function("step", [x, u], [ca.vertcat(mean, *[after[at] for at in place])])
     weights = ca.vertcat(1, 1, 400, 0, 0)
     w = ca.MX.sym("w", 7, problem.steps)  # of a step: its control, and the belief after it
-    first = belief.state([2, 2], np.sqrt(np.diag(belief.covariance(problem.start))))
+    first = problem.start
+    assert first is not None
     before = ca.horzcat(first, w[2:, :-1])
     cost = (ca.sumsqr(w[:2, :]) + ca.sum2(weights.T @ before**2) + weights.T @ w[2:, -1] ** 2) / 2
     gaps = ca.vec(w[2:, :] - step.map(problem.steps)(before, w[:2, :]))
