@@ -33,7 +33,7 @@ from lqrsim.kernels.active_set import (
     take_step,
 )
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy, copy_matrix, finite
+from lqrsim.kernels.linear_algebra import copy, copy_matrix
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
@@ -98,7 +98,6 @@ EDGE = 0.05  # distance of the first controls from their limits, relative to the
 BARELY = 1e-3  # least first excess, relative to the least first slack
 WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
 CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
-LOWER, UPPER, SIGNS = 0, 1, (1.0, -1.0)  # the two sides of a row, d = s - p, and the signs of their slacks in it
 NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its row's size and relative to the cost
 
 # Tasks of `interior_point`: to find typical sizes at a plan; to choose slacks and multipliers there; to take steps
@@ -158,17 +157,17 @@ def begin(begun, stages, work, mem):
     mem.pairs, mem.elastic = 0.0, 0.0
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    mem.pairs += 1
-            if rows.prices[at] < inf:
+            if has_slack(at, rows):
+                mem.pairs += 1
+            if has_excess(at, rows):
+                mem.pairs += 1
                 mem.elastic = 1.0
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
     mem.highest, mem.part, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
     mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, inf, 0.0, begun.oldest
     for at in range(rows.size * (steps + 1)):
-        now.slacks[at, LOWER], now.slacks[at, UPPER], rows.force[at] = 0.0, 0.0, 0.0
+        now.slacks.slack[at], now.slacks.excess[at], rows.force[at] = 0.0, 0.0, 0.0
         if rows.live[at] != 0:
             begin_row(at, begun, stages, work, mem)
     adjoint(stages, work.costates, work.other.changes.controls)
@@ -191,23 +190,28 @@ def begin_row(at, begun, stages, work, mem):
     if force > 0 and not equality:
         least = min(least, mem.parameter / force)
     slack = 0.0
-    if has_slack(at, LOWER, rows):
+    if has_slack(at, rows):
         slack = max(number, 0.0) + least if equality else max(number, least)
         middle = mem.parameter / slack
         if begun.informed and not equality:
             force = min(max(force, middle / AROUND), AROUND * middle)
         elif not begun.informed:
             force = 0.0 if equality else middle
-        work.now.slacks[at, LOWER] = slack
-    if has_slack(at, UPPER, rows):
-        work.now.slacks[at, UPPER] = max(slack - number, BARELY * least)
+        work.now.slacks.slack[at] = slack
+    if has_excess(at, rows):
+        work.now.slacks.excess[at] = max(slack - number, BARELY * least)
     far = WITHIN * price if price < inf else inf
     rows.force[at] = min(max(force, -far if equality else 0.0), far)
 
 
-def has_slack(at, side, rows):
-    """Whether a row has the slack of a side: with a price it has both, an inequality without one the lower."""
-    return rows.live[at] != 0 and (rows.prices[at] < inf or (side == LOWER and rows.kinds[at] != EQUALITY))
+def has_slack(at, rows):
+    """Whether a row has the slack of its lower side: all but equalities without a price."""
+    return rows.kinds[at] != EQUALITY or rows.prices[at] < inf
+
+
+def has_excess(at, rows):
+    """Whether a row has the slack of its upper side: rows with a price."""
+    return rows.prices[at] < inf
 
 
 def regularised(at, rows):
@@ -215,11 +219,14 @@ def regularised(at, rows):
     return rows.kinds[at] == EQUALITY and not rows.prices[at] < inf
 
 
-def room_of(at, side, rows):
-    """Distance of a row's multiplier from its bound on a side."""
-    if side == UPPER:
-        return rows.prices[at] - rows.force[at]
+def above(at, rows):
+    """Distance of a row's multiplier from its lower bound."""
     return rows.force[at] + rows.prices[at] if rows.kinds[at] == EQUALITY else rows.force[at]
+
+
+def below(at, rows):
+    """Distance of a row's multiplier from its upper bound."""
+    return rows.prices[at] - rows.force[at]
 
 
 # The loop.
@@ -385,9 +392,11 @@ def off_centre(stages, work, mem):
     """The largest difference of a product of slack and multiplier from the barrier parameter."""
     rows, slacks, largest = stages.rows, work.now.slacks, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            if has_slack(at, side, rows):
-                largest = max(largest, abs(slacks[at, side] * room_of(at, side, rows) - mem.parameter))
+        if rows.live[at] != 0:
+            if has_slack(at, rows):
+                largest = max(largest, abs(slacks.slack[at] * above(at, rows) - mem.parameter))
+            if has_excess(at, rows):
+                largest = max(largest, abs(slacks.excess[at] * below(at, rows) - mem.parameter))
     return largest
 
 
@@ -396,15 +405,16 @@ def models_with_barrier(stages, work, mem):
     """Give the models the barrier's curvature, and the least regularisation with which they have a minimum."""
     rows, slacks = stages.rows, work.now.slacks
     for at in range(rows.size * (stages.steps + 1)):
-        work.curves[at], work.corrections[at, LOWER], work.corrections[at, UPPER] = 0.0, 0.0, 0.0
+        work.curves[at], work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0, 0.0
         if rows.live[at] != 0:
             width = 0.0
             if regularised(at, rows):
                 size = rows.sizes[at]
                 width = mem.soft * SOFTNESS * size * size / mem.scale
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    width += slacks[at, side] / room_of(at, side, rows)
+            else:
+                width = slacks.slack[at] / above(at, rows)
+                if has_excess(at, rows):
+                    width += slacks.excess[at] / below(at, rows)
             work.curves[at] = 1 / width
     pull_rows(False, work.corrections, stages, work, mem)
     rung = regularised_direction(stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
@@ -430,9 +440,10 @@ def pull_rows(beyond, corrections, stages, work, mem):
 def residual_of(at, corrections, rows, work, mem):
     """Residual of a row in these equations: its value, minus slacks with the desired products."""
     residual = work.now.numbers[at]
-    for side in range(2):
-        if has_slack(at, side, rows):
-            residual -= SIGNS[side] * (mem.parameter - corrections[at, side]) / room_of(at, side, rows)
+    if has_slack(at, rows):
+        residual -= (mem.parameter - corrections.slack[at]) / above(at, rows)
+    if has_excess(at, rows):
+        residual += (mem.parameter - corrections.excess[at]) / below(at, rows)
     return residual
 
 
@@ -452,7 +463,7 @@ def complete(beyond, corrections, out, stages, work, mem):
     for t in range(stages.steps + 1):
         for row in range(rows.size):
             at = rows.size * t + row
-            out.force[at], out.slacks[at, LOWER], out.slacks[at, UPPER] = 0.0, 0.0, 0.0
+            out.force[at], out.slacks.slack[at], out.slacks.excess[at] = 0.0, 0.0, 0.0
             if rows.live[at] == 0:
                 continue
             ahead = moved(t, row, stages) + residual_of(at, corrections, rows, work, mem)
@@ -460,11 +471,12 @@ def complete(beyond, corrections, out, stages, work, mem):
                 ahead += work.beyond[at]
             change = -work.curves[at] * ahead
             out.force[at] = change
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    room, slack = room_of(at, side, rows), slacks[at, side]
-                    wanted = (mem.parameter - corrections[at, side]) / room
-                    out.slacks[at, side] = wanted - slack - slack / room * (SIGNS[side] * change)
+            if has_slack(at, rows):
+                wanted, dual, slack = mem.parameter - corrections.slack[at], above(at, rows), slacks.slack[at]
+                out.slacks.slack[at] = wanted / dual - slack - slack / dual * change
+            if has_excess(at, rows):
+                wanted, dual, excess = mem.parameter - corrections.excess[at], below(at, rows), slacks.excess[at]
+                out.slacks.excess[at] = wanted / dual - excess + excess / dual * change
 
 
 @compact
@@ -488,18 +500,22 @@ def predict(least, stages, work, mem):
     primal, dual = longest(1.0, work.now.slacks, step.slacks, stages), longest_dual(1.0, step.force, stages)
     average, after = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            if has_slack(at, side, rows):
-                slack, room, force = slacks[at, side], room_of(at, side, rows), SIGNS[side] * step.force[at]
-                average += slack * room
-                after += (slack + primal * step.slacks[at, side]) * (room + dual * force)
+        if rows.live[at] != 0:
+            if has_slack(at, rows):
+                distance = above(at, rows)
+                average += slacks.slack[at] * distance
+                after += (slacks.slack[at] + primal * step.slacks.slack[at]) * (distance + dual * step.force[at])
+            if has_excess(at, rows):
+                distance = below(at, rows)
+                average += slacks.excess[at] * distance
+                after += (slacks.excess[at] + primal * step.slacks.excess[at]) * (distance - dual * step.force[at])
     average, ratio = average / mem.pairs, after / average
     mem.parameter = max(least, min(HIGHER * mem.highest, ratio * ratio * ratio * average))
     mem.filtered = 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0 and primal > CENTRED:
-            for side in range(2):
-                corrections[at, side] = SIGNS[side] * step.slacks[at, side] * step.force[at]
+            corrections.slack[at] = step.slacks.slack[at] * step.force[at]
+            corrections.excess[at] = -step.slacks.excess[at] * step.force[at]
 
 
 @compact
@@ -516,18 +532,21 @@ def centre(stages, work, mem):
         return
     ahead, dual_ahead = min(1.0, part + REACH), min(1.0, dual + REACH)
     for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            if has_slack(at, side, rows):
-                room = room_of(at, side, rows) + SIGNS[side] * (dual_ahead * step.force[at])
-                product = (slacks[at, side] + ahead * step.slacks[at, side]) * room
-                work.others[at, side] = corrections[at, side] - lacking(product, mem)
+        if rows.live[at] != 0:
+            force = dual_ahead * step.force[at]
+            if has_slack(at, rows):
+                product = (slacks.slack[at] + ahead * step.slacks.slack[at]) * (above(at, rows) + force)
+                work.others.slack[at] = corrections.slack[at] - lacking(product, mem)
+            if has_excess(at, rows):
+                product = (slacks.excess[at] + ahead * step.slacks.excess[at]) * (below(at, rows) - force)
+                work.others.excess[at] = corrections.excess[at] - lacking(product, mem)
     if not solve(False, work.others, work.gaps, stages, work, mem):
         return
     complete(False, work.others, work.other, stages, work, mem)
     if longest(share, slacks, work.other.slacks, stages) >= part + FURTHER * REACH:
         count = rows.size * (stages.steps + 1)
-        copy_matrix(work.others, count, 2, corrections)
-        copy_matrix(work.other.slacks, count, 2, step.slacks)
+        copy_slacks(count, work.others, corrections)
+        copy_slacks(count, work.other.slacks, step.slacks)
         copy(work.other.force, count, step.force)
         copy_plan(stages.steps, work.other.changes, step.changes)
         copy_matrix(work.other.costates, stages.steps + 1, N, step.costates)
@@ -549,9 +568,11 @@ def longest(share, slacks, changes, stages):
     """The largest part of the changes of slacks, at most 1, by the fraction-to-the-boundary rule."""
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            if has_slack(at, side, rows) and changes[at, side] < 0:
-                part = min(part, -share * slacks[at, side] / changes[at, side])
+        if rows.live[at] != 0:
+            if has_slack(at, rows) and changes.slack[at] < 0:
+                part = min(part, -share * slacks.slack[at] / changes.slack[at])
+            if has_excess(at, rows) and changes.excess[at] < 0:
+                part = min(part, -share * slacks.excess[at] / changes.excess[at])
     return part
 
 
@@ -560,10 +581,12 @@ def longest_dual(share, changes, stages):
     """The same for changes of the multipliers, and their bounds."""
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            change = SIGNS[side] * changes[at]
-            if has_slack(at, side, rows) and change < 0:
-                part = min(part, -share * room_of(at, side, rows) / change)
+        if rows.live[at] != 0:
+            change = changes[at]
+            if has_slack(at, rows) and change < 0:
+                part = min(part, -share * above(at, rows) / change)
+            if has_excess(at, rows) and change > 0:
+                part = min(part, share * below(at, rows) / change)
     return part
 
 
@@ -576,7 +599,10 @@ def search(corrected, stages, work, mem):
 
     The correction reduces the residuals after the whole step, which remain because rows and dynamics are not linear.
     Only if `corrected` are there corrections. Where derivatives are kept, none follow an accepted step: another step
-    costs as little. Returns the fraction of the step that leads to the point in `work.tried`, or -1.
+    costs as little.
+
+    Returns:
+      The fraction of the step that leads to the point in `work.tried`, or -1.
     """
     step, now = work.step, work.now
     mem.slope, mem.violated = slope_of_merit(stages, work, mem), off(now, stages)
@@ -647,8 +673,8 @@ def close_residuals(part, stages, work, mem):
                 at = rows.size * t + row
                 if rows.live[at] != 0:
                     change = -work.curves[at] * (moved(t, row, stages) + missed(at, tried))
-                    for side in range(2):
-                        other.slacks[at, side] = slacks[at, side] / room_of(at, side, rows) * (-SIGNS[side] * change)
+                    other.slacks.slack[at] = -slacks.slack[at] / above(at, rows) * change
+                    other.slacks.excess[at] = slacks.excess[at] / below(at, rows) * change
         far = longest(boundary(mem), tried.slacks, other.slacks, stages)
         cost = go(far, tried, stages.changes, other.slacks, work.closer, stages)
         if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:
@@ -669,7 +695,7 @@ def force_step(stages, work, mem):
     mem.forced += 1
     mem.share = 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        work.corrections[at, LOWER], work.corrections[at, UPPER] = 0.0, 0.0
+        work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0
     if mem.forced > FORCED or not solve(False, work.corrections, work.gaps, stages, work, mem):
         return -1.0
     mem.filtered = 0.0
@@ -697,7 +723,7 @@ def take(part, stages, work, mem):
         if rows.live[at] != 0:
             rows.force[at] += (part if regularised(at, rows) else dual) * step.force[at]
             if is_hard(at, rows):  # its product stays within a factor of the barrier parameter
-                middle = mem.parameter / work.tried.slacks[at, LOWER]
+                middle = mem.parameter / work.tried.slacks.slack[at]
                 rows.force[at] = min(max(rows.force[at], middle / WIDE), WIDE * middle)
     for t in range(stages.steps + 1):
         for i in range(N):
@@ -715,7 +741,7 @@ def take(part, stages, work, mem):
 @compact
 def go(part, about, changes, slacks, out, stages):
     """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
-    rows, steps = stages.rows, stages.steps
+    rows, steps, good = stages.rows, stages.steps, True
     for t in range(steps + 1):
         for i in range(N):
             out.plan.states[t, i] = about.plan.states[t, i] + part * changes.states[t, i]
@@ -723,15 +749,17 @@ def go(part, about, changes, slacks, out, stages):
             for i in range(M):
                 out.plan.controls[t, i] = about.plan.controls[t, i] + part * changes.controls[t, i]
     cost = trial(stages, out.plan, out.arrived)
-    good = finite(out.arrived, steps, N)
+    for t in range(steps):
+        for i in range(N):
+            good = good and isfinite(out.arrived[t, i])
     read_rows(stages, out.plan, out.numbers)
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
             good = good and isfinite(out.numbers[at])
-            for side in range(2):
-                out.slacks[at, side] = about.slacks[at, side] + part * slacks[at, side]
+            out.slacks.slack[at] = about.slacks.slack[at] + part * slacks.slack[at]
+            out.slacks.excess[at] = about.slacks.excess[at] + part * slacks.excess[at]
             if is_hard(at, rows):
-                out.slacks[at, LOWER] = max(out.slacks[at, LOWER], out.numbers[at])
+                out.slacks.slack[at] = max(out.slacks.slack[at], out.numbers[at])
     return cost if good else nan
 
 
@@ -742,7 +770,7 @@ def is_hard(at, rows):
 
 def missed(at, point):
     """A row's value minus its slacks."""
-    return point.numbers[at] - (point.slacks[at, LOWER] - point.slacks[at, UPPER])
+    return point.numbers[at] - (point.slacks.slack[at] - point.slacks.excess[at])
 
 
 @compact
@@ -771,12 +799,13 @@ def merit_of(point, cost, stages, mem):
     rows, logarithms, paid = stages.rows, 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    logarithms += log(point.slacks[at, side])
-            if rows.prices[at] < inf:
-                slack = point.slacks[at, LOWER] if rows.kinds[at] == EQUALITY else 0.0
-                paid += rows.prices[at] * (point.slacks[at, UPPER] + slack)
+            if has_slack(at, rows):
+                logarithms += log(point.slacks.slack[at])
+            if has_excess(at, rows):
+                logarithms += log(point.slacks.excess[at])
+                both = rows.kinds[at] == EQUALITY
+                slack = point.slacks.slack[at] if both else 0.0
+                paid += rows.prices[at] * (point.slacks.excess[at] + slack)
     return cost + paid - mem.parameter * logarithms
 
 
@@ -791,10 +820,13 @@ def slope_of_merit(stages, work, mem):
             for i in range(M):
                 slope += stages.models.gradient[t, N + i] * step.changes.controls[t, i]
     for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            if has_slack(at, side, rows):
-                paid = rows.prices[at] if side == UPPER or rows.kinds[at] == EQUALITY else 0.0
-                slope += (paid - mem.parameter / slacks[at, side]) * step.slacks[at, side]
+        if rows.live[at] != 0:
+            price = rows.prices[at]
+            if has_slack(at, rows):
+                paid = price if rows.kinds[at] == EQUALITY else 0.0
+                slope += (paid - mem.parameter / slacks.slack[at]) * step.slacks.slack[at]
+            if has_excess(at, rows):
+                slope += (price - mem.parameter / slacks.excess[at]) * step.slacks.excess[at]
     return slope
 
 
@@ -817,6 +849,12 @@ def acceptable(part, point, cost, stages, work, mem):
 # Points, and the models about them.
 
 
+def copy_slacks(count, source, target):
+    """Copy the slacks of rows."""
+    copy(source.slack, count, target.slack)
+    copy(source.excess, count, target.excess)
+
+
 @compact
 def copy_point(source, target, stages):
     """Copy a point."""
@@ -824,7 +862,7 @@ def copy_point(source, target, stages):
     copy_plan(stages.steps, source.plan, target.plan)
     copy_matrix(source.arrived, stages.steps, N, target.arrived)
     copy(source.numbers, count, target.numbers)
-    copy_matrix(source.slacks, count, 2, target.slacks)
+    copy_slacks(count, source.slacks, target.slacks)
 
 
 @compact
@@ -876,9 +914,10 @@ def take_measures(stages, work, mem):
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
             mem.miss = larger(mem.miss, abs(missed(at, work.now)) / rows.sizes[at])
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    mem.product = larger(mem.product, slacks[at, side] * room_of(at, side, rows))
+            if has_slack(at, rows):
+                mem.product = larger(mem.product, slacks.slack[at] * above(at, rows))
+            if has_excess(at, rows):
+                mem.product = larger(mem.product, slacks.excess[at] * below(at, rows))
     # The product of margin and multiplier; for violated elastic rows, that of the other slack.
     mem.complementarity = (mem.product if mem.elastic != 0 else product) / mem.scale
 
@@ -950,10 +989,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
         take_step(violation, stages, active, memory)
         if not isfinite(memory.cost):
             return False
-        far = 0.0  # the largest distance of a row that is held from its target
-        for at in range(rows.size * (stages.steps + 1)):
-            if rows.held[at] == HELD:
-                far = larger(far, abs(rows.numbers[at] - rows.targets[at]))
+        far = farthest_from_target(rows, stages.steps)
         if max(memory.stationarity, memory.gap) < SETTLED * tolerance and far < SETTLED * violation:
             break
     kept = mem.elastic != 0 or memory.violation <= violation
@@ -977,3 +1013,12 @@ def first_state(at, rows, mem):
         if violation / size > 1 - abs(force) / price:
             return PAID
     return HELD if equality or force * size / mem.scale > number / size else FREE
+
+
+def farthest_from_target(rows, steps):
+    """The largest distance of a row that is held from its target."""
+    largest = 0.0
+    for at in range(rows.size * (steps + 1)):
+        if rows.held[at] == HELD:
+            largest = larger(largest, abs(rows.numbers[at] - rows.targets[at]))
+    return largest
