@@ -50,7 +50,7 @@ def write(
 def with_metadata(source: Path, path: Path, metadata: VideoMetadata) -> None:
     """Copy the frames, to the last bit, into a file with other metadata."""
     with av.open(str(source)) as given, av.open(str(path), "w", format="mp4") as container:
-        metadata.embed(container)
+        container.metadata["comment"] = metadata.as_json()
         stream = container.add_stream_from_template(given.streams.video[0])
         for packet in given.demux(video=0):
             if packet.dts is not None:  # the last one only says that there are no more

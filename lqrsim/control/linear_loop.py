@@ -30,13 +30,13 @@ def moments_of(loops: LoopArrays, stated: int, count: int | None = None, lost: f
       lost: fraction of the commands that get lost.
     """
     (steps, laws, m, width), (systems, own) = loops.K.shape, loops.F.shape[1:3]
-    count = own if count is None else count
+    first = own if count is None else count
     rows, columns, lossy = *loops.noise.shape[2:], 0 < lost < 1
     sizes = LoopSizes(
-        steps, systems, laws, own, width, m, count, stated, rows, columns, bool(loops.jointly.size), lossy,
+        steps, systems, laws, own, width, m, first, stated, rows, columns, bool(loops.jointly.size), lossy,
         lost / (1 - lost) if lossy else 0.0,
     )  # fmt: skip
-    lengths = {"T": steps, "L": systems, "C": laws, "Y": own, "X": width, "R": width - own, "m": m, "N": count}
+    lengths = {"T": steps, "L": systems, "C": laws, "Y": own, "X": width, "R": width - own, "m": m, "N": first}
     work, found = zeros_of(LoopWork, **lengths), zeros_of(LoopMoments, **lengths)
     P, M = work.P, work.M
     M[..., own:, own:] = loops.transition

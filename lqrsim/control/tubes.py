@@ -120,7 +120,8 @@ def predict_tube(
             raise InputError("predict_tube: got uncertainty, samples or another controller in belief space, want none")
         return _tube_of_belief(problem.dynamics, problem, solution if controller is None else controller.solution)
     wanted = "an Uncertainty, such as uncertainty_of(...)"
-    uncertainty = check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, wanted)
+    check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, wanted)
+    assert uncertainty is not None
     check_count("predict_tube: samples", 0 if samples is None else samples, at_least=0, at_most=40_000)
     check_count("predict_tube: seed", seed, at_least=0)
     plan = solution.trajectory

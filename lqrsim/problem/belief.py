@@ -222,7 +222,8 @@ class Belief(Dynamics):
           function: as in `SymbolicConstraint`, with x the robot's state. Each of its entries has the chance.
           chance: largest chance that an entry is negative, below a half.
         """
-        parameters = check_kind("chance_constraint: parameters", parameters or {}, Mapping, "a dictionary by name")
+        values: Mapping[str, float] = {} if parameters is None else parameters
+        check_kind("chance_constraint: parameters", values, Mapping, "a dictionary by name")
         n, rows, names = self.size, self.rows, tuple(self.robot.state_coordinates.names)
         quantile = -NormalDist().inv_cdf(chance)
 
@@ -238,7 +239,7 @@ class Belief(Dynamics):
                 margins.append(entry - p.deviations * sqrt(spread))
             return margins
 
-        return SymbolicConstraint(margin, parameters={**parameters, "deviations": quantile}, name=name)
+        return SymbolicConstraint(margin, parameters={**values, "deviations": quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
         """The beliefs (K, N) of the extended Kalman filter one period later.
