@@ -34,7 +34,7 @@ def test_scripts_explain_themselves(
         runpy.run_path(str(script), run_name="__main__")
     assert not ended.value.code
     printed = capsys.readouterr().out
-    assert "--quick" in printed or script.stem in ("print_numbers", "print_words")  # which have no smaller part
+    assert "--quick" in printed or script.stem in ("print_numbers", "print_words", "seed_faults")
 
 
 def benchmark(*arguments: str) -> dict[str, Any]:

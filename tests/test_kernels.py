@@ -937,7 +937,7 @@ class TestParts:
         box = np.array(ls.types.Box(0.4, 0.4, 0.4).corners((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), dtype=float)
         table = ls.World([ls.Obstacle.of_corners("box", box), ls.Obstacle.of_corners("plate", box * [1, 1, 0])]).table
         for number, off in itertools.product(range(2), (0.0, 0.4, 0.4 + 1e-9)):
-            given = table, declarations.ROW * number, (box + np.array([off, 0, 0])).ravel(), 0, 8, np.zeros(24)
+            given = table, declarations.ROW * number, (box + np.array([off, 0.03, 0.05])).ravel(), 0, 8, np.zeros(24)
             replay(source, {}, "hull_distance", *given)
 
     @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])

@@ -313,7 +313,7 @@ def test_the_file_says_what_is_not_given(cart, on_track):
 
 def test_errors_of_sensors_are_stored_as_plain_data():
     one = SensorErrors(IMU, strength=0.5)
-    assert disturbances_from_json(disturbances_as_json([one])) == (one,)
+    assert disturbances_from_json(disturbances_as_json([one]), ls.scenarios.quadrotor()) == (one,)
 
 
 def test_what_cannot_be_read_is_refused_by_name(on_track, cage, law, plan, problem):

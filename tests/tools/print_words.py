@@ -1,7 +1,7 @@
 """Prints all sentences of the package that a user may read, by kind and place, so that a person can read them through.
 
-Kinds: `status` (meanings and remedies), `solve` (summaries of the solves of tests/test_remedies.py), `warning`,
-`error`, `say` (details, summaries, progress, figures), `help`.
+Kinds: `status` (meanings and remedies), `solve` (summaries of those of tests/helpers/failing_solves.py),
+`warning`, `error`, `say` (details, summaries, progress, figures), `help`.
 Values that are filled in are shown as `{}`.
 """
 
@@ -84,7 +84,7 @@ def helps() -> list[str]:
 def solves() -> list[str]:
     """What is printed of solves that fail, each with its name."""
     sys.path[:0] = [str(TESTS), str(TESTS / "helpers")]
-    from test_remedies import CASES
+    from failing_solves import CASES
 
     return [f"{name}:\n{case.solver(case.of, **case.options)}\n" for name, case in CASES.items()]
 
