@@ -67,10 +67,10 @@ class ActiveSet:
         return self._within(tolerance)
 
     def _within(self, tolerance: float) -> bool:
-        found = self.measures
+        measures = self.measures
         # The rollout of the plan must not use up the margin of the constraints.
-        kept = self._memory["kept"][0] > 0
-        return kept and max(found.stationarity, found.gap / INSIDE, found.complementarity) < tolerance
+        feasible = self._memory["kept"][0] > 0
+        return feasible and max(measures.stationarity, measures.gap / INSIDE, measures.complementarity) < tolerance
 
     def _step(self, late: Callable[[float], bool]) -> bool:
         """Take a step; return False if there is none, or no time for it: twice that of the models is needed."""
@@ -90,18 +90,18 @@ class ActiveSet:
         """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values."""
         stages, steps = self.stages, self.stages.steps
         self._call(ROLL_OUT)
-        values = [one.reshape(steps + 1, -1) for one in stages.about.values]
+        values = [rows.reshape(steps + 1, -1) for rows in stages.about.values]
         return Motion(*map(np.copy, self._arrays.out)), stages.about.policy.gain.copy(), self.measures.cost, values
 
     def multipliers(self) -> list[tuple[Array, float]]:
         """Multipliers (T+1, rows) and penalty of each constraint."""
         owners, scale = self.stages.owners, float(self._memory["scale"][0])
-        found = []
+        multipliers = []
         for k in range(len(self.stages.problem.constraint_terms)):
             sizes = self.stages.row_sizes[owners == k]
             price = FIRMNESS * scale / float(np.median(sizes**2)) if len(sizes) else 1.0
-            found.append((self.force[:, owners == k].copy(), price))
-        return found
+            multipliers.append((self.force[:, owners == k].copy(), price))
+        return multipliers
 
     def _call(self, task: int) -> int:
         return self.stages.call("active_set", task, self._violation, self.stages.about, self._arrays, self._memory)

@@ -123,9 +123,9 @@ def _near_singular(problem: Problem, found: RunResult) -> str:
     space, states = problem.dynamics.state_coordinates, found.states
     for first, turn in zip(space.rotation_vectors, space.turns, strict=True):
         entries = [first + i for i in range(3) if i != turn]
-        period, close, what, where = 2 * np.pi, WHOLE, "a whole turn", "rotation vectors"
+        period, close, multiple, where = 2 * np.pi, WHOLE, "a whole turn", "rotation vectors"
         if turn >= 0:
-            period, close, what, where = np.pi, HALF, "half or whole turns", "tilts"
+            period, close, multiple, where = np.pi, HALF, "half or whole turns", "tilts"
         angles = np.linalg.norm(states[:, entries], axis=1)
         turns = np.round(angles / period)
         apart = np.where(turns > 0, np.abs(angles - period * turns), np.inf)
@@ -133,7 +133,7 @@ def _near_singular(problem: Problem, found: RunResult) -> str:
             knot, names = int(apart.argmin()), ", ".join(space.names[i] for i in entries)
             axis = _regular_axis(states[:, first : first + 3]) if problem.dynamics.by_mujoco and turn < 0 else None
             return (
-                f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from {what}, where {where} are"
+                f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from {multiple}, where {where} are"
                 " singular: the policy may take an attitude beside the plan's for another turn"
             ) + (f'; MjcfRobot(..., turns_about="{axis}") avoids this' if axis else "")
     return ""
@@ -179,10 +179,10 @@ def remedy_of(
     if shorter or status.success or found.remedy:
         return shorter or found.remedy
     if inside := problem.goal_inside:
-        geoms = any("geoms" in one.shape for one in problem.kept_clear)
+        geoms = any("geoms" in term.shape for term in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
     if status is Status.TIME_LIMIT and log:
-        took = sum(one.seconds for one in log)
+        took = sum(iteration.seconds for iteration in log)
         similar = "or begin with start=solution of a similar problem"
         return f"raise time_limit: {len(log)} iterations took {took:.2g} s; {similar}"
     if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
@@ -233,7 +233,7 @@ def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
-    radius = max((one.shape.get("radius", 0.0) for one in problem.kept_clear), default=0.0)
+    radius = max((term.shape.get("radius", 0.0) for term in problem.kept_clear), default=0.0)
     if plan is not None and radius:
         radius = Target(problem.dynamics.state_coordinates, goal, plan).on_the_way(radius)
     return radius or None
@@ -244,10 +244,10 @@ def clearance_of(problem: Problem, states: Array) -> Array | None:
 
     For a robot of several collision spheres or geoms, it is their smallest distance.
     """
-    found = []
-    for one in each_once([one for one in problem.kept_clear if len(one.world)]):
-        shape, displaced = one.in_world(problem.dynamics), None
+    clearances = []
+    for term in each_once([term for term in problem.kept_clear if len(term.world)]):
+        shape, displaced = term.in_world(problem.dynamics), None
         if shape.world.moving:
             displaced = shape.world.displacements(problem.times)
-        found.append(shape.clearance(shape.places(states), displaced))
-    return np.min(found, axis=0) if found else None
+        clearances.append(shape.clearance(shape.places(states), displaced))
+    return np.min(clearances, axis=0) if clearances else None

@@ -41,13 +41,13 @@ REFINED = 5  # damped iterations from a plan of the search before Newton's metho
 def by_multipliers(run: SolveRun) -> RunResult:
     """The certified result of a full run: smoothing, its safeguard, and these iterations."""
     if run.initial_guess.multipliers and run.run_opening_pass():
-        found = meet_constraints(run, None)
-        if found.success or run.budget.over:
-            return run.certified(found)
+        result = meet_constraints(run, None)
+        if result.success or run.budget.over:
+            return run.certified(result)
         # Multipliers of another problem do not help here.
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
-    run, found = _with_constraints(run, run.solve())
-    return run.certified(found)
+    run, result = _with_constraints(run, run.solve())
+    return run.certified(result)
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
@@ -102,19 +102,19 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     plain = problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, 0.0))
     without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))
     with budget.without_costs():
-        kept = without.solve()
-        if kept.success and not budget.over:
-            kept = meet_constraints(without, kept)
-    if not kept.success or budget.over:
+        first = without.solve()
+        if first.success and not budget.over:
+            first = meet_constraints(without, first)
+    if not first.success or budget.over:
         # Only the constraint values of the plan are known. The certificate provides the cost.
-        status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
-        return run, dataclasses.replace(kept, status=status, final=not kept.success, values={})
+        status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if first.success else first.status
+        return run, dataclasses.replace(first, status=status, final=not first.success, values={})
     initial_guess = dataclasses.replace(
-        run.initial_guess, gain=kept.law[0].copy(), offset=kept.law[1].copy(), trajectory=None, prior=None,
-        cost_to_go=kept.values.get("cost_to_go"), multipliers=kept.multipliers,
+        run.initial_guess, gain=first.law[0].copy(), offset=first.law[1].copy(), trajectory=None, prior=None,
+        cost_to_go=first.values.get("cost_to_go"), multipliers=first.multipliers,
     )  # fmt: skip
     run = _again(run, problem, initial_guess)
-    if kept.multipliers:
+    if first.multipliers:
         return run, meet_constraints(run, None)
     found = run.solve()
     return run, meet_constraints(run, found) if found.success and not budget.over else found
@@ -152,12 +152,12 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
             since = 0
             lagrangian.update()
             run.weigh_noise(work.last)
-    found = run.result(ending)
-    detail = found.detail or ("" if found.success else f"with constraints; {lagrangian.worst()}")
-    if found.success and not lagrangian.solved:
-        found = dataclasses.replace(found, status=Status.MAX_ITERATIONS)
+    result = run.result(ending)
+    detail = result.detail or ("" if result.success else f"with constraints; {lagrangian.worst()}")
+    if result.success and not lagrangian.solved:
+        result = dataclasses.replace(result, status=Status.MAX_ITERATIONS)
         detail = f"{done} iterations with constraints: {lagrangian.worst()}"
-    return dataclasses.replace(found, detail=detail, multipliers=lagrangian.multipliers())
+    return dataclasses.replace(result, detail=detail, multipliers=lagrangian.multipliers())
 
 
 def _damped(
@@ -218,8 +218,8 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
         lagrangian.evaluate(*work.best)
         if ending.success and lagrangian.solved:
             if not rough:
-                found = run.damped_result(ending, ending.status, why)
-                return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+                result = run.damped_result(ending, ending.status, why)
+                return dataclasses.replace(result, multipliers=lagrangian.multipliers())
             if not budget.over:
                 rough = False
                 continue
@@ -234,8 +234,8 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
         status, detail = Status.STALLED, lagrangian.worst()
     if budget.stop.due:
         status = Status.TIME_LIMIT
-    found = run.damped_result(ending, status, detail)
-    return dataclasses.replace(found, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
+    result = run.damped_result(ending, status, detail)
+    return dataclasses.replace(result, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
 
 
 def _forces(own: ConstraintMultipliers, values: Array) -> Array:
@@ -280,7 +280,7 @@ class AugmentedLagrangian:
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [own.penalty for own in self._own]  # zero, except multipliers of another solution
+        self._first = [multipliers.penalty for multipliers in self._own]  # zero, except multipliers of another solution
 
     def _restart(self) -> None:
         self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
@@ -296,30 +296,35 @@ class AugmentedLagrangian:
         stated = self._work.constraint_values(states, controls)
         self.kept = self._work.keeps(stated)
         beyond = [
-            violation_of(own.term, values) - own.term.equality * self._near
-            for own, values in zip(self._own, stated, strict=True)
+            violation_of(multipliers.term, values) - multipliers.term.equality * self._near
+            for multipliers, values in zip(self._own, stated, strict=True)
         ]
         self.nearly = not self.kept and max(beyond, default=0.0) <= 0
-        self._values = [values.ravel() - own.margin for own, values in zip(self._own, stated, strict=True)]
-        self.solved = all(_missed(own, values) <= self._tolerance[own.term.equality] for own, values in self._each())
+        self._values = [
+            values.ravel() - multipliers.margin for multipliers, values in zip(self._own, stated, strict=True)
+        ]
+        self.solved = all(
+            _missed(multipliers, values) <= self._tolerance[multipliers.term.equality]
+            for multipliers, values in self._each()
+        )
 
     def start(self) -> None:
         """Begin with zero multipliers, and with penalties that fit the cost of changing each constraint."""
         self._restart()
-        for which, (own, values) in enumerate(self._each()):
-            own.values[...] = 0.0
+        for which, (multipliers, values) in enumerate(self._each()):
+            multipliers.values[...] = 0.0
             if not self._first[which] > 0:
                 # This comes last: once a penalty is set, the curvature of the passes contains it.
                 self._first[which] = INITIAL * self._curvature(which) if len(values) else 1.0
-            own.penalty = self._first[which]
+            multipliers.penalty = self._first[which]
 
     def update(self, growth: float = GROWTH) -> None:
         """Set the multipliers to the forces. Increase the penalties of constraints for which this helps too little."""
         missed = dict.fromkeys(self._tolerance, -np.inf)
-        for own, values in self._each():
-            own.values[...] = _forces(own, values)
-            short = np.abs(values).max(initial=0.0) if own.term.equality else -values.min(initial=np.inf)
-            missed[own.term.equality] = max(missed[own.term.equality], short)
+        for multipliers, values in self._each():
+            multipliers.values[...] = _forces(multipliers, values)
+            short = np.abs(values).max(initial=0.0) if multipliers.term.equality else -values.min(initial=np.inf)
+            missed[multipliers.term.equality] = max(missed[multipliers.term.equality], short)
         worst = max(missed, key=lambda kind: missed[kind])
         # Equalities that nearly hold can be met: they need a better inner minimum, not a larger penalty.
         near = {kind: kind and short <= self._near for kind, short in missed.items()}
@@ -328,28 +333,34 @@ class AugmentedLagrangian:
             more = growth * self._grown[kind] <= LARGEST or not near[kind]
             if more and missed[kind] > max(0.5 * self._last[kind], tolerance):
                 self._grown[kind] *= growth
-                for own in self._own:
-                    own.penalty *= growth if own.term.equality == kind else 1.0
+                for multipliers in self._own:
+                    multipliers.penalty *= growth if multipliers.term.equality == kind else 1.0
         self._last = missed
 
     def added(self) -> float:
         """The augmented Lagrangian's terms in the cost of the plan."""
-        return sum(_added(own, values) for own, values in self._each())
+        return sum(_added(multipliers, values) for multipliers, values in self._each())
 
     def multipliers(self) -> tuple[Multipliers, ...]:
         """The multipliers for a solution, updated for the last plan."""
         rows = self._problem.steps + 1, -1
-        return tuple(Multipliers(_forces(own, values).reshape(rows), own.penalty) for own, values in self._each())
+        return tuple(
+            Multipliers(_forces(multipliers, values).reshape(rows), multipliers.penalty)
+            for multipliers, values in self._each()
+        )
 
     def worst(self) -> str:
         """A text that names the worst violated constraint, its violation and its time."""
         if self.kept and not self._work.priced:
             return "the plan keeps the constraints, but there are better ones"
         missed = [
-            (np.abs(values) if own.term.equality else -(values + own.margin)).max(initial=-np.inf)
-            for own, values in self._each()
+            (np.abs(values) if multipliers.term.equality else -(values + multipliers.margin)).max(initial=-np.inf)
+            for multipliers, values in self._each()
         ]
-        beyond = [one - allowed_violation(own.term, self._near) for one, own in zip(missed, self._own, strict=True)]
+        beyond = [
+            violation - allowed_violation(multipliers.term, self._near)
+            for violation, multipliers in zip(missed, self._own, strict=True)
+        ]
         which = int(np.argmax(beyond))
         term, (step, row) = self._own[which].term, self._worst_of(which)
         time = step * self._problem.dt
@@ -384,14 +395,16 @@ class AugmentedLagrangian:
         go, come = values["cost_to_go"], values["cost_to_come"]
         try:
             if isinstance(come, Moments):
-                given = np.linalg.solve(np.eye(n) + come.covariance[step] @ go.hessian[step], come.covariance[step])
+                covariance = np.linalg.solve(
+                    np.eye(n) + come.covariance[step] @ go.hessian[step], come.covariance[step]
+                )
             else:
-                given = np.linalg.inv(go.hessian[step] + come.hessian[step])
+                covariance = np.linalg.inv(go.hessian[step] + come.hessian[step])
         except np.linalg.LinAlgError:
             return 1.0
         spread = np.zeros((len(slope), len(slope)))
         gain = self._work.arrays.policy.gain[min(step, steps - 1)]
-        spread[:n, :n], spread[n:, n:] = given, gain @ given @ gain.T
-        spread[:n, n:], spread[n:, :n] = given @ gain.T, gain @ given
+        spread[:n, :n], spread[n:, n:] = covariance, gain @ covariance @ gain.T
+        spread[:n, n:], spread[n:, :n] = covariance @ gain.T, gain @ covariance
         response = float(slope @ spread @ slope)
         return 1 / response if response > 0 else 1.0

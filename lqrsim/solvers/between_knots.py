@@ -49,7 +49,7 @@ class Look:
     @property
     def missed(self) -> float:
         """The largest violation, 0 if there is none."""
-        return max((float(one.max(initial=0.0)) for one in self.worst), default=0.0)
+        return max((float(violations.max(initial=0.0)) for violations in self.worst), default=0.0)
 
     def record(self, problem: Problem) -> BetweenKnots:
         """The record of it, with the names of the problem's constraints."""
@@ -59,9 +59,9 @@ class Look:
         ):
             for row, name in enumerate(names_of(constraint, term)):
                 t = int(np.argmax(worst[:, row]))
-                found = float(worst[t, row]), problem.begin + problem.dt * (t + float(shares[t, row]))
-                if found[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
-                    violations[name] = found
+                violation = float(worst[t, row]), problem.begin + problem.dt * (t + float(shares[t, row]))
+                if violation[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
+                    violations[name] = violation
         return BetweenKnots(self.step_error, self.end_error, violations)
 
 
@@ -82,10 +82,10 @@ def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
 def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
     """The states (T, parts, n) at the ends of equal parts of each period; see `kernels/model_functions.py`."""
     steps, n = len(plan.controls), plan.states.shape[1]
-    found = np.empty((steps * parts, n))
+    states = np.empty((steps * parts, n))
     with problem.dynamics.quiet():
-        compiled.costs_module(problem).states_within(steps, parts, again, plan, compiled.arguments(problem), found)
-    return found.reshape(steps, parts, n)
+        compiled.costs_module(problem).states_within(steps, parts, again, plan, compiled.arguments(problem), states)
+    return states.reshape(steps, parts, n)
 
 
 def _errors(problem: Problem, plan: Motion) -> tuple[float, float]:
@@ -97,7 +97,7 @@ def _errors(problem: Problem, plan: Motion) -> tuple[float, float]:
     while parts < MOST and not changed <= max(ACCURATE, KNOWN * error):
         parts, last = 2 * parts, exact
         exact = _within(problem, plan, parts)[:, -1]
-        changed, error = ((np.abs(exact - one) / sizes).max() for one in (last, plan.states[1:]))
+        changed, error = ((np.abs(exact - ends) / sizes).max() for ends in (last, plan.states[1:]))
     end = _within(problem, plan, parts, again=False)[-1, -1]
     return float(error), float((np.abs(end - plan.states[-1]) / sizes).max())
 
@@ -109,8 +109,8 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
     """
     terms = problem.constraint_terms
     within = [
-        not (term.equality or term.final_only) and not (one.moving and not one.by_knot)
-        for one, term in zip(problem.constraints, terms, strict=True)
+        not (term.equality or term.final_only) and not (constraint.moving and not constraint.by_knot)
+        for constraint, term in zip(problem.constraints, terms, strict=True)
     ]
     if not any(within):
         none: list[Array] = [np.zeros((problem.steps, term.rows)) for term in terms]
@@ -119,10 +119,10 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
     states = np.concatenate([plan.states[:-1, None], states], axis=1)
     values = _values(problem, states, plan.controls)
     worst, shares = [], []
-    for kept, one in zip(within, values, strict=True):
-        missed, share = _deepest(-one)
-        missed[0, one[0, 0] < -MISSED] = 0.0
-        worst.append(missed if kept else np.zeros_like(missed))
+    for checked, rows in zip(within, values, strict=True):
+        missed, share = _deepest(-rows)
+        missed[0, rows[0, 0] < -MISSED] = 0.0
+        worst.append(missed if checked else np.zeros_like(missed))
         shares.append(share)
     return worst, shares
 
@@ -137,19 +137,21 @@ def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
     for one in acting:
         one.array[FIRST] = 0.0  # a fixed start cannot change, but what follows can
     constraints = compiled.arguments(problem, multipliers=acting).stage.constraints
-    found: list[Array] = [np.empty((steps, states.shape[1], term.rows)) for term in terms]
+    results: list[Array] = [np.empty((steps, states.shape[1], term.rows)) for term in terms]
     for j in range(states.shape[1]):
-        here, there = (np.concatenate(pair) for pair in ((states[:, j], states[-1:, j]), (states[:1, j], states[:, j])))
-        for at, first in ((here, 0), (there, 1)):
-            values = tuple(np.empty_like(one.values) for one in acting)
+        at_begins, at_ends = (
+            np.concatenate(pair) for pair in ((states[:, j], states[-1:, j]), (states[:1, j], states[:, j]))
+        )
+        for at, first in ((at_begins, 0), (at_ends, 1)):
+            values = tuple(np.empty_like(multipliers.values) for multipliers in acting)
             compiled.costs_module(problem).evaluate_constraints(steps, at, controls, constraints, values)
-            for own, one, constraint, term in zip(found, values, problem.constraints, terms, strict=True):
+            for result, one, constraint, term in zip(results, values, problem.constraints, terms, strict=True):
                 rows = one.reshape(steps + 1, -1)[first : first + steps]
                 if not first:
-                    own[:, j] = rows
+                    result[:, j] = rows
                 elif constraint.by_knot and not term.uses_control:
-                    own[:, j] = np.maximum(own[:, j], rows)
-    return found
+                    result[:, j] = np.maximum(result[:, j], rows)
+    return results
 
 
 def _deepest(missed: Array) -> tuple[Array, Array]:
@@ -162,9 +164,9 @@ def _deepest(missed: Array) -> tuple[Array, Array]:
         peaks = np.where((bend < 0) & (np.abs(shift) <= 1), here + tilt * shift / 2, -np.inf)
     ends = np.broadcast_to(np.arange(1, parts + 1)[None, :, None], missed[:, 1:].shape)
     times = np.concatenate([ends, ends[:, :-1] + shift], axis=1)
-    found = np.concatenate([missed[:, 1:], peaks], axis=1)
-    at = found.argmax(axis=1)[:, None]
-    return np.take_along_axis(found, at, axis=1)[:, 0], np.take_along_axis(times, at, axis=1)[:, 0] / parts
+    violations = np.concatenate([missed[:, 1:], peaks], axis=1)
+    at = violations.argmax(axis=1)[:, None]
+    return np.take_along_axis(violations, at, axis=1)[:, 0], np.take_along_axis(times, at, axis=1)[:, 0] / parts
 
 
 def solve_between_knots(
@@ -177,7 +179,7 @@ def solve_between_knots(
     gets the last plan, too, from which a search for a free duration goes on.
     """
     at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.violation_tolerance(problem)
-    rows = [Rows(np.zeros((problem.steps, one.rows)), np.zeros(one.rows)) for one in problem.constraint_terms]
+    rows = [Rows(np.zeros((problem.steps, term.rows)), np.zeros(term.rows)) for term in problem.constraint_terms]
 
     def again(last: Solution) -> Solution:
         stated = _with_rows(problem, replace(at_knots, dt=last.trajectory.dt), rows)
@@ -191,30 +193,33 @@ def solve_between_knots(
             if solution.violation <= tolerance and failed % 2:  # it is only not at its best
                 solution = again(solution)
             else:  # another way than the last plan's
-                rows = [one.everywhere() for one in rows]
+                rows = [constraint_rows.everywhere() for constraint_rows in rows]
                 solution = solve(_with_rows(problem, replace(at_knots, dt=problem.dt), rows), settings, None)
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)
-        found = look(at_knots, solution.trajectory)
-        coarse = problem.accuracy is not None and found.step_error > problem.accuracy
-        missed = problem.between_knots and found.missed > tolerance
+        errors = look(at_knots, solution.trajectory)
+        coarse = problem.accuracy is not None and errors.step_error > problem.accuracy
+        missed = problem.between_knots and errors.missed > tolerance
         if not (coarse or missed):
             break
         if rounds >= ROUNDS or stop.due:
             status, remedy = Status.STALLED, "use more steps"
             if stop.due:
                 status, remedy = Status.TIME_LIMIT, "raise time_limit"
-            wrong = found.record(at_knots)._told(tolerance, problem.accuracy or np.inf)
+            wrong = errors.record(at_knots)._told(tolerance, problem.accuracy or np.inf)
             said = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
             ended = {"status": status, "remedy": remedy, "detail": said}
             break
         if coarse:
             assert problem.accuracy is not None
-            finer = at_knots.dynamics.with_substeps(_substeps(at_knots, found.step_error / problem.accuracy))
+            finer = at_knots.dynamics.with_substeps(_substeps(at_knots, errors.step_error / problem.accuracy))
             at_knots = replace(at_knots, dynamics=finer)
         if missed:
-            rows = [one.against(worst, tolerance) for one, worst in zip(rows, found.worst, strict=True)]
+            rows = [
+                constraint_rows.against(worst, tolerance)
+                for constraint_rows, worst in zip(rows, errors.worst, strict=True)
+            ]
         solution = again(solution)
         rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
     settled = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)
@@ -229,7 +234,11 @@ def solve_between_knots(
 def _with_rows(asked: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
     """The problem with rows within its periods beside the constraints that are asked."""
     pairs = zip(asked.constraints, rows, strict=True)
-    within = [WithinPeriods(constraint, *own) for constraint, own in pairs if own.acts.any()]
+    within = [
+        WithinPeriods(constraint, *constraint_rows)
+        for constraint, constraint_rows in pairs
+        if constraint_rows.acts.any()
+    ]
     return at_knots.with_constraints([*asked.constraints, *within])
 
 

@@ -63,11 +63,11 @@ class Stop:
             yield
         finally:
             self._stopped = before
-            taken = time.perf_counter() - began
-            self.begun += taken
-            self.deadline += taken
-            if len(compilations) > compiled and np.inf > limit < NOTED * taken:
-                _log.warning("compiled in %.1f s, which the time_limit of %g s does not count", taken, limit)
+            seconds = time.perf_counter() - began
+            self.begun += seconds
+            self.deadline += seconds
+            if len(compilations) > compiled and np.inf > limit < NOTED * seconds:
+                _log.warning("compiled in %.1f s, which the time_limit of %g s does not count", seconds, limit)
 
     @property
     def due(self) -> bool:
@@ -274,7 +274,7 @@ class _Watch:
             now = time.perf_counter()
             for activity in activities:
                 activity.report(now)
-            wait = max(min((one.due - now for one in activities), default=SILENT), SHORTEST)
+            wait = max(min((activity.due - now for activity in activities), default=SILENT), SHORTEST)
             self._sleeps_until = now + min(wait, SILENT)
             self._woken.wait(min(wait, SILENT))
             self._woken.clear()

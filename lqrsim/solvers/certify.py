@@ -54,8 +54,8 @@ def certified(
       tolerance: tolerance of the optimality; None if only the cost was tested.
       least: the least cost to which the optimality is relative, as that of time where the duration was free.
     """
-    numbers, own = np.zeros(1, CERTIFICATE), np.zeros(1, CERTIFICATE)
-    numbers["typical"] = own["typical"] = least
+    numbers, evaluated = np.zeros(1, CERTIFICATE), np.zeros(1, CERTIFICATE)
+    numbers["typical"] = evaluated["typical"] = least
     to_go = no_value(states)
     if value is not None:
         to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
@@ -69,11 +69,11 @@ def certified(
         return certificate, ""
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
-        work(declarations.EVALUATE, no_value(states), own)
-        optimality = certificate_of(problem, own[0], states, violation=violation, least=least).optimality
+        work(declarations.EVALUATE, no_value(states), evaluated)
+        optimality = certificate_of(problem, evaluated[0], states, violation=violation, least=least).optimality
         certificate = replace(certificate, optimality=optimality)
-    rest = REST * float(numbers["scale"][0])
-    return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)
+    rounding = REST * float(numbers["scale"][0])
+    return certificate, faults(certificate, claimed=claimed, rest=rounding, tolerance=tolerance, kept=kept)
 
 
 def no_value(states: Array) -> CostToGo:
@@ -93,8 +93,8 @@ def certificate_of(
     if not np.isfinite(cost):
         decrease = np.inf
     # A cost in whose rounding typical changes are lost, as of noise that no control damps, says nothing about them.
-    whole = typical if 0 < typical < REST * abs(cost) else abs(cost)
-    least = max(whole, least, TYPICAL * typical, 1e-26 * scale, 1e-300)
+    size = typical if 0 < typical < REST * abs(cost) else abs(cost)
+    least = max(size, least, TYPICAL * typical, 1e-26 * scale, 1e-300)
     optimality = decrease / least if np.isfinite(decrease) else np.inf
     return Certificate(
         cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),
@@ -112,19 +112,19 @@ def faults(
       tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether the violation comes from
         equalities within their tolerance.
     """
-    found = []
+    contradictions = []
     if certificate.start != 0:
-        found.append(f"it begins {certificate.start:.2g} off the fixed start")
+        contradictions.append(f"it begins {certificate.start:.2g} off the fixed start")
     if not certificate.dynamics_residual <= MOTION:
-        found.append(f"it is {certificate.dynamics_residual:.2g} off the dynamics")
+        contradictions.append(f"it is {certificate.dynamics_residual:.2g} off the dynamics")
     if not certificate.policy_residual <= LAW:
-        found.append(f"its controls are {certificate.policy_residual:.2g} off the policy's")
+        contradictions.append(f"its controls are {certificate.policy_residual:.2g} off the policy's")
     if certificate.limits > 0:
-        found.append(f"a control is {certificate.limits:.2g} beyond its limit")
+        contradictions.append(f"a control is {certificate.limits:.2g} beyond its limit")
     if certificate.violation > 0 and not kept:
-        found.append(f"a constraint is missed by {certificate.violation:.2g}")
+        contradictions.append(f"a constraint is missed by {certificate.violation:.2g}")
     if not abs(certificate.cost - claimed) <= COST * abs(certificate.cost) + rest:
-        found.append(f"it costs {certificate.cost:.9g}, not {claimed:.9g}")
+        contradictions.append(f"it costs {certificate.cost:.9g}, not {claimed:.9g}")
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
-        found.append(f"its optimality is {certificate.optimality:.2g}, not below {tolerance:g}")
-    return ", ".join(found)
+        contradictions.append(f"its optimality is {certificate.optimality:.2g}, not below {tolerance:g}")
+    return ", ".join(contradictions)

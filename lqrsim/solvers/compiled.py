@@ -49,15 +49,15 @@ def core(problem: Problem, form: str = "dual") -> CompiledModule:
     """The compiled passes and iterations for problems of this size; see `kernels/entry_points.py`."""
     noisy = problem.noise_term is not None
     sizes = _sizes(problem.dynamics)
-    what = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
-    what += "" if form == "dual" else f", {form} form"
-    return module_of(with_form(form), what, **sizes, NOISY=int(noisy))
+    description = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
+    description += "" if form == "dual" else f", {form} form"
+    return module_of(with_form(form), description, **sizes, NOISY=int(noisy))
 
 
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
     """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/entry_points.py`."""
-    what = f"linear-quadratic problems, {n} states and {m} controls"
-    return module_of(with_form(form), what, N=n, M=m, NOISY=0)
+    description = f"linear-quadratic problems, {n} states and {m} controls"
+    return module_of(with_form(form), description, N=n, M=m, NOISY=0)
 
 
 @functools.cache
@@ -73,7 +73,7 @@ def _sizes(dynamics: Dynamics) -> dict[str, int]:
 def structure(problem: Problem) -> tuple[Any, ...]:
     """A key that is equal for problems that share all their compiled code."""
     costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in _FIELDS)
-    constraints = tuple((one.code, one.uses_control, one.equality, one.shared) for one in problem.constraint_terms)
+    constraints = tuple((term.code, term.uses_control, term.equality, term.shared) for term in problem.constraint_terms)
     term = problem.noise_term
     noise = None if term is None else term.code
     return problem.dynamics.step_source, tuple(_sizes(problem.dynamics).items()), costs, constraints, noise
@@ -94,7 +94,7 @@ def arguments(
     return ProblemModel(
         dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
         initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", acting),
-        final=_cost(problem, "final_cost", [one for one in acting if not one.term.uses_control]),
+        final=_cost(problem, "final_cost", [constraint for constraint in acting if not constraint.term.uses_control]),
         limits=Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
         noise=() if term is None else _noise(problem, term),
     )  # fmt: skip
@@ -117,10 +117,13 @@ def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
 def _cost(problem: Problem, field: str, constraints: Sequence["ConstraintMultipliers"]) -> CostModel:
     terms, sizes = cost_terms(problem, field), tuple(_sizes(problem.dynamics).items())
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
-    stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one in (own.term for own in constraints))
+    stated = tuple(
+        (term.code, term.shared, term.equality, term.uses_control)
+        for term in (constraint.term for constraint in constraints)
+    )
     acting = Constraints(
-        _constraint_functions(stated, sizes), tuple(numbers_of(own.term) for own in constraints),
-        tuple(own.array for own in constraints), len(constraints),
+        _constraint_functions(stated, sizes), tuple(numbers_of(constraint.term) for constraint in constraints),
+        tuple(constraint.array for constraint in constraints), len(constraints),
     )  # fmt: skip
     indefinite = sum(term.nonconvex_in is not None for term in terms)
     return CostModel(functions, tuple(map(numbers_of, terms)), len(terms), indefinite, project, acting)
@@ -153,8 +156,8 @@ def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...
         if shared:
             pairs |= {name: (code, name) for name in ("places", "places_jacobian")}
         module = module_of(source.filled(**pairs), f"a constraint: {code.what}", **dict(sizes), EQUALITY=int(equality))
-        found = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
-        rows.append([*found, float(uses_control)])
+        addresses = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
+        rows.append([*addresses, float(uses_control)])
     return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
 

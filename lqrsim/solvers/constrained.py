@@ -78,8 +78,8 @@ class Ladder:
         if run.settings.penalty is None:
             self._point.without_multipliers()
         self.start = self._point.start()
-        kept = (self.given or run.settings.start is not None) and self.start.violation <= self._allowed
-        self._given = self.start if kept else None  # the answer must not be worse
+        feasible = (self.given or run.settings.start is not None) and self.start.violation <= self._allowed
+        self._given = self.start if feasible else None  # the answer must not be worse
         self.untried = self.may_start = stay or not known.from_start  # the runs of a search have the same start
 
     @property
@@ -89,9 +89,9 @@ class Ladder:
     def climb(self) -> RunResult:
         """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
         for attempt in ATTEMPTS:
-            found = attempt.make(self) if attempt.when(self) else None
-            if found is not None and found.success:
-                if not self._worse(found):
+            result = attempt.make(self) if attempt.when(self) else None
+            if result is not None and result.success:
+                if not self._worse(result):
                     break
                 self._best = None  # the given plan is better
             if self._budget.over:
@@ -103,7 +103,7 @@ class Ladder:
         return self._remember(self._point.finish(self.guess.found))
 
     def from_neighbour(self) -> RunResult | None:
-        known = tuple(one.values for one in self.guess.multipliers)
+        known = tuple(multipliers.values for multipliers in self.guess.multipliers)
         return self._interior(copied(self.start), LITTLE, multipliers=known)
 
     def from_given(self) -> RunResult | None:
@@ -121,10 +121,10 @@ class Ladder:
         best = best.kept()
         self._point.without_multipliers()
         self._run.work.take(*best.plan, best.cost)
-        found = self._run.newton(detail=best.detail, patient=True)
-        if not found.success or found.violation > 0:
+        result = self._run.newton(detail=best.detail, patient=True)
+        if not result.success or result.violation > 0:
             return None
-        return self._remember(replace(found, multipliers=()))
+        return self._remember(replace(result, multipliers=()))
 
     def from_valley(self) -> RunResult | None:
         run = self._run
@@ -145,10 +145,10 @@ class Ladder:
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
         # answer.
         checkpoint = run.checkpoint()
-        found = run.newton()
-        if found.success and found.violation == 0:
-            return self._remember(found)
-        bottom = copied(found) if found.success else self.smoothed
+        result = run.newton()
+        if result.success and result.violation == 0:
+            return self._remember(result)
+        bottom = copied(result) if result.success else self.smoothed
         run.go_on(checkpoint)
         if self._budget.stop.due or (self.guided and self._cuts(bottom)):
             return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
@@ -171,8 +171,8 @@ class Ladder:
 
     def from_damped(self) -> RunResult | None:
         with self._budget.limited(REFINED):
-            found = damped_from_rollout(self._run)
-        return self._after_multipliers(found)
+            result = damped_from_rollout(self._run)
+        return self._after_multipliers(result)
 
     def from_multipliers(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
@@ -181,15 +181,15 @@ class Ladder:
         """
         run = self._run
         with self._budget.limited(AUGMENTED):
-            found = meet_constraints(run, run.result(run.ending), stale=STALE)
-        if found.success and not self.curved:
-            return self._remember(run.certified(found))
-        return self._after_multipliers(found, most=self.start.cost)
+            result = meet_constraints(run, run.result(run.ending), stale=STALE)
+        if result.success and not self.curved:
+            return self._remember(run.certified(result))
+        return self._after_multipliers(result, most=self.start.cost)
 
     def by_multipliers(self) -> RunResult | None:
         self._point.without_multipliers()
-        found = by_multipliers(self._run)
-        return self._remember(found if found.success else None)
+        result = by_multipliers(self._run)
+        return self._remember(result if result.success else None)
 
     def from_smoothed_at_a_price(self) -> RunResult | None:
         assert self.smoothed is not None
@@ -219,13 +219,13 @@ class Ladder:
             if priced.settled:
                 return None
             if priced.near or price == PRICES[-1]:
-                found = self._interior(plan, MUCH)
+                result = self._interior(plan, MUCH)
             elif self.untried and self.start.violation <= self._allowed:
-                found = self.from_start()
+                result = self.from_start()
             else:
                 continue
-            if found is not None and found.success:
-                return found
+            if result is not None and result.success:
+                return result
         return None
 
     def _restore(self, plan: Motion, price: float) -> Restored | None:
@@ -251,17 +251,17 @@ class Ladder:
 
     def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
-        there = self._point.result(*plan)
-        if not there.violation > FAR * self._allowed:
+        result = self._point.result(*plan)
+        if not result.violation > FAR * self._allowed:
             return False
         rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
-        found = evidence(
-            self._problem, self._run.work, there, shares=shares, sizes=rows, allowed=self._allowed,
+        new_evidence = evidence(
+            self._problem, self._run.work, result, shares=shares, sizes=rows, allowed=self._allowed,
             control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
-        if found is not None:
-            self._known.evidence.append(found)
-        return found is not None
+        if new_evidence is not None:
+            self._known.evidence.append(new_evidence)
+        return new_evidence is not None
 
     def _interior(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
@@ -318,7 +318,7 @@ ATTEMPTS = (
     ),
     Attempt(
         "the plan of another solution, with its multipliers",
-        lambda tried: any(one.values.any() for one in tried.guess.multipliers),
+        lambda tried: any(multipliers.values.any() for multipliers in tried.guess.multipliers),
         Ladder.from_neighbour,
     ),
     Attempt(

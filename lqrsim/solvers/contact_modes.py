@@ -116,12 +116,12 @@ class ModeModel:
         ahead, gains = self.last[0], np.zeros((len(self.periods), self.stages[0][0].shape[0] - n, n))
         for t in reversed(range(len(self.periods))):
             jacobian = self.periods[t].jacobian
-            whole = self.stages[t][0] + jacobian.T @ ahead @ jacobian
+            hessian = self.stages[t][0] + jacobian.T @ ahead @ jacobian
             free = np.flatnonzero((self.low[t] < 0) & (self.high[t] > 0))
             if len(free):
-                gains[t, free] = -np.linalg.solve(whole[np.ix_(n + free, n + free)], whole[n + free, :n])
+                gains[t, free] = -np.linalg.solve(hessian[np.ix_(n + free, n + free)], hessian[n + free, :n])
             closed = np.vstack([np.eye(n), gains[t]])
-            ahead = closed.T @ whole @ closed
+            ahead = closed.T @ hessian @ closed
             ahead = 0.5 * (ahead + ahead.T)
         return gains
 
@@ -179,12 +179,12 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
             pulls, _ = scipy.optimize.nnls(matrix, target, maxiter=30 * matrix.shape[1])
         except RuntimeError:
             return None
-        rest = matrix @ pulls - target
-        if not abs(rest[-1]) > 1e-13:  # the rows contradict each other
+        residual = matrix @ pulls - target
+        if not abs(residual[-1]) > 1e-13:  # the rows contradict each other
             return None
-        nearest = free - rest[:size] / rest[-1]
+        nearest = free - residual[:size] / residual[-1]
         weights[:] = 0.0
-        weights[active] = -pulls / rest[-1]
+        weights[active] = -pulls / residual[-1]
         missed = np.flatnonzero(rows @ nearest - bounds < -1e-9 * (1 + np.abs(bounds)))
         if not len(np.setdiff1d(missed, active)):
             break
@@ -224,12 +224,12 @@ def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: Mode
                 continue
             if where is not None and before is not None:
                 way = points[t] - where
-                rest = rate - before - bend @ way
-                along, size = float(rest @ way), float(np.linalg.norm(way))
+                residual = rate - before - bend @ way
+                along, size = float(residual @ way), float(np.linalg.norm(way))
                 if size < SHORT:
                     continue
-                if abs(along) > SKEW * size * np.linalg.norm(rest):
-                    bend += np.outer(rest, rest) / along
+                if abs(along) > SKEW * size * np.linalg.norm(residual):
+                    bend += np.outer(residual, residual) / along
             where, before = points[t], rate
         lacking += model.motions[t].T @ bend @ model.motions[t]
         rate = model.stages[t][1] + rate
@@ -288,7 +288,7 @@ class Descent:
             plans.append(self._stepped(damped))
             if lacking is not None and lacking.any():
                 plans.append(self._stepped(bent(damped, lacking)))
-        best = min((one for one in plans if one is not None), key=lambda one: one.cost, default=None)
+        best = min((plan for plan in plans if plan is not None), key=lambda one: one.cost, default=None)
         if best is None:
             self._damping = max(10 * self._damping, DAMPING)
         else:
@@ -303,11 +303,11 @@ class Descent:
         for halvings in range(HALVINGS):
             share = 0.5**halvings
             change, most = share * step.change, cost - ENOUGH * share * step.decrease
-            there = changed(self._problem, self.plan, model, change)
-            if not there.cost < most:
-                there = self._pushed_back(there, change, step.multipliers)
-            if there.cost < most:
-                return there
+            trial = changed(self._problem, self.plan, model, change)
+            if not trial.cost < most:
+                trial = self._pushed_back(trial, change, step.multipliers)
+            if trial.cost < most:
+                return trial
         return None
 
     def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
@@ -369,13 +369,13 @@ class Descent:
         step = minimize(self.model, self.model.hessian)
         multipliers = np.zeros(len(self.model.values)) if step is None else step.multipliers
         parts = np.split(multipliers, self.model.first[1:-1])
-        pulls = [Switches(one.switches.names, part) for one, part in zip(self.model.periods, parts, strict=True)]
+        pulls = [Switches(period.switches.names, part) for period, part in zip(self.model.periods, parts, strict=True)]
         return pulls, np.zeros_like(self.model.low) if step is None else step.limits
 
     def _go_to(self, plan: CostedPlan) -> None:
         """Adopt a plan, and linearise about it."""
-        kept = self.model.points.shape[1] - 1
-        self._earlier = [*self._earlier[-kept:], (self.model.points, self.model.periods)]
+        count = self.model.points.shape[1] - 1
+        self._earlier = [*self._earlier[-count:], (self.model.points, self.model.periods)]
         self.plan, self.model = plan, ModeModel(self._problem, self._modes, plan)
         self._laps.record("contact modes", plan.cost, optimality=np.nan)
 
@@ -492,9 +492,9 @@ def optimality_in_mode(
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]
     data, costs, space = compiled.arguments(problem), compiled.costs_module(problem), problem.control_coordinates
-    whole, rate = np.zeros((n + m, n + m)), np.zeros(n + m)
-    cost = costs.cost_quadratic(states[steps].copy(), np.zeros(m), steps, data.final, whole, rate)
-    ahead, costate, lagrangian, decrease = whole[:n, :n].copy(), rate[:n].copy(), rate[:n].copy(), 0.0
+    joint, rate = np.zeros((n + m, n + m)), np.zeros(n + m)
+    cost = costs.cost_quadratic(states[steps].copy(), np.zeros(m), steps, data.final, joint, rate)
+    ahead, costate, lagrangian, decrease = joint[:n, :n].copy(), rate[:n].copy(), rate[:n].copy(), 0.0
     hessians, slopes, constants = [ahead], [costate], [cost]
     for t in reversed(range(steps)):
         x, u = states[t].copy(), controls[t].copy()
@@ -504,14 +504,14 @@ def optimality_in_mode(
         pull = np.nan_to_num(pulls[t].at(switches.names))
         decrease += float(pull @ np.abs(switches.values))
         signed = np.where(switches.values < 0, -pull, pull)
-        whole = hessian + period.jacobian.T @ ahead @ period.jacobian
+        joint = hessian + period.jacobian.T @ ahead @ period.jacobian
         rate = gradient + period.jacobian.T @ lagrangian - np.nan_to_num(period.slopes).T @ signed
-        own = gradient + period.jacobian.T @ costate
+        policy_rate = gradient + period.jacobian.T @ costate
         rate[n:] -= limits[t]
         room = np.where(limits[t] > 0, u - space.low, np.where(limits[t] < 0, space.high - u, 0.0))
-        decrease += float(np.abs(limits[t]) @ room) + 0.5 * float(rate[n:] @ np.linalg.solve(whole[n:, n:], rate[n:]))
+        decrease += float(np.abs(limits[t]) @ room) + 0.5 * float(rate[n:] @ np.linalg.solve(joint[n:, n:], rate[n:]))
         closed = np.vstack([np.eye(n), gain[t]])
-        ahead, costate, lagrangian = closed.T @ whole @ closed, closed.T @ own, closed.T @ rate
+        ahead, costate, lagrangian = closed.T @ joint @ closed, closed.T @ policy_rate, closed.T @ rate
         hessians.append(ahead)
         slopes.append(costate)
         constants.append(cost)
@@ -523,9 +523,9 @@ def optimality_in_mode(
 
 def surroundings(problem: Problem, model: ModeModel, plan: CostedPlan, pulls: Sequence[Switches]) -> ContactCertificate:
     """The true cost near a plan: across each switch that the plan is pressed against, and at random samples."""
-    pressed = np.flatnonzero(np.concatenate([one.values for one in pulls]) > 0).tolist()
+    pressed = np.flatnonzero(np.concatenate([pull.values for pull in pulls]) > 0).tolist()
     plans = [beyond(problem, plan, model, which) for which in pressed]
-    cheapest = min((one.cost for one in plans if one is not None), default=np.inf)
+    cheapest = min((crossed.cost for crossed in plans if crossed is not None), default=np.inf)
     draws, reach = np.random.default_rng(0), np.minimum(model.high - model.low, 1e3)
     factor, lowest = scipy.linalg.cholesky(model.hessian, lower=True), np.inf
     for _ in range(SAMPLES):

@@ -174,13 +174,13 @@ def smooth_lq_continuous(
     tolerances = tolerances_of(rtol, atol)
 
     def at(t: float) -> Stage:
-        given = stage(t) if callable(stage) else stage
-        if not isinstance(given, Stage) or np.ndim(given.B) != 2:
-            got = f"a Stage with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else excerpt(given)
+        value = stage(t) if callable(stage) else stage
+        if not isinstance(value, Stage) or np.ndim(value.B) != 2:
+            got = f"a Stage with {np.ndim(value.B)} dimensions in B" if isinstance(value, Stage) else excerpt(value)
             raise InputError(
                 f"stage: got {got}, want a Stage without a leading axis, or a function of t that gives one"
             )
-        return given
+        return value
 
     if callable(stage):
         check_function("stage", stage, "a Stage, or a function of t that gives one", arguments=1)
@@ -188,9 +188,9 @@ def smooth_lq_continuous(
     n, m = first.states, first.controls
 
     def model(t: float, _: Array) -> Model:
-        return whole if whole is not None else _model(at(t), n, m)
+        return constant_model if constant_model is not None else _model(at(t), n, m)
 
-    whole = None if callable(stage) else _model(first, n, m)
+    constant_model = None if callable(stage) else _model(first, n, m)
     c_0, c_l = _end("initial", initial, n), _end("final", final, n)
     backward, forward, status, detail = None, None, Status.CONVERGED, ""
     where = "backward pass"

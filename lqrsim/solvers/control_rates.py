@@ -41,13 +41,15 @@ S = TypeVar("S", bound=Settings)
 def solve_with_rates(problem: Problem, settings: S, solve: Callable[[Problem, S], Solution]) -> Solution:
     """Solve a problem with a `control_rate`; `solve` is for problems without."""
     wide = with_last_command(problem)
-    found = solve(wide, replace(settings, start=widened(settings.start, problem, wide)))
-    policy, cost_to_go = feedback(problem, found.trajectory, found.multipliers)
-    states = found.trajectory.states[:, : len(problem.dynamics.state_coordinates)]
+    solution = solve(wide, replace(settings, start=widened(settings.start, problem, wide)))
+    policy, cost_to_go = feedback(problem, solution.trajectory, solution.multipliers)
+    states = solution.trajectory.states[:, : len(problem.dynamics.state_coordinates)]
     return narrowed(
-        found, problem, policy, cost_to_go,
+        solution, problem, policy, cost_to_go,
         inverse_policy=None, cost_to_come=None, clearance=clearance_of(problem, states),
-        candidates=tuple(replace(one, trajectory=_narrow(one.trajectory, problem)) for one in found.candidates),
+        candidates=tuple(
+            replace(candidate, trajectory=_narrow(candidate.trajectory, problem)) for candidate in solution.candidates
+        ),
         problem_digest=problem.digest, problem_parts=parts_of(problem),
     )  # fmt: skip
 
@@ -129,14 +131,14 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
     states = _with_commands(plan.states, plan.controls)
     if rate.previous is not None:
         states[0, n:] = np.asarray(rate.previous)
-    kept = widened(solution, problem, wide).multipliers
-    gain, found = _gains(wide, states, plan.controls, kept) if plan.finite else (np.zeros(0), None)
-    if found is None:
+    multipliers = widened(solution, problem, wide).multipliers
+    gain, cost_to_go = _gains(wide, states, plan.controls, multipliers) if plan.finite else (np.zeros(0), None)
+    if cost_to_go is None:
         raise InputError(f"solution: got a plan without feedback ({solution.status.name}), want one that converged")
     steps, m = plan.controls.shape
     pairs = zip(plan.states[:-1], plan.controls, strict=True)
-    each = [problem.dynamics.linearize(x, u, plan.dt) for x, u in pairs]
-    A, B, c = (np.array(one) for one in zip(*each, strict=True))
+    linearizations = [problem.dynamics.linearize(x, u, plan.dt) for x, u in pairs]
+    A, B, c = (np.array(matrices) for matrices in zip(*linearizations, strict=True))
     gain, offset = compiled.law_about(states, plan.controls, gain)
     onto = np.eye(n + m, n)
     return OutputFeedbackPolicy(
@@ -194,7 +196,7 @@ def widened(start: Any, problem: Problem, wide: Problem) -> Any:
         case InitialGuess():  # of a re-plan
             return replace(start, gain=np.pad(start.gain, [(0, 0), (0, 0), (0, m)]), cost_to_go=None, multipliers=())
         case Plan():
-            rows = [one.rows for one in wide.constraint_terms[len(start.multipliers) :]] if start.multipliers else []
+            rows = [term.rows for term in wide.constraint_terms[len(start.multipliers) :]] if start.multipliers else []
             zeros = (Multipliers(np.zeros((start.trajectory.steps + 1, count)), 0.0) for count in rows)
             goal = None if start.goal is None else np.pad(start.goal, (0, m), constant_values=np.nan)
             return Plan(

@@ -108,8 +108,8 @@ class _Reduced:
                     return Curvature.SADDLE, direction
                 singular |= bent == 0
                 usable[k] &= bent > 0
-            kept = vectors[:, usable]
-            inverse = (kept / values[usable]) @ kept.T
+            basis = vectors[:, usable]
+            inverse = (basis / values[usable]) @ basis.T
             gains[t] = -sizes.controls[:, None] * (inverse @ cross)
             curve = both[:n, :n] - cross.T @ inverse @ cross
             curve = (curve + curve.T) / 2
@@ -139,6 +139,6 @@ class _Reduced:
         if (moved[held] > TANGENT).any():
             return 1, direction
         along = float(np.einsum("ti,tij,tj->", changes, stages.models.hessian, changes))
-        terms = float(np.einsum("ti,tij,tj->", *(np.abs(one) for one in (changes, stages.models.hessian, changes))))
+        terms = float(np.einsum("ti,tij,tj->", *(np.abs(part) for part in (changes, stages.models.hessian, changes))))
         flat = max(FLAT * terms, FLATTER * sizes.cost)
         return (0 if abs(along) <= flat else 1 if along > 0 else -1), direction

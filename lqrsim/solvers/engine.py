@@ -50,7 +50,7 @@ from lqrsim.solvers.stages import LARGEST_KEPT, MOST_KEPT, Stages
 
 _METHODS = {getattr(declarations, name): name.lower() for name in ("SMOOTH", "DAMPED", "REJECTED", "ILQR", "NEWTON")}
 # The status of each outcome: that of the same name, if there is one.
-_STATUS = {getattr(declarations, one.name): one for one in Status if hasattr(declarations, one.name)} | {
+_STATUS = {getattr(declarations, status.name): status for status in Status if hasattr(declarations, status.name)} | {
     declarations.RUNNING: Status.MAX_ITERATIONS,  # all requested iterations were done
     declarations.NO_START: Status.NOT_FINITE,
     declarations.CYCLING: Status.STALLED,
@@ -210,7 +210,7 @@ class SolveRun:
         """
         wanted = entry, compiled.core(problem, settings.form), problem.steps
         with _lending:
-            fitting = (one for one in reversed(_idle) if (one.entry, one.work.core, one.problem.steps) == wanted)
+            fitting = (idle for idle in reversed(_idle) if (idle.entry, idle.work.core, idle.problem.steps) == wanted)
             run = next(fitting, None) if settings.first_pass == "forward" else None
             if run is not None:
                 _idle.remove(run)
@@ -270,21 +270,21 @@ class SolveRun:
         self.smooth(len(self._rows))
         if self.ending.outcome == declarations.IN_VALLEY:
             checkpoint, begin = self.checkpoint(), len(self.budget.log)
-            found = self.newton()
-            if found.success or self.budget.over:
-                return found
+            result = self.newton()
+            if result.success or self.budget.over:
+                return result
             self.go_on(checkpoint, self.budget.log[begin:])
             self.smooth(len(self._rows))
         ending = self.checked_ending()
         lost = ending is not self.ending  # a function is not finite at the start, so nothing can help
-        found = self.result(ending)
-        if lost or (found.success and not self.second_order):
-            return found
+        result = self.result(ending)
+        if lost or (result.success and not self.second_order):
+            return result
         if ending.outcome == declarations.TIMED_OUT or (self.settings.safeguard and not self.budget.left):
-            return self.best(found) if look_back else found
-        if found.success:
+            return self.best(result) if look_back else result
+        if result.success:
             return self.newton(patient=True)
-        return self.safeguard(found) if self.settings.safeguard else found
+        return self.safeguard(result) if self.settings.safeguard else result
 
     def smooth(self, last: int) -> None:
         """Continue until smoothing has done `last` iterations, or ends."""
@@ -411,7 +411,7 @@ class SolveRun:
     def checkpoint(self) -> list[tuple[Array, Array]]:
         """The arrays with the state of smoothing, and copies of them."""
         arrays = self.work.arrays
-        return [(one, one.copy()) for one in (*arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat)]
+        return [(array, array.copy()) for array in (*arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat)]
 
     def go_on(self, checkpoint: list[tuple[Array, Array]], others: Sequence[Iteration] = ()) -> None:
         """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
@@ -507,8 +507,8 @@ class SolveRun:
         if self.problem.noise_term is not None and self.problem.constraint_terms:
             # The expected cost without penalties of constraints, which the cost-to-go of the solver has.
             out, none = np.zeros(1, CERTIFICATE), no_value(found.states)
-            task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, found, none, out)
-            self._loop(task, first, last, options, self._without_penalties(), *rest)
+            task, first, last, options, _, *others = self._check_arguments(declarations.EVALUATE, found, none, out)
+            self._loop(task, first, last, options, self._without_penalties(), *others)
             certificate = replace(certificate, cost=float(out[0]["cost"]))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
@@ -533,7 +533,9 @@ class SolveRun:
             if out["curvature"][0] > FLAT:
                 return Bend(Curvature.MINIMUM)
         stages, plan = self.stages, Motion(*map(in_c_order, found.plan))
-        return curvature_at(stages, plan, stages.of_constraints([one.values for one in found.multipliers]))
+        return curvature_at(
+            stages, plan, stages.of_constraints([multipliers.values for multipliers in found.multipliers])
+        )
 
     def _without_penalties(self) -> ProblemModel:
         """The model without constraints, whose noise is weighed by its own cost-to-go."""
@@ -569,14 +571,14 @@ class SolveRun:
         """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
         self.roll_out()
         work, law = self.work, self.work.arrays.last_policy
-        found = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
-        return self.certified(found) if np.isfinite(found.states).all() else found
+        result = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
+        return self.certified(result) if np.isfinite(result.states).all() else result
 
     def is_worse(self, found: RunResult, other: RunResult) -> bool:
         """Whether a plan violates constraints more than another, or costs more if both violate them as much."""
         if not np.isfinite(other.cost):
             return False
-        missed, others = (self._missed(one) for one in (found, other))
+        missed, others = (self._missed(result) for result in (found, other))
         return missed > others or (missed == others and self.costs_more(found, other))
 
     def _missed(self, found: RunResult) -> float:
@@ -593,8 +595,8 @@ class SolveRun:
         is met, only the size of what cancels says what that is.
         """
         rounding = ROUNDING * abs(other.cost) + SETTLED * float(self.work.memory["negligible"])
-        for own, pressing in zip(self.work.multipliers, found.multipliers, strict=False):
-            rounding += float(np.abs(pressing.values).sum()) * (own.margin + other.violation)
+        for multipliers, pressing in zip(self.work.multipliers, found.multipliers, strict=False):
+            rounding += float(np.abs(pressing.values).sum()) * (multipliers.margin + other.violation)
         return not found.cost <= other.cost + rounding
 
     def candidate(self, name: str, found: RunResult | None) -> Candidate:
@@ -646,9 +648,9 @@ class SolveRun:
                 bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
             for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
                 cost, improvement, gap, optimality, residual, method = row
-                found = missed if i == done or not problem.constraints else float("nan")
+                violation = missed if i == done or not problem.constraints else float("nan")
                 budget.record(
-                    Iteration(cost, improvement, gap, optimality, residual, found, seconds, _METHODS[int(method)])
+                    Iteration(cost, improvement, gap, optimality, residual, violation, seconds, _METHODS[int(method)])
                 )
             stop.pace = time.perf_counter() - clock
             if stop.error is not None:
@@ -748,8 +750,8 @@ class Workspace:
         self.multipliers = [
             compiled.ConstraintMultipliers(problem, term, spare, settings.price) for term in problem.constraint_terms
         ]
-        for own, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
-            own.penalty, own.values[...] = known.penalty, known.values.ravel()
+        for multipliers, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
+            multipliers.penalty, multipliers.values[...] = known.penalty, known.values.ravel()
         self.model = compiled.arguments(problem, multipliers=self.multipliers, second_order=self._exact)
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # All other memory is written before it is read.
@@ -759,8 +761,8 @@ class Workspace:
         arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
         value = initial_guess.cost_to_go
         known = (0.0, 0.0, 0.0) if value is None else (value.hessian, value.gradient, value.constant)
-        for array, given in zip(arrays.to_go, known, strict=True):
-            array[...] = given
+        for array, numbers in zip(arrays.to_go, known, strict=True):
+            array[...] = numbers
         # Without a trajectory, use the start state, and the controls with which the dynamics can run backwards.
         plan = initial_guess.trajectory
         for array in (arrays.given, arrays.best):
@@ -828,14 +830,14 @@ class Workspace:
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero if it does not act."""
-        values = [np.empty_like(one.values) for one in self.multipliers]
+        values = [np.empty_like(multipliers.values) for multipliers in self.multipliers]
         if values:
             constraints = self.model.stage.constraints
             of = self._problem.steps, in_c_order(states), in_c_order(controls), constraints, tuple(values)
             if self._evaluation is None:
                 self._evaluation = self._costs.lay_out("evaluate_constraints", *of)
             self._evaluation(*of)
-        return [one.reshape(self._problem.steps + 1, -1) for one in values]
+        return [numbers.reshape(self._problem.steps + 1, -1) for numbers in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
         """Gradient (n+m,) of one row of a constraint."""
@@ -846,7 +848,7 @@ class Workspace:
     def violation(self, values: list[Array]) -> float:
         """The largest violation of a constraint, given their values; infinite if one is NaN."""
         pairs = zip(self.multipliers, values, strict=True)
-        return max((violation_of(own.term, one) for own, one in pairs), default=0.0)
+        return max((violation_of(multipliers.term, numbers) for multipliers, numbers in pairs), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
         """Whether a plan with these values keeps all constraints within their tolerance.
@@ -855,7 +857,9 @@ class Workspace:
         """
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
         pairs = zip(self.multipliers, values, strict=True)
-        return self.priced or all(violation_of(own.term, one) <= allowed(own.term) for own, one in pairs)
+        return self.priced or all(
+            violation_of(multipliers.term, numbers) <= allowed(multipliers.term) for multipliers, numbers in pairs
+        )
 
 
 def _cost_of(iteration: Iteration | None) -> float:

@@ -109,47 +109,47 @@ class DurationSearch:
         with stop.not_counting():  # compiling
             stages = Stages(stated)
             free = with_duration(problem)
-        found, sketches = list(ways(stated, stages)), list[Sketch]()
-        spent = dict.fromkeys((way.name for way in found), 0)
+        routes, sketches = list(ways(stated, stages)), list[Sketch]()
+        spent = dict.fromkeys((way.name for way in routes), 0)
         for share, freed in SKETCHED:
             last = bool(sketches)
-            for way in [one for one in found if one.name not in {made.way for made in sketches}]:
+            for way in [way for way in routes if way.name not in {draft.way for draft in sketches}]:
                 with stop.reporting("smooth", self._attentive), stop.heeding():
-                    made = self._sketched(way, share, free if freed else None)
-                    self._total += made.iterations
-                    spent[way.name] += made.iterations
-                    if np.isfinite(made.cost):
-                        sketches.append(made._replace(iterations=spent[way.name]))
+                    draft = self._sketched(way, share, free if freed else None)
+                    self._total += draft.iterations
+                    spent[way.name] += draft.iterations
+                    if np.isfinite(draft.cost):
+                        sketches.append(draft._replace(iterations=spent[way.name]))
                 if stop.due:
                     return
             if last:
                 break
-        far = spent.keys() - {one.way for one in sketches}
+        far = spent.keys() - {draft.way for draft in sketches}
         self.candidates += (
-            Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in found if way.name in far
+            Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in routes if way.name in far
         )
-        for made in sorted(sketches, key=lambda one: one.cost):
+        for draft in sorted(sketches, key=lambda one: one.cost):
             if stop.due:
                 return
-            if self.best is not None and made.free and made.cost > PROMISING * self.best[1].measures.cost:
-                self.candidates.append(Candidate(made.name, made.cost, made.iterations, None, made.plan))
+            if self.best is not None and draft.free and draft.cost > PROMISING * self.best[1].measures.cost:
+                self.candidates.append(Candidate(draft.name, draft.cost, draft.iterations, None, draft.plan))
             else:
-                self._follow(made.name, made.plan)
+                self._follow(draft.name, draft.plan)
 
     def _sketched(self, way: Way, share: float, free: Problem | None) -> "Sketch":
         """What a few iterations make of a way in a share of the stated duration, which is free or fixed."""
         problem = self._problem
         duration = float(np.clip(share * problem.steps * problem.dt, *self._range))
         fixed = settled(problem, duration)
-        made = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
+        result = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
         if free is not None:
-            return made._replace(name=way.name, way=way.name)
-        cost = made.cost + problem.time_weight * duration
-        return made._replace(name=f"{way.name}, {duration:g} s", way=way.name, cost=cost)
+            return result._replace(name=way.name, way=way.name)
+        cost = result.cost + problem.time_weight * duration
+        return result._replace(name=f"{way.name}, {duration:g} s", way=way.name, cost=cost)
 
     def grow_trees(self) -> None:
         """Grow trees while no plan is known, and go on from the ways through them."""
-        if self.best is not None or any(one.success for one in self._fixed):
+        if self.best is not None or any(solution.success for solution in self._fixed):
             return
         for seed, way in ways_by_trees(self._problem, self._stop, attentive=self._attentive):
             self._follow(f"trees of short plans, seed {seed}, {way.horizon:.4g} s", way)
@@ -161,7 +161,7 @@ class DurationSearch:
 
         If no plan of that duration keeps the constraints, none of a shorter one is likely to.
         """
-        if self.best is not None or any(one.success for one in self._fixed) or self._budget.over:
+        if self.best is not None or any(solution.success for solution in self._fixed) or self._budget.over:
             return
         self._fixed.append(self._solved(settled(self._problem, self._range[1]), self._settings))
         if self._fixed[-1].success:
@@ -170,18 +170,18 @@ class DurationSearch:
     def _follow(self, name: str, plan: Trajectory) -> None:
         """Go on from a plan that is one of the candidates."""
         before = self._total
-        _, ordinary, found = self._find(plan, Budget(self._settings.max_iterations, self._stop))
-        status = Status.CONVERGED if found.solved else Status.STALLED
-        cost = found.measures.cost if np.isfinite(found.measures.cost) else np.inf
-        self.candidates.append(Candidate(name, cost, self._total - before, status, found.trajectory(ordinary.dt)))
+        _, ordinary, result = self._find(plan, Budget(self._settings.max_iterations, self._stop))
+        status = Status.CONVERGED if result.solved else Status.STALLED
+        cost = result.measures.cost if np.isfinite(result.measures.cost) else np.inf
+        self.candidates.append(Candidate(name, cost, self._total - before, status, result.trajectory(ordinary.dt)))
 
     def follow_start(self, start: StartLike | InitialGuess) -> bool:
         """Go on from a trajectory of the caller, as it is, and return whether that led to a plan.
 
         Its knots may be far from the best ends of segments, so a plan of the stated duration may be hard to find.
         """
-        given = resolve(start, self._problem).trajectory
-        return given is not None and self._find(given, self._budget)[0]
+        trajectory = resolve(start, self._problem).trajectory
+        return trajectory is not None and self._find(trajectory, self._budget)[0]
 
     def go_on_from(self, begin: Solution | None) -> None:
         """Go on from the solution for the stated duration; with a weight on time, also from those for shorter ones.
@@ -207,9 +207,9 @@ class DurationSearch:
         if self.candidates:
             status, cost, plan = first.status, self._rank(first)[1], first.trajectory
             if self.best is not by_ways and self.best is not None:
-                ordinary, found = self.best
-                status, cost = Status.CONVERGED, found.measures.cost
-                plan = found.trajectory(ordinary.dt)
+                ordinary, result = self.best
+                status, cost = Status.CONVERGED, result.measures.cost
+                plan = result.trajectory(ordinary.dt)
             name = f"the nominal control, {first.trajectory.horizon:g} s"
             self.candidates.append(Candidate(name, cost, self._total - before, status, plan))
 
@@ -221,10 +221,10 @@ class DurationSearch:
         cheaper.
         """
         while not self._budget.over:
-            _, ordinary, found = self._find(begin, self._budget)
-            if found.solved or not np.isfinite(found.plan.states).all() or self._stop.due:
+            _, ordinary, result = self._find(begin, self._budget)
+            if result.solved or not np.isfinite(result.plan.states).all() or self._stop.due:
                 return
-            least, end = min(self._rank(one) for one in self._fixed), found.trajectory(ordinary.dt)
+            least, end = min(self._rank(solution) for solution in self._fixed), result.trajectory(ordinary.dt)
             for share in PART_WAY if least[0] == 0 else PART_WAY[:1]:
                 dt = begin.dt + share * (end.dt - begin.dt)
                 start = end if share == 1 else replace(begin, dt=dt)
@@ -245,22 +245,22 @@ class DurationSearch:
         """
         problem, settings, before = self._problem, self._settings, len(budget.log)
         with self._stop.reporting("smooth", self._attentive):
-            ordinary, found = find_duration(
+            ordinary, result = find_duration(
                 problem, begin, tolerance=share * settings.final(problem),
                 violation=settings.violation_tolerance(problem), budget=budget, price=settings.price,
             )  # fmt: skip
         self._total += len(budget.log) - before
-        cheaper = found.solved and (self.best is None or found.measures.cost < self.best[1].measures.cost)
+        cheaper = result.solved and (self.best is None or result.measures.cost < self.best[1].measures.cost)
         if cheaper:
-            self.best, self._log = (ordinary, found), list(budget.log)
-        return cheaper, ordinary, found
+            self.best, self._log = (ordinary, result), list(budget.log)
+        return cheaper, ordinary, result
 
     def _solved(self, fixed: Problem, settings: SmootherSettings) -> Solution:
         """Solve with a fixed duration."""
         solution = self._solve(fixed, settings)
         if fixed.segments:
             solution = replace(solution, options=dict(solution.options) | {"segments": fixed.segments})
-        self._total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
+        self._total += max(len(solution.iterations), sum(candidate.iterations for candidate in solution.candidates))
         return solution
 
     def _rank(self, solution: Solution) -> tuple[float, float]:
@@ -352,14 +352,14 @@ def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop, free: Pr
         return stop.due
 
     point = InteriorPoint(stages, Motion(*map(in_c_order, (states, way.controls))), room=MUCH.room, price=prices)
-    found = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=watch)
+    result = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=watch)
     stages.give_back()
-    cost, duration = found.measures.cost, way.horizon
-    if not (found.measures.violation < WORTH and found.measures.gap < WORTH):
+    cost, duration = result.measures.cost, way.horizon
+    if not (result.measures.violation < WORTH and result.measures.gap < WORTH):
         cost = np.inf
     elif free is not None:
-        duration = float(found.plan.states[0, n])
-    plan = Trajectory(found.plan.states[:, :n], found.plan.controls, duration / problem.steps)
+        duration = float(result.plan.states[0, n])
+    plan = Trajectory(result.plan.states[:, :n], result.plan.controls, duration / problem.steps)
     return Sketch(plan, cost, len(budget.log), free is not None)
 
 
@@ -385,20 +385,20 @@ def find_duration(
     if by_segment is not None:
         problem, begin = by_segment
     n = len(problem.dynamics.state_coordinates)
-    stages, prices, found = _searched(
+    stages, prices, result = _searched(
         problem, begin, (), tolerance, violation, budget, price, hold=by_segment is not None
     )
-    cost = found.measures.cost + _paid(stages, found.plan, prices)
-    duration = float(np.clip(found.plan.states[0, n], low, high))
+    cost = result.measures.cost + _paid(stages, result.plan, prices)
+    duration = float(np.clip(result.plan.states[0, n], low, high))
     # Remove everything that belongs to the duration.
-    rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]
-    found = replace(
-        found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
-        gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1],
-        measures=found.measures._replace(cost=cost),
-        sizes=found.sizes._replace(rows=rows),
+    rows = result.sizes.rows[stages.owners != len(problem.constraint_terms)]
+    result = replace(
+        result, plan=Motion(in_c_order(result.plan.states[:, :n]), result.plan.controls),
+        gain=in_c_order(result.gain[:, :, :n]), multipliers=result.multipliers[:-1],
+        measures=result.measures._replace(cost=cost),
+        sizes=result.sizes._replace(rows=rows),
     )  # fmt: skip
-    return settled(problem, duration), found
+    return settled(problem, duration), result
 
 
 def _searched(
@@ -450,12 +450,12 @@ def _with_found_segments(
     found; whether they are the best does not matter here.
     """
     assert problem.duration is not None
-    _, _, found = _searched(problem, begin, problem.segments, NEAR_SEGMENTS, violation, budget, price)
-    kept = found.measures.violation <= violation and found.measures.gap < NEAR_SEGMENTS
-    if not (found.solved or kept):
+    _, _, result = _searched(problem, begin, problem.segments, NEAR_SEGMENTS, violation, budget, price)
+    feasible = result.measures.violation <= violation and result.measures.gap < NEAR_SEGMENTS
+    if not (result.solved or feasible):
         return None
     steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])
-    ends = np.cumsum([0.0, *found.plan.states[:-1, -1] / steps])  # times of the knots
+    ends = np.cumsum([0.0, *result.plan.states[:-1, -1] / steps])  # times of the knots
     new = np.rint(ends[old] / ends[-1] * steps).astype(int)
     for k in range(1, len(new)):
         new[k] = max(new[k], new[k - 1] + 2)  # `Problem` wants two steps in a segment
@@ -463,7 +463,7 @@ def _with_found_segments(
     for k in range(len(new) - 2, 0, -1):
         new[k] = min(new[k], new[k + 1] - 2)
     at = np.interp(np.arange(steps + 1), new, old)
-    plan = resampled(found.plan.states[:, :-1], found.plan.controls, at)
+    plan = resampled(result.plan.states[:, :-1], result.plan.controls, at)
     dt = float(np.clip(LONGER * ends[-1], *problem.duration)) / steps
     return replace(problem._with_segments(new[1:-1].tolist()), dt=dt), Trajectory(*plan, dt)
 
@@ -493,12 +493,13 @@ def with_duration(problem: Problem, *, by_segment: bool = False) -> Problem:
         lambda x, u, p: [x[n] - p.low, p.high - x[n]], parameters={"low": low, "high": high},
         at="all" if by_segment else "final",
     )  # fmt: skip
-    stage_cost, final_cost = (one.with_added_state(dynamics) for one in (problem.stage_cost, problem.final_cost))
+    stage_cost, final_cost = (cost.with_added_state(dynamics) for cost in (problem.stage_cost, problem.final_cost))
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
         stage_cost=stage_cost + priced if by_segment else stage_cost,
         final_cost=final_cost if by_segment else final_cost + priced, control_limits=problem.control_limits,
-        constraints=(*(one.with_added_state(dynamics) for one in problem.constraints), bounds), begin=problem.begin,
+        constraints=(*(constraint.with_added_state(dynamics) for constraint in problem.constraints), bounds),
+        begin=problem.begin,
     )  # fmt: skip
 
 
@@ -516,7 +517,7 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
         f, states=dict(zip(names, space.units, strict=True)) | {state: "s"},
         controls=dict(zip(controls.names, controls.units, strict=True)),
         parameters=dict(dynamics.parameters) | {parameter: stated},
-        disturbances={name: one for name, one in dynamics.disturbances.items() if name not in dynamics.parameters},
+        disturbances={name: value for name, value in dynamics.disturbances.items() if name not in dynamics.parameters},
         position=tuple(names[i] for i in space.position), plane=space.plane, offset=space.offset,
         angles=tuple(names[i] for i in space.angles),
         rotation_vectors=tuple(names[i : i + 3] for i in space.rotation_vectors),

@@ -109,8 +109,8 @@ def gradients(
         ahead, behind = point.copy(), point.copy()
         ahead[k] += step
         behind[k] -= step
-        above, below = (optimum.values(_made(make, one), plan) for one in (ahead, behind))
-        return [(one - other) / (ahead[k] - behind[k]) for one, other in zip(above, below, strict=True)]
+        above, below = (optimum.values(_made(make, parameters), plan) for parameters in (ahead, behind))
+        return [(upper - lower) / (ahead[k] - behind[k]) for upper, lower in zip(above, below, strict=True)]
 
     columns, errors = [], []
     for k, size in enumerate(sizes):
@@ -118,7 +118,7 @@ def gradients(
         # Of the error, what is of second order is taken out; so its estimate is above what remains.
         columns.append([(4 * fine - coarse) / 3 for fine, coarse in zip(narrow, wide, strict=True)])
         errors.append(abs(float(narrow[0] - wide[0])) / 3)
-    partials = [np.stack(each, axis=-1) for each in zip(*columns, strict=True)]
+    partials = [np.stack(derivatives, axis=-1) for derivatives in zip(*columns, strict=True)]
     moves = optimum.moves(*partials[1:]) if plan else (None, None)
     return Gradients(partials[0], np.array(errors), optimum.changing, *moves)
 
@@ -155,7 +155,7 @@ class _Optimum:
         self._ilqr = solution.solver == "ilqr"
         self._plan, self._stages = Motion(states, controls), Stages(self._begun(problem))
         stages, unknown = self._stages, np.zeros_like(states)
-        self._forces = forces = stages.of_constraints([one.values for one in solution.multipliers])
+        self._forces = forces = stages.of_constraints([multipliers.values for multipliers in solution.multipliers])
         with problem.dynamics.solving(check_threads(None)):
             self._sizes = sizes = stages.sizes(self._plan)
             stages.linearize(self._plan, unknown, forces, np.inf)
@@ -188,13 +188,13 @@ class _Optimum:
             if whole:
                 stages.linearize(self._plan, self._costates, self._forces, np.inf)
         cost += (self._costates[0] @ (start - states[0])) - (self._forces * rows).sum()
-        found = [np.array(cost + (self._costates[1:] * (arrived - states[1:])).sum())]
+        parts = [np.array(cost + (self._costates[1:] * (arrived - states[1:])).sum())]
         if whole:
             slopes = stages.models.gradient - np.einsum("tr,trw->tw", self._forces, stages.slopes)
             slopes[:-1] += np.einsum("tn,tnw->tw", self._costates[1:], stages.models.jacobian)
-            found += [np.array(start), arrived, rows, slopes]
+            parts += [np.array(start), arrived, rows, slopes]
         stages.give_back()
-        return found
+        return parts
 
     def moves(self, start: Array, arrived: Array, rows: Array, slopes: Array) -> tuple[Array, Array]:
         """The gradients of states (T+1, n, P) and controls (T, m, P), from those of `values`."""

@@ -138,24 +138,24 @@ def _solve(
     with budget.stop.reporting("ilqr", attentive):
         ending = run.ilqr()
     log, work = budget.log, run.work
-    costs = np.array([one.cost for one in log])
+    costs = np.array([iteration.cost for iteration in log])
     ending = check_finite_at_start(problem, ending, costs, start, control, refuse=attentive)
-    whole = len(log) > 0 and ending.failed < 0
+    complete = len(log) > 0 and ending.failed < 0
     if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was made about the previous trajectory
         if not log:
             run.roll_out()
-        whole = bool(np.isfinite(run.linearize_about_plan()))
+        complete = bool(np.isfinite(run.linearize_about_plan()))
     (states, controls), gain = work.best, work.arrays.policy.gain
     # Without a pass about the trajectory the policy has no feedback.
-    law = compiled.law_about(states, controls, gain) if whole else (np.zeros_like(gain), controls)
-    found = RunResult(
+    law = compiled.law_about(states, controls, gain) if complete else (np.zeros_like(gain), controls)
+    result = RunResult(
         status=ending.status, detail=ending.detail(problem.steps), plan=work.best, law=law, cost=work.cost,
         violation=0.0, gap=0.0,
-        values={"cost_to_go": Quadratic(*work.arrays.to_go)} if whole else {},
+        values={"cost_to_go": Quadratic(*work.arrays.to_go)} if complete else {},
     )  # fmt: skip
-    found = run.certified(found)
-    if found.status is Status.RISK_TOO_HIGH:
-        found = replace(found, detail=name_risk(run, found))
-    solution = assemble(problem, found, log, solver="ilqr", options=settings.options(guess))
+    result = run.certified(result)
+    if result.status is Status.RISK_TOO_HIGH:
+        result = replace(result, detail=name_risk(run, result))
+    solution = assemble(problem, result, log, solver="ilqr", options=settings.options(guess))
     run.give_back()
     return budget.stop.finish(solution)

@@ -40,7 +40,7 @@ class Evidence:
 def alike(found: Sequence[Evidence]) -> list[Evidence]:
     """The evidence with equally small violations, the least first; empty unless it is from `STARTS` starts."""
     least = sorted(found, key=lambda one: one.missed)
-    same = [one for one in least if one.missed <= (1 + ALIKE) * least[0].missed]
+    same = [case for case in least if case.missed <= (1 + ALIKE) * least[0].missed]
     return same if len(same) >= STARTS else []
 
 
@@ -62,8 +62,8 @@ def evidence(
     if not left <= STATIONARY * size:
         return None
     if size > 0:
-        each = zip(problem.dynamics.control_coordinates.names, pressed.tolist(), strict=True)
-        holding += [(force / size, f"the limits of {name}") for name, force in each if force > 1e-2 * min(pull, size)]
+        forces = zip(problem.dynamics.control_coordinates.names, pressed.tolist(), strict=True)
+        holding += [(force / size, f"the limits of {name}") for name, force in forces if force > 1e-2 * min(pull, size)]
     return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))
 
 
@@ -98,8 +98,8 @@ def _pulls(
             share = 1 + beyond / sizes[k][row] if beyond > allowed else float(np.abs(weights[:, row]).sum())
             if share > 1e-2:
                 t = int((short if beyond > allowed else np.abs(weights))[:, row].argmax())
-                told = f", missed by {beyond:.2g}" if beyond > allowed else ""
-                holding.append((share, f"{term.describe(row)} at {t * problem.dt:.2f} s{told}"))
+                shortfall = f", missed by {beyond:.2g}" if beyond > allowed else ""
+                holding.append((share, f"{term.describe(row)} at {t * problem.dt:.2f} s{shortfall}"))
     return missed, slopes, alone, holding
 
 
@@ -117,16 +117,16 @@ def _balance(
     low = controls <= space.low + NEAR_LIMIT * control_size
     high = controls >= space.high - NEAR_LIMIT * control_size
     total, size, pull, pressed = 0.0, 0.0, 0.0, np.zeros(m)
-    ahead, own = slopes[steps, :n], alone[steps, :n]
+    ahead, ahead_alone = slopes[steps, :n], alone[steps, :n]
     for t in range(steps - 1, -1, -1):
         A, B, _ = problem.dynamics.linearize(states[t], controls[t], problem.dt)
-        slope, of_missed = slopes[t, n:] + B.T @ ahead, alone[t, n:] + B.T @ own
+        slope, of_missed = slopes[t, n:] + B.T @ ahead, alone[t, n:] + B.T @ ahead_alone
         free = ~((low[t] & (slope > 0)) | (high[t] & (slope < 0)))
         total = max(total, float((np.abs(slope) * control_size * free).max()))
         pressed = np.maximum(pressed, np.abs(slope) * control_size * ~free)
         reach = np.linalg.norm(B / state_size[:, None], axis=0) * control_size
-        of_all, of_own = np.linalg.norm(ahead * state_size) * reach, np.linalg.norm(own * state_size) * reach
+        of_all, of_own = np.linalg.norm(ahead * state_size) * reach, np.linalg.norm(ahead_alone * state_size) * reach
         pull = max(pull, float((np.abs(of_missed) * control_size).max()))
         size = max(size, pull, float(of_all.max()), float(of_own.max()))
-        ahead, own = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ own
+        ahead, ahead_alone = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ ahead_alone
     return total, size, pull, pressed

@@ -49,8 +49,8 @@ class InitialPrior:
             raise InputError(
                 f"InitialPrior: weight: got {excerpt(self.weight.tolist())}, want numbers >= 0, one a state"
             )
-        given = numbers_of("InitialPrior: about", about, f"numbers ({len(self.weight)},) or (T+1, {len(self.weight)})")
-        self.about = check_array("InitialPrior: about", given, (*[None] * (given.ndim == 2), len(self.weight)))
+        array = numbers_of("InitialPrior: about", about, f"numbers ({len(self.weight)},) or (T+1, {len(self.weight)})")
+        self.about = check_array("InitialPrior: about", array, (*[None] * (array.ndim == 2), len(self.weight)))
         if len(self.about) < 2 and self.about.ndim == 2:
             raise InputError(
                 f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times"
@@ -107,14 +107,14 @@ class InitialGuess:
     def digest(self) -> str:
         """Hash of everything that the first pass starts from."""
         parts: dict[str, object] = {"gain": self.gain, "offset": self.offset}
-        for name, one in (("cost_to_go", self.cost_to_go), ("trajectory", self.trajectory)):
-            parts |= {} if one is None else {f"{name}.{part}": value for part, value in vars(one).items()}
+        for name, record in (("cost_to_go", self.cost_to_go), ("trajectory", self.trajectory)):
+            parts |= {} if record is None else {f"{name}.{part}": value for part, value in vars(record).items()}
         if self.prior is not None:
             prior = self.prior
             parts |= {"weight": prior.weight, "about": prior.about}
             parts |= {"iterations": prior.iterations, "obstacles": prior.obstacles}
-        for number, one in enumerate(self.multipliers):
-            parts |= {f"multipliers.{number}": one.values, f"penalty.{number}": one.penalty}
+        for number, record in enumerate(self.multipliers):
+            parts |= {f"multipliers.{number}": record.values, f"penalty.{number}": record.penalty}
         arrays = ((name, np.asarray(value, dtype=np.float64)) for name, value in parts.items())
         return sha256(*(part for name, array in arrays for part in (f"{name} {array.shape}", array)))
 
@@ -148,9 +148,9 @@ class InitialGuess:
             raise InputError(f"penalty: got {penalty:g} for a problem without constraints, want None")
         if self.prior is not None:
             raise InputError(f"penalty: got {penalty:g} beside an InitialPrior, want another start")
-        known = [one.values for one in self.multipliers]
+        known = [multipliers.values for multipliers in self.multipliers]
         values = known or [np.zeros((problem.steps + 1, term.rows)) for term in problem.constraint_terms]
-        return replace(self, multipliers=tuple(Multipliers(one, penalty) for one in values))
+        return replace(self, multipliers=tuple(Multipliers(numbers, penalty) for numbers in values))
 
 
 def resampled(states: Array, controls: Array, at: Array) -> Motion:
@@ -192,7 +192,9 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
             value = Quadratic(hessian, check_array("start: cost_to_go.gradient", value.gradient, (steps + 1, n)),
                               check_array("start: cost_to_go.constant", value.constant, (steps + 1,)))  # fmt: skip
         multipliers = start.multipliers
-        if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
+        if [known.values.shape for known in multipliers] != [
+            (steps + 1, term.rows) for term in problem.constraint_terms
+        ]:
             multipliers = ()  # they belong to other constraints
         summary = _summary(start, policy.gain, policy.offset)
         return InitialGuess(policy.gain, policy.offset, summary, value, multipliers=multipliers)

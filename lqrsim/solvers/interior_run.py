@@ -57,9 +57,9 @@ class InteriorRun:
     def instead(self, plan: Motion | RunResult) -> RunResult | None:
         """The result from a plan if it converges; else None, so that smoothing can continue."""
         checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
-        found = self.solve(copied(plan), MUCH)
-        if found is not None and found.success:
-            return found
+        result = self.solve(copied(plan), MUCH)
+        if result is not None and result.success:
+            return result
         self._run.go_on(checkpoint, self._budget.log[begin:])
         return None
 
@@ -70,7 +70,7 @@ class InteriorRun:
 
         `stale` is the number of iterations without a new least stationarity that ends it; by default it may take any.
         """
-        budget, run, found = self._budget, self._run, None
+        budget, run, result = self._budget, self._run, None
         if budget.left < 2 or budget.stop.due:
             return None
         laps, least, since = Laps(budget), np.inf, 0
@@ -87,11 +87,11 @@ class InteriorRun:
                 run.stages, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
                 multipliers=multipliers,
             )  # fmt: skip
-            found = point.run(
+            result = point.run(
                 tolerance=run.final, violation=self.allowed, most=min(MOST, budget.left - 1), near=barrier.near,
                 watch=watch, hurried=budget.hurried,
             )  # fmt: skip
-        return None if found is None else self.finish(found)
+        return None if result is None else self.finish(result)
 
     def finish(self, found: Found) -> RunResult | None:
         """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
@@ -137,8 +137,8 @@ class InteriorRun:
 
     def without_multipliers(self) -> None:
         """Set multipliers and penalties of the augmented Lagrangian to zero."""
-        for one in self._run.work.multipliers:
-            one.penalty, one.values[...] = 0.0, 0.0
+        for multipliers in self._run.work.multipliers:
+            multipliers.penalty, multipliers.values[...] = 0.0, 0.0
 
     def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
         """The rollout of a plan with gains about it, or without gains if this violates the constraints less."""
@@ -199,15 +199,15 @@ class InteriorRun:
         for side, sign in ((self._run.stages.low, -1.0), (self._run.stages.high, 1.0)):
             room = np.abs(side - controls) / found.sizes.controls
             force = sign * found.pressing * found.sizes.controls / found.scale
-            there = (room < AT_LIMIT) & (force > room)
-            controls = np.where(there, side, controls)
-            gain[there] = 0.0
+            pressed = (room < AT_LIMIT) & (force > room)
+            controls = np.where(pressed, side, controls)
+            gain[pressed] = 0.0
         return controls, gain
 
     def _take_multipliers(self, found: Found, values: list[Array], firmness: float) -> None:
         """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
-        each = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
-        for k, (own, known, numbers) in enumerate(each):
+        triples = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
+        for k, (own, known, numbers) in enumerate(triples):
             size = found.sizes.rows[self._run.stages.owners == k]
             own.penalty = firmness * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
@@ -225,11 +225,11 @@ class InteriorRun:
         """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
         values = self._run.work.constraint_values(*result.plan)
         multipliers = []
-        for k, one in enumerate(lagrangian.multipliers()):
+        for k, updated in enumerate(lagrangian.multipliers()):
             size = found.sizes.rows[self._run.stages.owners == k]
-            idle = one.values * size / found.scale < values[k] / size
+            idle = updated.values * size / found.scale < values[k] / size
             idle &= not self._problem.constraint_terms[k].equality
-            multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
+            multipliers.append(replace(updated, values=np.where(idle, 0.0, updated.values)))
         return tuple(multipliers)
 
 

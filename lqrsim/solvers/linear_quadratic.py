@@ -65,8 +65,8 @@ def smooth_lq(
         if not optimality < ACCURACY:
             detail = f"too ill-conditioned: the plan costs {value:.9g}, the cost-to-go promised {promised:.9g}"
     solved = not detail
-    whole = solved and max(gap, residual) < ACCURACY
-    if solved and not whole:
+    close = solved and max(gap, residual) < ACCURACY
+    if solved and not close:
         detail = f"the states of least total cost are {gap:.1g} off the plan, so the cost-to-come is left out"
     exact = dict.fromkeys(("start", "dynamics_residual", "policy_residual", "limits", "violation"), 0.0)  # a rollout
     iteration = Iteration(
@@ -78,9 +78,9 @@ def smooth_lq(
         detail=detail,
         remedy="" if solved else WEIGH_MORE,
         policy=_policy(*passes.policy, states[:-1].copy(), dt),
-        inverse_policy=_policy(*passes.smoothing[2:], states[1:].copy(), dt) if whole and form == "primal" else None,
+        inverse_policy=_policy(*passes.smoothing[2:], states[1:].copy(), dt) if close and form == "primal" else None,
         cost_to_go=Quadratic(*passes.to_go) if solved else None,
-        cost_to_come=(Moments if form == "dual" else Quadratic)(*passes.to_come) if whole else None,
+        cost_to_come=(Moments if form == "dual" else Quadratic)(*passes.to_come) if close else None,
         trajectory=Trajectory(states, controls, dt),
         iterations=(iteration,) if solved else (),
         clearance=None,
@@ -114,19 +114,19 @@ def _passes(
     inverse, c_inverse = (jacobian, c.copy()) if form == "dual" else _inverse(A, B, c)
     cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))
     slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
-    found = zeros_of(RiccatiArrays, T=steps, N=n, M=m, S=steps)
-    for array, end in zip(found.to_go, check_end("final", final, n), strict=True):
+    passes = zeros_of(RiccatiArrays, T=steps, N=n, M=m, S=steps)
+    for array, end in zip(passes.to_go, check_end("final", final, n), strict=True):
         array[-1] = end
-    for array, begin in zip(found.to_come, _initial_cost_to_come(initial, n, form), strict=True):
+    for array, begin in zip(passes.to_come, _initial_cost_to_come(initial, n, form), strict=True):
         array[0] = begin
     failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
         steps, LinearStep(jacobian, c.copy()), LinearStep(inverse, c_inverse), QuadraticStage(cost, slope),
-        constant.copy(), found,
+        constant.copy(), passes,
     )  # fmt: skip
     failure = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
     if failed >= 0 and form == "dual" and which > 0:
         failure += '; try form="primal"'
-    return found, failure
+    return passes, failure
 
 
 def _start(passes: RiccatiArrays, failure: str, initial: Quadratic | FixedState) -> tuple[Array, str]:

@@ -71,14 +71,14 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     weight = weight_of_path * _holding(problem) if holding else np.zeros(len(problem.start))
     weight[moving] = weight_of_path
     between = np.where(weight > 0, np.linspace(problem.start, problem.goal, problem.steps + 1), 0.0)
-    found, unit = [], problem.dynamics.state_coordinates.units[moving[0]]
+    starts, unit = [], problem.dynamics.state_coordinates.units[moving[0]]
     ring = RING if problem.dynamics.state_coordinates.position else FOLD
     for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count, ring=ring, unit=unit):
         about = between.copy()
         about[:, moving] = path(*ends, bend, problem.steps)
         prior = InitialPrior(weight, about=about, iterations=CHOOSE if holding else 1, obstacles=SHARES)
-        found.append((name, prior))
-    return found
+        starts.append((name, prior))
+    return starts
 
 
 def _stands(problem: Problem) -> bool:
@@ -118,13 +118,13 @@ def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]
     place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
         return {}
-    found = {}
+    trajectories = {}
     for name, bend in bends((goal - begin)[place], ASIDE if count is None else count)[1:]:
         states = path(begin, goal, np.zeros(len(begin)), problem.steps)
         states[:, place] = path(begin[place], goal[place], bend, problem.steps)
         controls = np.tile(problem.nominal_control, (problem.steps, 1))
-        found[f"a path {name}"] = Trajectory(states, controls, problem.dt)
-    return found
+        trajectories[f"a path {name}"] = Trajectory(states, controls, problem.dt)
+    return trajectories
 
 
 def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[str, InitialPrior]:
@@ -138,15 +138,15 @@ def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[st
     begin, goal, place = problem.start, problem.goal, list(moving)
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
         return {}
-    found, unit, space = {}, problem.dynamics.state_coordinates.units[place[0]], problem.dynamics.state_coordinates
+    priors, unit, space = {}, problem.dynamics.state_coordinates.units[place[0]], problem.dynamics.state_coordinates
     distance = float(np.linalg.norm((goal - begin)[place]))
     ring, count = (RING, MOTIONS) if space.position else (FOLD, STARTS)
     for name, bend in bends((goal - begin)[place], count, ring=ring, unit=unit):
         about, weight = np.tile(begin, (problem.steps + 1, 1)), np.zeros(len(begin))
         about[:, place] = path(begin[place], goal[place], bend, problem.steps)
         weight[place] = FOLLOWED * cost / (problem.steps * max(STEP * distance, float(np.linalg.norm(bend))) ** 2)
-        found[f"a motion along a path {name}"] = InitialPrior(weight, about=about, iterations=FOLLOW)
-    return found
+        priors[f"a motion along a path {name}"] = InitialPrior(weight, about=about, iterations=FOLLOW)
+    return priors
 
 
 def passable(problem: Problem) -> list[bool]:
@@ -163,7 +163,7 @@ def reweighted(problem: Problem, times: float) -> Problem:
     Only numbers change, so nothing is compiled. The constraints do not act in its solves.
     """
     stage, final = (weighing_obstacles(cost, times) for cost in (problem.stage_cost, problem.final_cost))
-    heavier = (one if one.state_reference is None else one.times(times) for one in final.terms)
+    heavier = (term if term.state_reference is None else term.times(times) for term in final.terms)
     return problem.with_costs(stage_cost=stage, final_cost=CostSum(tuple(heavier)))
 
 
@@ -192,9 +192,9 @@ def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
     assert start is not None
     m, steps = len(nominal), problem.steps
     shares = LEVELS if m < 3 else LEVELS[::2]
-    each = itertools.product(shares, repeat=m) if m < 5 else zip(*[shares] * m, strict=True)
+    combinations = itertools.product(shares, repeat=m) if m < 5 else zip(*[shares] * m, strict=True)
     limited = np.isfinite([space.low, space.high]).all()
-    for share, far in itertools.product(each, (1.0,) if limited else UNLIMITED):
+    for share, far in itertools.product(combinations, (1.0,) if limited else UNLIMITED):
         low = np.where(np.isfinite(space.low), space.low, nominal - far)
         high = np.where(np.isfinite(space.high), space.high, nominal + far)
         control = low + np.array(share) * (high - low)

@@ -48,8 +48,8 @@ def solve_all(
     with workers(threads, functions) as pool:
         futures = [pool.submit(solve, problem, settings) for problem in problems]
         done = 0
-        told = reported("solving", lambda: f"{done} of {len(futures)} problems done")
-        with told if progress is None else contextlib.nullcontext():
+        report = reported("solving", lambda: f"{done} of {len(futures)} problems done")
+        with report if progress is None else contextlib.nullcontext():
             for done, _ in enumerate(as_completed(futures), start=1):
                 if progress is not None:
                     progress(done, len(futures))
@@ -81,4 +81,4 @@ def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float 
     listed = list(check_items("problems", problems, object, "a list of Problem"))
     if noise is None and risk is None:
         return listed
-    return [check_kind("problems", one, Problem, "Problems").driven_by(noise, risk) for one in listed]
+    return [check_kind("problems", problem, Problem, "Problems").driven_by(noise, risk) for problem in listed]

@@ -186,8 +186,8 @@ class PreparedSolver(OneVersion):
           previous: (m,) the last command before the plan, from which a `control_rate` counts; None if it is free.
         """
         clock = time.perf_counter()
-        own = self.problem if problem is None else self.check(problem)
-        problem = own.from_state(state, after=after, previous=previous)
+        base = self.problem if problem is None else self.check(problem)
+        problem = base.from_state(state, after=after, previous=previous)
         if self._wide is not None:
             return self._solve_wide(self._wide, problem, start, time_limit, clock)
         stop = Stop(reserve=self._pace + self._closing)
@@ -201,26 +201,26 @@ class PreparedSolver(OneVersion):
         with problem.dynamics.solving(self.threads):
             if run.second_order and _can_yield(problem):
                 point = _Yielding(run, _plan_of(start, best), self._closing)
-                found, ended = point.find(best.plan, best.cost), point.ended
-                if found is None:
-                    found = replace(_unchanged(best), status=point.unsolved)
+                result, ended = point.find(best.plan, best.cost), point.ended
+                if result is None:
+                    result = replace(_unchanged(best), status=point.unsolved)
                 else:
-                    best.adopt(found)
+                    best.adopt(result)
             elif problem.constraints and run.second_order:
                 neighbour = _Neighbour(run, _plan_of(start, best), best, self._closing)
-                found, ended = neighbour.find(), neighbour.laps.ended
+                result, ended = neighbour.find(), neighbour.laps.ended
                 if neighbour.may_be_far:
-                    best.consider(found)
-                    found, ended = Ladder(run, Known()).climb(), time.perf_counter()
+                    best.consider(result)
+                    result, ended = Ladder(run, Known()).climb(), time.perf_counter()
             else:
-                found = _solve(run, best)
+                result = _solve(run, best)
                 ended = time.perf_counter()
         if stop.error is not None:
             raise stop.error
-        seconds = [one.seconds for one in budget.log]
+        seconds = [iteration.seconds for iteration in budget.log]
         self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
-        best.consider(found)
-        answer = self._answer(problem, best, found, budget, clock, best.rolling_out + sum(seconds))
+        best.consider(result)
+        answer = self._answer(problem, best, result, budget, clock, best.rolling_out + sum(seconds))
         run.give_back()  # this is skipped after an exception
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
@@ -235,9 +235,11 @@ class PreparedSolver(OneVersion):
         if time_limit is not None:
             left = time_limit - (time.perf_counter() - clock) - self._closing
             time_limit = max(left, 1e-9)
-        found = solver.solve(wide.start, widened(start, problem, wide), problem=wide, time_limit=time_limit)
+        wide_plan = solver.solve(wide.start, widened(start, problem, wide), problem=wide, time_limit=time_limit)
         ended = time.perf_counter()
-        plan = narrowed(found, problem, *feedback(problem, found.trajectory, found.multipliers), seconds=0.0)
+        plan = narrowed(
+            wide_plan, problem, *feedback(problem, wide_plan.trajectory, wide_plan.multipliers), seconds=0.0
+        )
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return replace(plan, seconds=time.perf_counter() - clock)
 
@@ -281,10 +283,10 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
     try:
         if run.initial_guess.multipliers:
             return meet_constraints(run, None)
-        found = run.solve(look_back=False)
-        if run.problem.constraints and found.success and not run.budget.stop.due:
-            found = meet_constraints(run, found)
-        return found
+        result = run.solve(look_back=False)
+        if run.problem.constraints and result.success and not run.budget.stop.due:
+            result = meet_constraints(run, result)
+        return result
     except InputError as error:  # a function that is not finite at the start
         return replace(_unchanged(best), status=Status.NOT_FINITE, detail=str(error))
 
@@ -322,7 +324,7 @@ class _Neighbour:
         if not np.isfinite(self._best.cost):
             detail = "the policy that it begins with diverges"
             return replace(_unchanged(self._best), status=Status.NOT_FINITE, detail=detail)
-        known = tuple(one.values for one in run.initial_guess.multipliers)
+        known = tuple(multipliers.values for multipliers in run.initial_guess.multipliers)
         for function in functions_of(run.problem):
             function.forget()
         with np.errstate(all="ignore"):
@@ -338,9 +340,9 @@ class _Neighbour:
                     measures.record(self.laps, seconds=seconds)
                     return self._late(budget.log[-1].seconds) or not budget.left
 
-                found = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
-                if found.solved or not np.isfinite(active.measures.cost):
-                    active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
+                result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
+                if result.solved or not np.isfinite(active.measures.cost):
+                    active = ActiveSet(self._stages, result.plan, result.multipliers, self._allowed)
                     solved = self._solve(active)
             self.laps.ended = time.perf_counter()
             in_time = self.laps.ended + ELSEWHERE * active.looking + self._closing < budget.stop.deadline
@@ -370,14 +372,14 @@ class _Neighbour:
         plan, gain, cost, values = active.carried_out()
         pairs = zip(problem.constraint_terms, values, strict=True)
         solved = solved and all(
-            violation_of(term, one) <= allowed_violation(term, self._allowed) for term, one in pairs
+            violation_of(term, numbers) <= allowed_violation(term, self._allowed) for term, numbers in pairs
         )
         status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else status, detail=detail, plan=plan,
             law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values),
-            multipliers=tuple(Multipliers(*one) for one in active.multipliers()),
+            multipliers=tuple(Multipliers(*pair) for pair in active.multipliers()),
         )  # fmt: skip
 
 
@@ -427,12 +429,12 @@ class _Yielding:
             self._late = self.ended + looking + self._closing >= budget.stop.deadline
             if self._late or not budget.left:
                 return None
-            found = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
-            law = compiled.law_about(*found.plan, found.gain.copy())
+            result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
+            law = compiled.law_about(*result.plan, result.gain.copy())
             plan = run.work.roll_out(*law, self._plan.states[0])
             reached = run.stages.trial(plan)[0]
             rank = self._rank(plan, reached)
-            solved = found.solved and rank[1] == 0
+            solved = result.solved and rank[1] == 0
             if not solved and rank > self._rank(before, cost):
                 return None
         return self._result(plan, law, reached, Status.CONVERGED if solved else self.unsolved)
@@ -450,8 +452,10 @@ class _Yielding:
         """The largest violation of the constraints that do not give way, beyond what is allowed."""
         values = self._run.work.constraint_values(*plan)
         pairs = zip(self._run.problem.constraint_terms, values, strict=True)
-        hard = ((one, number) for one, number in pairs if not one.yields)
-        return max([0.0, *(violation_of(one, number) - allowed_violation(one, self._allowed) for one, number in hard)])
+        hard = ((term, number) for term, number in pairs if not term.yields)
+        return max(
+            [0.0, *(violation_of(term, number) - allowed_violation(term, self._allowed) for term, number in hard)]
+        )
 
     def _rank(self, plan: Motion, cost: float) -> tuple[bool, float, float]:
         """Sort key, best first: violation of what does not give way, then the cost with the prices of violations."""
@@ -502,16 +506,16 @@ class _Best:
         if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
             if iteration.method == "newton":
-                there = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
+                parts = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
             else:
-                there = *arrays.last, *arrays.last_policy, *arrays.to_go
+                parts = *arrays.last, *arrays.last_policy, *arrays.to_go
             # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.
             if not self._copies:
                 self._copies = tuple(
                     np.empty_like(array) for array in (*arrays.best, *arrays.last_policy, *arrays.to_go)
                 )
-            copies = self._copies[: len(there)]  # the cost-to-go about Newton's plans is computed at the end
-            for copy, array in zip(copies, there, strict=True):
+            copies = self._copies[: len(parts)]  # the cost-to-go about Newton's plans is computed at the end
+            for copy, array in zip(copies, parts, strict=True):
                 np.copyto(copy, array)
             self._keep(iteration.cost, iteration.violation, copies)
 
@@ -523,8 +527,8 @@ class _Best:
             self.adopt(found)
 
     def adopt(self, found: RunResult) -> None:
-        there = *found.plan, *found.law, *(self._work.arrays.to_go if found.values else ())
-        self._keep(found.cost, found.violation, there)
+        parts = *found.plan, *found.law, *(self._work.arrays.to_go if found.values else ())
+        self._keep(found.cost, found.violation, parts)
         self.multipliers = found.multipliers
 
     def _beaten_by(self, cost: float, violation: float) -> bool:

@@ -79,18 +79,18 @@ def _final_cost(problem: Problem, state: Array) -> tuple[float, Array, Array]:
 
 def missing(problem: Problem, state: Array, places: list[int]) -> Array:
     """By how much these states of a final state (n,) are short of the goal, (n,); zero for all others."""
-    found, (_, slope, curvature) = np.zeros(len(state)), _final_cost(problem, state)
-    found[places] = -np.linalg.lstsq(curvature[np.ix_(places, places)], slope[places])[0]
+    shortfall, (_, slope, curvature) = np.zeros(len(state)), _final_cost(problem, state)
+    shortfall[places] = -np.linalg.lstsq(curvature[np.ix_(places, places)], slope[places])[0]
     for i, number in goals_of(problem.constraints, problem.dynamics).items():
-        found[i] = number - state[i] if i in places else 0.0
-    return found
+        shortfall[i] = number - state[i] if i in places else 0.0
+    return shortfall
 
 
 def comes_nearer(problem: Problem, plan: RunResult | Motion, other: RunResult, places: list[int]) -> bool:
     """Whether these states end nearer to their goal in a plan than in another, by a good part of the way."""
     if not np.isfinite(plan.states[-1]).all():
         return False
-    ways = [missing(problem, one.states[-1], places) for one in (plan, other)]
+    ways = [missing(problem, motion.states[-1], places) for motion in (plan, other)]
     return bool(np.linalg.norm(ways[0]) < (1 - NEARER) * np.linalg.norm(ways[1]))
 
 
@@ -108,8 +108,10 @@ def approaches(problem: Problem, found: RunResult, places: list[int]) -> Iterato
         stage = problem.stage_cost + QuadraticCost(
             drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
         )
-        kept = [one for one in problem.constraints if not one.final_states(problem.dynamics)]
-        yield words, replace(problem, dynamics=dynamics, constraints=kept).with_costs(stage_cost=stage)
+        constraints = [
+            constraint for constraint in problem.constraints if not constraint.final_states(problem.dynamics)
+        ]
+        yield words, replace(problem, dynamics=dynamics, constraints=constraints).with_costs(stage_cost=stage)
 
 
 def moved_otherwise(problem: Problem, states: Array, places: list[int]) -> bool:
@@ -127,6 +129,6 @@ def moved_otherwise(problem: Problem, states: Array, places: list[int]) -> bool:
 def described(problem: Problem, states: Array, places: list[int]) -> str:
     """In words: which states no control changes, and which bodies nothing touches."""
     names = problem.dynamics.state_coordinates.names
-    found = f"no control changes {' or '.join(names[i] for i in places)} along this plan"
+    text = f"no control changes {' or '.join(names[i] for i in places)} along this plan"
     bodies = dict.fromkeys(filter(None, (problem.dynamics.untouched_body(states, i) for i in places)))
-    return found + (f": nothing that moves touches {' or '.join(bodies)}" if bodies else "")
+    return text + (f": nothing that moves touches {' or '.join(bodies)}" if bodies else "")

@@ -153,13 +153,13 @@ def riccati_pass(
         return -sign * slope(t, packed)[1].ravel()[corner]
 
     span = (horizon, 0.0) if backward else (0.0, horizon)
-    found = integrate(rate, end[rows, columns], span, tolerances)
+    solution = integrate(rate, end[rows, columns], span, tolerances)
 
     def sample(t: float, packed: Array) -> Array:
         V, _, law = slope(t, packed)
         return np.concatenate([V.ravel(), law.ravel()])
 
-    return Pass(_pieces(found, sample), n, model(span[0], end).G.shape[1])
+    return Pass(_pieces(solution, sample), n, model(span[0], end).G.shape[1])
 
 
 def integrate(
@@ -191,13 +191,13 @@ def integrate(
         guarded(span[0], start)
         if last:
             raise last[0]
-        found = solve_ivp(guarded, span, start, method="DOP853", dense_output=True, **tolerances._asdict())
-    if not found.success:
-        t = float(found.t[-1])
+        solution = solve_ivp(guarded, span, start, method="DOP853", dense_output=True, **tolerances._asdict())
+    if not solution.success:
+        t = float(solution.t[-1])
         if last and abs(last[0].time - t) < 1e-6 * abs(span[1] - span[0]):
             raise last[0]
         raise IntegrationFailure(Status.NOT_FINITE, "the solution grows beyond what steps of any length can follow", t)
-    return found
+    return solution
 
 
 def _pieces(found: Any, sample: Callable[[float, Array], Array]) -> PPoly:
@@ -282,9 +282,9 @@ class System:
             cost = self._expand(t, x, law[:, :-1] @ x + law[:, -1])
             return np.append(self._f, cost)
 
-        found = integrate(rate, np.append(start, self.end_value("initial", start)), (0.0, self.horizon), tolerances)
-        cost = found.y[-1, -1] + self.end_value("final", np.ascontiguousarray(found.y[:-1, -1]))
-        return float(cost), _pieces(found, lambda t, y: y[: self.n])
+        solution = integrate(rate, np.append(start, self.end_value("initial", start)), (0.0, self.horizon), tolerances)
+        cost = solution.y[-1, -1] + self.end_value("final", np.ascontiguousarray(solution.y[:-1, -1]))
+        return float(cost), _pieces(solution, lambda t, y: y[: self.n])
 
     def decrease(self, states: PPoly, policy: Pass, tolerances: Tolerances) -> float:
         """The decrease of cost that a linear-quadratic model about a rollout predicts."""
@@ -301,6 +301,6 @@ class System:
             return bordered(self._hessian[: self.n, : self.n], self._gradient[: self.n], 0.0)
 
         last, first = states(self.horizon), states(0.0)
-        found = riccati_pass(deviation, end("final", last), self.horizon, backward=True, tolerances=tolerances)
-        total = found.at(0.0)[0] + end("initial", first)
+        backward = riccati_pass(deviation, end("final", last), self.horizon, backward=True, tolerances=tolerances)
+        total = backward.at(0.0)[0] + end("initial", first)
         return float(-0.5 * total[-1, -1] - 0.5 * total[-1, :-1] @ minimizer(total, 0.0))

@@ -79,8 +79,8 @@ class SmootherSettings(Settings):
 
     def final(self, problem: Problem) -> float:
         """Tolerance of the optimality."""
-        own = ROUGH if not self.second_order(problem) else FINE if has_curvature(problem) else LEARNED
-        return self.tolerance or own
+        default = ROUGH if not self.second_order(problem) else FINE if has_curvature(problem) else LEARNED
+        return self.tolerance or default
 
     def rough(self, problem: Problem) -> float:
         """Tolerance at which smoothing ends, coarser if Newton's method follows."""

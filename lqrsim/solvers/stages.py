@@ -69,15 +69,15 @@ class Stages:
         self._lengths = {"T": steps, "N": n, "M": m, "W": n + m, "R": rows, "K": (steps + 1) * rows, "C": len(counts)}
         self._module = module_of(source_of(entry_points), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
-        own = zeros_of(StageRows, {"size": rows}, **self._lengths)
-        own.limits[...], own.first[...] = np.inf, np.cumsum([0, *counts])[:-1]
+        stage_rows = zeros_of(StageRows, {"size": rows}, **self._lengths)
+        stage_rows.limits[...], stage_rows.first[...] = np.inf, np.cumsum([0, *counts])[:-1]
         values = tuple(np.zeros((steps + 1) * count) for count in counts)
-        stated = {"steps": steps, "soft": 0, "learns": 0, "model": None, "values": values, "rows": own}
+        stated = {"steps": steps, "soft": 0, "learns": 0, "model": None, "values": values, "rows": stage_rows}
         self.about = zeros_of(PlanStages, stated, **self._lengths)
         self.about.state_size[...], self.about.control_size[...] = 1.0, 1.0
         self.models = self.about.models
         self.slopes = self.models.slopes.reshape(steps + 1, rows, n + m)
-        by_step = (one.reshape(steps + 1, rows) for one in own[4:])
+        by_step = (array.reshape(steps + 1, rows) for array in stage_rows[4:])
         self._acts, self._live, self.held, self._kinds, self._sizes, self._targets, self._prices, *others = by_step
         self.numbers, self.force = others
         self._take(problem)
@@ -90,8 +90,8 @@ class Stages:
         """Read a problem's numbers, and determine which rows can act."""
         self.problem, self.steps = problem, problem.steps
         fixed, steps, terms = isinstance(problem.initial, FixedState), problem.steps, problem.constraint_terms
-        own = [compiled.ConstraintMultipliers(problem, term) for term in terms]
-        model = compiled.arguments(problem, multipliers=own, second_order=True)
+        acting = [compiled.ConstraintMultipliers(problem, term) for term in terms]
+        model = compiled.arguments(problem, multipliers=acting, second_order=True)
         self.low, self.high = model.limits
         *_, lower, upper = self._shape
         self.limits = [(1.0, i, self.low[i]) for i in lower] + [(-1.0, i, self.high[i]) for i in upper]
@@ -99,9 +99,9 @@ class Stages:
         self.equality = np.repeat([*(term.equality for term in terms), False], counts).astype(bool)
         self.owners = np.repeat([*range(len(terms)), -1], counts)
         self.live = np.ones((steps + 1, sum(counts)), dtype=bool)
-        for k, one in enumerate(own):
-            self.live[: one.first, self.owners == k] = False
-            self.live[steps, self.owners == k] &= not one.term.uses_control
+        for k, constraint in enumerate(acting):
+            self.live[: constraint.first, self.owners == k] = False
+            self.live[steps, self.owners == k] &= not constraint.term.uses_control
         self.live[steps, self.owners == -1] = False
         self._acts[...] = self._live[...] = self.live
         self.about = self.about._replace(
@@ -143,14 +143,14 @@ class Stages:
         """The stages of a problem, if possible in memory that was given back, because allocating takes time."""
         shape = _shape(problem)
         with _lending:
-            found = next((one for one in reversed(_idle) if one._shape == shape), None)
-            if found is not None:
-                _idle.remove(found)
-        if found is None:
+            stages = next((idle for idle in reversed(_idle) if idle._shape == shape), None)
+            if stages is not None:
+                _idle.remove(stages)
+        if stages is None:
             return cls(problem)
-        found._take(problem)
-        found.about.rows.support[...] = 0.0
-        return found
+        stages._take(problem)
+        stages.about.rows.support[...] = 0.0
+        return stages
 
     def give_back(self) -> None:
         """Leave the memory to another solve."""
@@ -236,8 +236,8 @@ class Stages:
     def of_constraints(self, numbers: Sequence[Array]) -> Array:
         """Numbers of each constraint (T+1, rows) at their places in (T+1, R); zero for limits, or if none are given."""
         rows = np.zeros(self.live.shape)
-        for k, one in enumerate(numbers):
-            rows[:, self.owners == k] = one
+        for k, values in enumerate(numbers):
+            rows[:, self.owners == k] = values
         return rows
 
     def of_each(self, numbers: NDArray[Any]) -> NDArray[Any]:

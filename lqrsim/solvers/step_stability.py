@@ -33,10 +33,10 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     same controls lead there with shorter steps as well.
     """
     known = np.flatnonzero(np.isfinite(states[:-1]).all(axis=1) & np.isfinite(controls).all(axis=1))
-    found = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
-    if found is None:
+    runge_kutta = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
+    if runge_kutta is None:
         return None
-    step, slopes = found
+    step, slopes = runge_kutta
     # The norm bounds all eigenvalues, and mostly decides.
     with np.errstate(over="ignore"):
         fast = (step * np.linalg.norm(slopes, axis=(1, 2)) > STABLE) & np.isfinite(slopes).all(axis=(1, 2))
@@ -61,8 +61,8 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     if not sound and not _stays_finite(problem, states[0], controls, math.ceil(step / longest)):
         return None
     # The state that takes part the most in the eigenvalue, whatever the units of states.
-    each, right = np.linalg.eig(slopes[knot])
-    mode = int(np.argmin(np.abs(each - rate)))
+    eigenvalues, right = np.linalg.eig(slopes[knot])
+    mode = int(np.argmin(np.abs(eigenvalues - rate)))
     carrier = int(np.argmax(np.abs(np.linalg.pinv(right)[mode] * right[:, mode])))
     name = problem.dynamics.state_coordinates.names[carrier]
     value = f"{rate.real:.3g}" + (f" +- {abs(rate.imag):.3g}i" if rate.imag else "")

@@ -128,21 +128,21 @@ def solve(
         return solve_for_duration(
             problem, settings, fixed, attentive=attentive, callback=callback, stop=stop, begin=begin
         )
-    before, asked = tuple[Iteration, ...](), settings
-    if refinements == REFINEMENTS and any(one._rough for one in problem.constraints):
+    before, original = tuple[Iteration, ...](), settings
+    if refinements == REFINEMENTS and any(constraint._rough for constraint in problem.constraints):
         problem, settings, before = outlined(problem, settings, attentive, threads, callback, stop)
     with stop.not_counting():  # compiling
-        given = [(GIVEN, settings.start)] if settings.start is not None else guides(problem, settings.starts)
+        starts = [(GIVEN, settings.start)] if settings.start is not None else guides(problem, settings.starts)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-        first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
+        first = resolve(starts[0][1], problem).penalised(problem, settings.penalty)
         check_functions(problem, start, first.offset[0].copy())
         runs = [
             SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
-            for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
+            for guess in (first, *(resolve(choice, problem) for _, choice in starts[1:]))
         ]
     is_plan = settings.start is not None and first.prior is None and first.found is None
-    kept = runs[0].given() if is_plan else None
-    search = Search([name for name, _ in given], runs, callback, threads, kept, trees=trees)
+    given_plan = runs[0].given() if is_plan else None
+    search = Search([name for name, _ in starts], runs, callback, threads, given_plan, trees=trees)
     with stop.reporting("smooth", attentive):
         search.attempt(ATTEMPTS)
     solution = search.solution()
@@ -151,9 +151,9 @@ def solve(
     refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
     if before:
         solution = replace(solution, iterations=(*before, *solution.iterations))
-    settled = solution.status is Status.COST_CONVERGED and solution.violation <= asked.violation_tolerance(problem)
-    if refined is not None or (settings is not asked and solution.success and not settled and not stop.due):
-        before, again = solution.iterations, replace(asked, start=solution, starts=None)
+    settled = solution.status is Status.COST_CONVERGED and solution.violation <= original.violation_tolerance(problem)
+    if refined is not None or (settings is not original and solution.success and not settled and not stop.due):
+        before, again = solution.iterations, replace(original, start=solution, starts=None)
         solution = solve(
             refined or problem, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
             refinements=refinements - 1,
@@ -173,11 +173,11 @@ def outlined(
     rough = settings
     if settings.second_order(problem):
         tolerance, missed = settings.final(problem), settings.violation_tolerance(problem)
-        missed = max(missed, min(one._rough for one in problem.constraints))
+        missed = max(missed, min(constraint._rough for constraint in problem.constraints))
         rough = replace(settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=missed)
     if settings.start is not None:
         return problem, rough, ()
-    free = problem.with_constraints([one for one in problem.constraints if not one._rough])
+    free = problem.with_constraints([constraint for constraint in problem.constraints if not constraint._rough])
     with stop.not_counting():  # compiling
         guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop, attentive=attentive)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
@@ -200,38 +200,38 @@ def finish(run: SolveRun, known: Known) -> RunResult:
         return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
-    found = by_multipliers(run)
+    result = by_multipliers(run)
     # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
-    if found.stuck and not known.evidence:
-        known.evidence.append(Evidence(found, found.violation))
-    return found
+    if result.stuck and not known.evidence:
+        known.evidence.append(Evidence(result, result.violation))
+    return result
 
 
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known, stay=True).climb()
-    found = damped_from_rollout(run)
-    if not found.stuck:
-        return found
-    known.evidence.append(one := Evidence(found, found.violation))
-    return replace(found, status=Status.INFEASIBLE) if one in alike(known.evidence) else found
+    result = damped_from_rollout(run)
+    if not result.stuck:
+        return result
+    known.evidence.append(new_evidence := Evidence(result, result.violation))
+    return replace(result, status=Status.INFEASIBLE) if new_evidence in alike(known.evidence) else result
 
 
 def from_states(run: SolveRun, known: Known) -> RunResult:
     """The certified result of the interior point from the trajectory of a start, whatever its rollout does."""
     assert run.initial_guess.trajectory is not None
     point = InteriorRun(run)
-    found = point.solve(copied(run.initial_guess.trajectory), MUCH)
-    return run.certified(point.start() if found is None else found)
+    result = point.solve(copied(run.initial_guess.trajectory), MUCH)
+    return run.certified(point.start() if result is None else result)
 
 
 def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
     """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
     point = InteriorRun(run)
     if run.problem.constraints:
-        found = point.solve(copied(plan), LITTLE)
-        return None if found is None or not found.success else run.certified(found)
+        result = point.solve(copied(plan), LITTLE)
+        return None if result is None or not result.success else run.certified(result)
     law = compiled.law_about(plan.states, plan.controls, saddle.law[0])
     beside = point.result(*compiled.rollout(run.problem, *law, plan.states[0].copy()))
     if not beside.cost < saddle.cost:
@@ -250,21 +250,21 @@ def _without_constraints(run: SolveRun) -> RunResult:
     controls = run.work.best.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        found = InteriorRun(run).instead(run.work.best)
-        if found is not None:
-            return found
-    found = run.solve()
-    if found.success or budget.stop.due or budget.left < 2:
-        return found
-    found, point = found.kept(), InteriorRun(run)
-    other = point.solve(copied(run.work.best if np.isfinite(found.cost) else point.start()), MUCH)
-    if other is None or other.success or not other.cost < found.cost:
-        return other if other is not None and other.success else found
+        result = InteriorRun(run).instead(run.work.best)
+        if result is not None:
+            return result
+    result = run.solve()
+    if result.success or budget.stop.due or budget.left < 2:
+        return result
+    result, point = result.kept(), InteriorRun(run)
+    other = point.solve(copied(run.work.best if np.isfinite(result.cost) else point.start()), MUCH)
+    if other is None or other.success or not other.cost < result.cost:
+        return other if other is not None and other.success else result
     other = other.kept()
     if budget.over:
-        return replace(other, status=found.status, detail=found.detail)
+        return replace(other, status=result.status, detail=result.detail)
     run.work.take(*other.plan, other.cost)
-    return run.newton(detail=found.detail, patient=True)
+    return run.newton(detail=result.detail, patient=True)
 
 
 class Search:
@@ -304,11 +304,11 @@ class Search:
 
     def attempt(self, attempts: "Sequence[Attempt]") -> None:
         """Make these attempts in turn, as far as they are called for."""
-        for one in attempts:
-            if one.when(self):
-                threads = contextlib.nullcontext() if one.others else self._problem.dynamics.solving(self._solving)
+        for attempt in attempts:
+            if attempt.when(self):
+                threads = contextlib.nullcontext() if attempt.others else self._problem.dynamics.solving(self._solving)
                 with threads:
-                    one.make(self)
+                    attempt.make(self)
 
     def run(self) -> None:
         """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
@@ -356,8 +356,8 @@ class Search:
     @property
     def is_lost(self) -> bool:
         """Whether the states leave their domain."""
-        found = self.best[1]
-        lost = not np.isfinite(found.cost) and found.status is not Status.RISK_TOO_HIGH
+        best = self.best[1]
+        lost = not np.isfinite(best.cost) and best.status is not Status.RISK_TOO_HIGH
         return lost and self._problem.start is not None and not self._budget.stop.due
 
     def try_finite(self) -> None:
@@ -371,7 +371,7 @@ class Search:
             plans.append(
                 (missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control)
             )
-        plans = [one for one in plans if np.isfinite(one[:2]).all()]
+        plans = [entry for entry in plans if np.isfinite(entry[:2]).all()]
         for _, _, control in sorted(plans, key=lambda one: one[:2])[:CONSTANT]:
             run = self._add(
                 resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}"
@@ -402,10 +402,10 @@ class Search:
         if self._budget.stop.due:
             return
         run = self._add(policy_of(boldest, f"a plan for {times:g} times the weight of obstacles and goal"))
-        found, best = self._finish(run, refine), self.best[1]
+        result, best = self._finish(run, refine), self.best[1]
         # The same optimum, different within the tolerances, is no improvement.
-        lower = not best.success or found.cost < best.cost - 1e-3 * abs(best.cost)
-        self._offer(run, found, better=found.rank < best.rank and lower)
+        lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
+        self._offer(run, result, better=result.rank < best.rank and lower)
 
     def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
@@ -418,11 +418,11 @@ class Search:
             self._follow_ways()
         motions = dict[str, StartLike](self._motions()) if exact and not self.best[1].success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
-        for name, one in (motions | sways).items():
+        for name, start in (motions | sways).items():
             if self._budget.stop.due or self.best[1].success:
                 return
             self._known.from_start = False
-            run = self._add(resolve(one, problem), name)
+            run = self._add(resolve(start, problem), name)
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._offer(run, self._finish(run, finish if exact and name in sways else refine))
@@ -448,17 +448,19 @@ class Search:
         A manoeuvre, such as to drive on and back, is found more often where nothing is in the way of its first plans.
         """
         problem = self._problem
-        kept = [one for one, passed in zip(problem.constraints, passable(problem), strict=True) if not passed]
-        free = problem.with_constraints(kept)
-        given = guides(free, None)
+        constraints = [
+            constraint for constraint, passed in zip(problem.constraints, passable(problem), strict=True) if not passed
+        ]
+        free = problem.with_constraints(constraints)
+        starts = guides(free, None)
         search = Search(
-            [name for name, _ in given], [self._another(resolve(one, free), free) for _, one in given],
+            [name for name, _ in starts], [self._another(resolve(start, free), free) for _, start in starts],
             self._callback, self._threads,
         )  # fmt: skip
         search.attempt(FIRST)
-        found = search.best[1]
-        if found.success and not self._budget.stop.due:
-            run = self._add(policy_of(found, "a plan without what is in the way"))
+        best = search.best[1]
+        if best.success and not self._budget.stop.due:
+            run = self._add(policy_of(best, "a plan without what is in the way"))
             self._known.from_start = False
             self._offer(run, self._finish(run, refine))
 
@@ -479,7 +481,7 @@ class Search:
     def _motions(self) -> list[tuple[str, Trajectory]]:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
         problem, cost = self._problem, self.best[1].cost
-        found = list[tuple[float, str, Trajectory]]()
+        motions = list[tuple[float, str, Trajectory]]()
         for name, prior in along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
             if self._budget.stop.due:
                 break
@@ -489,8 +491,8 @@ class Search:
             states, controls = (part.copy() for part in run.work.arrays.last)
             if np.isfinite(states).all():
                 missed = run.work.violation(run.work.constraint_values(states, controls))
-                found.append((missed, name, Trajectory(states, controls, problem.dt)))
-        return [(name, motion) for _, name, motion in sorted(found, key=lambda one: one[0])]
+                motions.append((missed, name, Trajectory(states, controls, problem.dt)))
+        return [(name, motion) for _, name, motion in sorted(motions, key=lambda one: one[0])]
 
     def _steered(self) -> list[int]:
         """The states that place the robot: its position, or else states on which constraints to be passed depend."""
@@ -511,9 +513,9 @@ class Search:
         runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
         chosen = choose(runs, self._threads)[0]
         self._named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
-        found, best = self._finish(chosen, known=Known()), self.best[1]
+        result, best = self._finish(chosen, known=Known()), self.best[1]
         # Even a plan that has not converged is better than doing nothing.
-        self._offer(chosen, found, better=found.violation <= best.violation and found.cost < best.cost)
+        self._offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._budget.stop.due
 
     @property
@@ -522,14 +524,14 @@ class Search:
         if self._settings.start is not None or not self.best[0].second_order or pull(self._problem) > 0:
             return False
         touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
-        return any(one.values.any() for one in touched)
+        return any(multipliers.values.any() for multipliers in touched)
 
     def look_aside(self) -> None:
         """Finish plans from paths to the left and to the right."""
         problem, tried = self._problem, {name for name, _ in self._named}
-        for name, one in detours(problem, self._settings.starts).items():
+        for name, trajectory in detours(problem, self._settings.starts).items():
             if name not in tried and not self._budget.stop.due:
-                run = self._add(resolve(one, problem), name)
+                run = self._add(resolve(trajectory, problem), name)
                 self._offer(run, self._finish(run))
 
     @property
@@ -543,11 +545,11 @@ class Search:
         for _ in range(SADDLES):
             if not self.is_at_saddle:
                 return
-            run, found = self.best
-            if not self._descend(run, found):
+            run, best = self.best
+            if not self._descend(run, best):
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
-                self._finished[0] = run, replace(found, status=status, detail=detail)
+                self._finished[0] = run, replace(best, status=status, detail=detail)
                 return
 
     def _descend(self, run: SolveRun, found: RunResult) -> bool:
@@ -555,20 +557,20 @@ class Search:
         bend = run.bend(found)
         if bend.direction is None:
             return False
-        kept, direction = found.kept(), bend.direction
+        saddle, direction = found.kept(), bend.direction
         for far, sign in itertools.product(AWAY, (1, -1)):
             moved = Trajectory(
-                kept.states + sign * far * direction.states, kept.controls + sign * far * direction.controls,
+                saddle.states + sign * far * direction.states, saddle.controls + sign * far * direction.controls,
                 self._problem.dt,
             )  # fmt: skip
-            one = self._another(InitialGuess(kept.law[0].copy(), kept.law[1].copy(), "a saddle"))
-            one.budget.report_to(self._callback)
-            result = from_beside(one, moved, kept)
+            run_beside = self._another(InitialGuess(saddle.law[0].copy(), saddle.law[1].copy(), "a saddle"))
+            run_beside.budget.report_to(self._callback)
+            result = from_beside(run_beside, moved, saddle)
             if self._budget.stop.due:
                 break
-            if result is not None and result.success and result.cost < kept.cost - FELL_FROM * abs(kept.cost):
-                self._named.append(("beside a saddle", one))
-                self._offer(one, result, better=True)
+            if result is not None and result.success and result.cost < saddle.cost - FELL_FROM * abs(saddle.cost):
+                self._named.append(("beside a saddle", run_beside))
+                self._offer(run_beside, result, better=True)
                 return True
         return False
 
@@ -579,27 +581,27 @@ class Search:
 
     def move(self) -> None:
         """Begin with motions that change these states: pushes by one control at a time, and approaches to a body."""
-        problem, found, places = self._problem, self.best[1], self._unmoved()
-        self._still = found, places
+        problem, before, places = self._problem, self.best[1], self._unmoved()
+        self._still = before, places
         plans = list[tuple[bool, float, str, InitialGuess]]()
 
         def consider(name: str, begin: InitialGuess, plan: Motion) -> bool:
             """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
             cost = float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0])
-            if not (np.isfinite(cost) and reach.differ(plan, found, places)):
+            if not (np.isfinite(cost) and reach.differ(plan, before, places)):
                 return False
             nearer = self._moves(plan)
             plans.append((not nearer, cost, name, begin))
-            return nearer and cost < SAVES * found.cost
+            return nearer and cost < SAVES * before.cost
 
         for name, controls, plan in pushes(problem):
             consider(name, resolve(controls, problem), plan)
-        for name, through in reach.approaches(problem, found, places):
+        for name, through in reach.approaches(problem, before, places):
             if self._budget.stop.due:
                 break
             drawn = self._solve_through(through)
             self._approached.append(name)
-            plan = Motion(*compiled.rollout(problem, *drawn.law, found.states[0].copy()))
+            plan = Motion(*compiled.rollout(problem, *drawn.law, before.states[0].copy()))
             if consider(name, policy_of(drawn, name), plan):
                 break
         plans.sort(key=lambda one: one[:2])
@@ -611,7 +613,7 @@ class Search:
             if run.is_worse(other, begun):  # a plan that no step can begin from is left by smoothing
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
-            self._offer(run, other, better=found.violation >= other.violation and other.cost < self.best[1].cost)
+            self._offer(run, other, better=before.violation >= other.violation and other.cost < self.best[1].cost)
             if self._moves(other) and (self._moved is None or other.cost < self._moved[1].cost):
                 self._moved = name, other
 
@@ -637,36 +639,36 @@ class Search:
 
     def _unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""
-        found, allowed = self.best[1], self._settings.violation_tolerance(self._problem)
-        if not np.isfinite(found.cost):
+        best, allowed = self.best[1], self._settings.violation_tolerance(self._problem)
+        if not np.isfinite(best.cost):
             return []
-        if self._looked[0] is not found:
-            places = reach.unmoved(self._problem, found.states, found.controls, found.cost, allowed)
-            self._looked = found, places
+        if self._looked[0] is not best:
+            places = reach.unmoved(self._problem, best.states, best.controls, best.cost, allowed)
+            self._looked = best, places
         return self._looked[1]
 
     @property
     def has_left_given(self) -> bool:
         """Whether the best plan is worse than the plan that the caller gave, or has left what that moved."""
-        (run, found), given = self.best, self._given
+        (run, best), given = self.best, self._given
         return given is not None and (
-            reach.differ(found, given, self._unmoved())
-            or run.is_worse(found, given)
-            or reach.goal_left(self._problem, found, given)
+            reach.differ(best, given, self._unmoved())
+            or run.is_worse(best, given)
+            or reach.goal_left(self._problem, best, given)
         )
 
     def keep(self) -> None:
         """Descend from the plan that the caller gave; return it, if none is better."""
-        (run, found), given = self.best, self._given
+        (run, best), given = self.best, self._given
         assert given is not None
-        still = reach.differ(found, given, self._unmoved())
+        still = reach.differ(best, given, self._unmoved())
         if not self._budget.stop.due:
             run = self._add(policy_of(given, "descent from the given plan"))
             other = self._finish(run, refine)
-            wanted = run.is_worse(found, given) or (still and other.cost < found.cost) or other.rank < found.rank
+            wanted = run.is_worse(best, given) or (still and other.cost < best.cost) or other.rank < best.rank
             self._offer(run, other, better=wanted and not run.is_worse(other, given))
-        run, found = self.best
-        if run.is_worse(found, given):
+        run, best = self.best
+        if run.is_worse(best, given):
             status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
             detail = "no plan was found that is better than the given one, which is returned"
             self._offer(run, replace(given, status=status, detail=detail), better=True)
@@ -681,11 +683,13 @@ class Search:
         """Solve without risk, and continue from that plan."""
         riskless = dataclasses.replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-        found = finish(choose(runs, self._threads)[0], Known())
-        if not found.success or self._budget.stop.due:
+        riskless_plan = finish(choose(runs, self._threads)[0], Known())
+        if not riskless_plan.success or self._budget.stop.due:
             return
-        begin = policy_of(found, "a plan without risk")
-        run = self._add(replace(begin, cost_to_go=found.values["cost_to_go"], multipliers=found.multipliers))
+        begin = policy_of(riskless_plan, "a plan without risk")
+        run = self._add(
+            replace(begin, cost_to_go=riskless_plan.values["cost_to_go"], multipliers=riskless_plan.multipliers)
+        )
         result = self._finish(run)
         # Of plans whose risk is too high, this one is near an optimum.
         self._offer(run, result, better=result.rank <= self.best[1].rank)
@@ -712,12 +716,12 @@ class Search:
             self._stiffen({f", {moved[0]}": begin}, harder, [], self._budget.left)
             if self.best[1].success or self._budget.stop.due:
                 return
-        found = {"": self._keep_softer(name, *self._search_softly(widest))}
+        results = {"": self._keep_softer(name, *self._search_softly(widest))}
         for cycles, side in itertools.product(SWAYS, (1, -1)):
             if not self._budget.stop.due:
                 begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
-                found[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
-        self._stiffen(found, harder, [name], self._budget.left)
+                results[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
+        self._stiffen(results, harder, [name], self._budget.left)
 
     def alternate(self) -> None:
         """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
@@ -730,7 +734,7 @@ class Search:
             before = self._cheapest
             again = self._stiffen({", again": before}, last, [], SOFT) if last else None
             begin = min(
-                (one for one in (before, again) if one is not None and one is not optimum),
+                (candidate for candidate in (before, again) if candidate is not None and candidate is not optimum),
                 key=lambda one: one.cost, default=before,
             )  # fmt: skip
             if begin is optimum or self._budget.stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
@@ -746,7 +750,7 @@ class Search:
         """The cheapest plan, whether it has converged or not; with constraints, the best."""
         if self._problem.constraints:
             return self.best[1]
-        finite = [found for _, found in self._finished if np.isfinite(found.cost)]
+        finite = [result for _, result in self._finished if np.isfinite(result.cost)]
         return min(finite, key=lambda found: found.cost, default=self.best[1])
 
     def _stiffen(
@@ -764,9 +768,9 @@ class Search:
         for name, problem in soft:
             most_soft = LOOK if len(found) > 1 else SOFT
             found = {
-                origin: self._solve_softly(f"{name}{origin}", problem, policy_of(one, name), most_soft)
-                for origin, one in found.items()
-                if np.isfinite(one.cost)
+                origin: self._solve_softly(f"{name}{origin}", problem, policy_of(result, name), most_soft)
+                for origin, result in found.items()
+                if np.isfinite(result.cost)
             } or found
             if self._budget.stop.due:
                 return None
@@ -789,9 +793,9 @@ class Search:
 
     def _search_softly(self, soft: Problem) -> tuple[SolveRun, RunResult]:
         """Plan for softer contacts by a search."""
-        given = guides(soft, None)
-        runs = [self._another(resolve(one, soft), soft) for _, one in given]
-        search = Search([name for name, _ in given], runs, self._callback, self._threads)
+        starts = guides(soft, None)
+        runs = [self._another(resolve(start, soft), soft) for _, start in starts]
+        search = Search([name for name, _ in starts], runs, self._callback, self._threads)
         search.attempt(FIRST)
         return search.best
 
@@ -810,36 +814,36 @@ class Search:
 
         run = self._another(policy_of(plan, "the best plan"))
         run.budget.report_to(self._callback)
-        found = None
+        result = None
         # A cost that is not curved in all controls has no descent of this kind.
         with self._problem.dynamics.solving(self._threads), contextlib.suppress(np.linalg.LinAlgError):
-            found = keep_modes(run, plan)
-        if found is None:
+            result = keep_modes(run, plan)
+        if result is None:
             return False
         self._named.append(("the best plan, within its contact modes", run))
-        detail = "; ".join(part for part in (plan.detail.partition("; ")[0], found.detail) if part)
-        self._offer(run, replace(found, detail=detail), better=found.rank <= self.best[1].rank)
+        detail = "; ".join(part for part in (plan.detail.partition("; ")[0], result.detail) if part)
+        self._offer(run, replace(result, detail=detail), better=result.rank <= self.best[1].rank)
         return True
 
     def solution(self) -> Solution:
         """The best result as a Solution."""
-        chosen, found = self.best
+        chosen, result = self.best
         problem, settings, stop = self._problem, self._settings, self._budget.stop
-        if not np.isfinite(found.states).all() and not found.success:
-            found = replace(found, status=Status.NOT_FINITE, detail=left_domain(problem, found))
-        elif found.status is Status.INFEASIBLE and not self.tried and stop.error is None:
+        if not np.isfinite(result.states).all() and not result.success:
+            result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
+        elif result.status is Status.INFEASIBLE and not self.tried and stop.error is None:
             untried = "no time was left for other starts, which may keep the constraints"
-            found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
-        elif self._cut_short and np.isfinite(found.cost):
+            result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}")
+        elif self._cut_short and np.isfinite(result.cost):
             untried = "no time was left for further attempts, which may find a better plan"
-            found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
-        elif not stop.due or (self._still is not None and not self._moves(found)):
-            found = self._told_of_unmoved(found)
-        detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
+            result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}".removeprefix("; "))
+        elif not stop.due or (self._still is not None and not self._moves(result)):
+            result = self._told_of_unmoved(result)
+        detail = name_risk(chosen, result) if result.status is Status.RISK_TOO_HIGH else result.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
         begun = self._named[0][1] if settings.start is not None else chosen
         return assemble(
-            problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
+            problem, replace(result, detail=detail), chosen.budget.log, solver="smooth",
             options=settings.options(begun.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
 
@@ -856,8 +860,8 @@ class Search:
         if self._nearer is not None:
             remedy = f"raise the weight of {names} until moving it costs less than leaving it"
         elif otherwise:
-            what = "with which the robot touches that body" if problem.dynamics.by_mujoco else f"that change {names}"
-            remedy = f"begin with start=[...], controls {what}"
+            clause = "with which the robot touches that body" if problem.dynamics.by_mujoco else f"that change {names}"
+            remedy = f"begin with start=[...], controls {clause}"
         if self._budget.stop.due:
             status, remedy = Status.TIME_LIMIT, ""
         return replace(found, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
@@ -878,7 +882,7 @@ class Search:
         """All runs as candidates; none if there was one run."""
         if len(self._named) == 1:
             return ()
-        results = {id(run): found for run, found in self._finished}
+        results = {id(run): result for run, result in self._finished}
         return (*(run.candidate(name, results.get(id(run))) for name, run in self._named), *self._softer)
 
     # Helper methods of the steps above.
@@ -951,26 +955,26 @@ class Search:
         space = problem.dynamics.state_coordinates
         if not self.is_guided or problem.goal is None:
             return self.is_without_plan or self._idle()
-        (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
-        if not found.success:
+        (run, best), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+        if not best.success:
             return run.budget.left > 0
         if space.position:
             place = list(space.position)
-            arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
+            arrived = np.linalg.norm(best.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
         else:
-            target = Target(space, problem.weighed_goal, found.states)
-            arrived = target.distance(found.states[-1]) <= TOLERANCE
+            target = Target(space, problem.weighed_goal, best.states)
+            arrived = target.distance(best.states[-1]) <= TOLERANCE
         if not arrived:
             return True
-        clearance = clearance_of(problem, found.states)
+        clearance = clearance_of(problem, best.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius
 
     def _idle(self) -> bool:
         """Whether the best plan does nothing, as when no single control helps from rest, but several together would."""
-        (run, found), nominal = self.best, self._problem.nominal_controls
-        off = np.abs(found.controls - nominal).max()
-        costs = found.cost > run.work.memory["negligible"]
-        return found.success and costs and off <= IDLE * max(1.0, np.abs(nominal).max())
+        (run, best), nominal = self.best, self._problem.nominal_controls
+        off = np.abs(best.controls - nominal).max()
+        costs = best.cost > run.work.memory["negligible"]
+        return best.success and costs and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
     def is_without_plan(self) -> bool:

@@ -88,7 +88,9 @@ def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Sto
     start, goal = ends
     planner, draws = LocalPlanner(problem, start, goal, LONGEST[seed % len(LONGEST)]), np.random.default_rng(seed)
     turn = np.zeros(len(goal))
-    turn[list({i for one in problem.constraints for i in one._turning_states(problem.dynamics)})] = 2 * np.pi
+    turn[list({i for constraint in problem.constraints for i in constraint._turning_states(problem.dynamics)})] = (
+        2 * np.pi
+    )
     goals = np.unique([goal, goal + turn, goal - turn], axis=0)
     trees = Tree(planner, start[None], 1, extensions), Tree(planner, goals, -1, extensions)
     for count in range(0, extensions, 2):
@@ -148,10 +150,14 @@ class LocalPlanner:
         space, controls, n = problem.dynamics.state_coordinates, problem.control_coordinates, len(start)
         self.arrivals = np.unique(np.ceil(np.linspace(0, min(longest, problem.steps), ARRIVALS + 1)[1:]).astype(int))
         self.controls = len(controls)
-        kept = zip(problem.constraints, problem.constraint_terms, strict=True)
-        still = [one for one, term in kept if not (term.final_only or term.uses_control or term.equality)]
+        pairs = zip(problem.constraints, problem.constraint_terms, strict=True)
+        still = [
+            constraint for constraint, term in pairs if not (term.final_only or term.uses_control or term.equality)
+        ]
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
-        for i, (least, most) in (pair for one in still for pair in one.state_bounds(problem.dynamics).items()):
+        for i, (least, most) in (
+            pair for constraint in still for pair in constraint.state_bounds(problem.dynamics).items()
+        ):
             low[i], high[i] = max(low[i], np.max(least)), min(high[i], np.min(most))
         half = (np.array(controls.high) - controls.low) / 2
         effort = ControlCost(1 / np.where(np.isfinite(half), half, 1.0) ** 2, about=problem.nominal_control)
@@ -269,8 +275,8 @@ class Tree:
         free = self._planner.free_until(plan.states) if len(plan.states) else 0
         if free <= steps:
             free = int(np.ceil(HELD_BACK * free))
-        kept = Motion(plan.states[:free], plan.controls[: max(free - 1, 0)])
-        if free < 2 or not self._add(kept.states[-1], int(node), kept):
+        free_plan = Motion(plan.states[:free], plan.controls[: max(free - 1, 0)])
+        if free < 2 or not self._add(free_plan.states[-1], int(node), free_plan):
             self._worn[node] += WORN
             return None
         return len(self._from) - 1
@@ -286,8 +292,8 @@ class Tree:
         if reach is None or count == len(self._states):
             return False
         self._states[count] = state
-        for part, own in zip(self._reach, reach, strict=True):
-            part[count] = own
+        for part, numbers in zip(self._reach, reach, strict=True):
+            part[count] = numbers
         self._from.append((origin, plan))
         return True
 
@@ -297,10 +303,10 @@ def _joined(forwards: list[Motion], backwards: list[Motion], dt: float) -> Traje
 
     Where they meet, the state is that of the other tree.
     """
-    plans = [*forwards[::-1], *(Motion(one.states[::-1], one.controls[::-1]) for one in backwards)]
-    states = [one.states[:-1] for one in plans[:-1]]
+    plans = [*forwards[::-1], *(Motion(plan.states[::-1], plan.controls[::-1]) for plan in backwards)]
+    states = [plan.states[:-1] for plan in plans[:-1]]
     return Trajectory(
         in_c_order(np.concatenate([*states, plans[-1].states[-1:]])),
-        np.concatenate([one.controls for one in plans]),
+        np.concatenate([plan.controls for plan in plans]),
         dt,
     )

@@ -77,8 +77,8 @@ def ways(problem: Problem, stages: Stages) -> Iterator[Way]:
     share = np.linspace(0, 1, problem.steps + 1)[:, None]
     headings = _headings(problem)
     turned = {name: share * turns for name, turns in _whole_turns(problem, headings, goal)}
-    found = _paths(problem, stages, headings, start, goal) if len(space.position) in CELLS else ()
-    for route, (path, backwards) in enumerate(found, start=1):
+    paths = _paths(problem, stages, headings, start, goal) if len(space.position) in CELLS else ()
+    for route, (path, backwards) in enumerate(paths, start=1):
         name, states = f"path {route} round obstacles", line.copy()
         states[:, list(space.position)] = drawn = _drawn(path, problem.steps)
         if not headings.angles:
@@ -100,13 +100,13 @@ def _whole_turns(problem: Problem, headings: Headings, goal: Array) -> Iterator[
     Headings turn together.
     """
     dynamics, names = problem.dynamics, problem.dynamics.state_coordinates.names
-    free = sorted({i for one in problem.constraints for i in one._turning_states(dynamics)})
-    bounds = [one.state_bounds(dynamics) for one in problem.constraints]
+    free = sorted({i for constraint in problem.constraints for i in constraint._turning_states(dynamics)})
+    bounds = [constraint.state_bounds(dynamics) for constraint in problem.constraints]
     groups = [free] if headings.angles else [*([i] for i in free), *([free] if len(free) > 1 else [])]
     for group, (word, turn) in itertools.product(groups, (("more", 2 * np.pi), ("less", -2 * np.pi))):
         turns = np.zeros(len(goal))
         turns[group] = turn
-        sides = [(goal[i] + turn, *one[i]) for one in bounds for i in group if i in one]
+        sides = [(goal[i] + turn, *limits[i]) for limits in bounds for i in group if i in limits]
         if group and all(np.min(low) <= at <= np.max(high) for at, low, high in sides):
             yield f"a turn {word} of {' and '.join(names[i] for i in group)}", turns
 
@@ -125,7 +125,7 @@ def _other_axes(problem: Problem, line: Array) -> Iterator[Way]:
 
 def _rates(problem: Problem) -> list[tuple[int, int]]:
     """States and the states that are their rates, at the start or at the goal."""
-    dynamics, found = problem.dynamics, set[tuple[int, int]]()
+    dynamics, pairs = problem.dynamics, set[tuple[int, int]]()
     h = problem.dt if dynamics.discrete or dynamics.by_mujoco else SHORT * problem.dt
     units = dynamics.state_coordinates.units
     for state in (problem.start, problem.goal):
@@ -134,8 +134,8 @@ def _rates(problem: Problem) -> list[tuple[int, int]]:
         slopes = (dynamics.linearize(state, problem.nominal_control, h)[0] - np.eye(len(state))) / h
         for i, j in np.argwhere(np.abs(slopes - 1) < RATE).tolist():
             if i != j and units[j] == (f"{units[i]}/s" if units[i] else ""):
-                found.add((i, j))
-    return sorted(found)
+                pairs.add((i, j))
+    return sorted(pairs)
 
 
 def _headings(problem: Problem) -> Headings:
@@ -154,11 +154,11 @@ def _headings(problem: Problem) -> Headings:
         state[place], state[angles] = start[place], 0.0
         turned = state.copy()
         turned[angles] += TURNED
-        here, there = (dynamics.step(one, control, h) - one for one in (state, turned))
-        here[place] = c * here[place[0]] - s * here[place[1]], s * here[place[0]] + c * here[place[1]]
-        if not np.abs(here - there).max() <= SAME * np.abs(here).max():
+        motion, turned_motion = (dynamics.step(begin, control, h) - begin for begin in (state, turned))
+        motion[place] = c * motion[place[0]] - s * motion[place[1]], s * motion[place[0]] + c * motion[place[1]]
+        if not np.abs(motion - turned_motion).max() <= SAME * np.abs(motion).max():
             return Headings([], 0.0)
-        directions.append(there[place])
+        directions.append(turned_motion[place])
     _, sizes, axes = np.linalg.svd(np.array(directions))
     if not sizes[1] <= SIDEWAYS * sizes[0]:
         return Headings([], 0.0)
@@ -196,12 +196,12 @@ class Grid:
             if not any(move):
                 continue
             here = tuple(slice(max(-m, 0), n - max(m, 0)) for m, n in zip(move, self.shape, strict=True))
-            there = tuple(slice(max(m, 0), n - max(-m, 0)) for m, n in zip(move, self.shape, strict=True))
+            neighbour = tuple(slice(max(m, 0), n - max(-m, 0)) for m, n in zip(move, self.shape, strict=True))
             fits = free.along(np.array(move)).reshape(self.shape)
-            both = fits[here] & fits[there]
+            both = fits[here] & fits[neighbour]
             rows.append(index[here][both])
-            columns.append(index[there][both])
-            weights.append(np.linalg.norm(move) * (length[here][both] + length[there][both]) / 2)
+            columns.append(index[neighbour][both])
+            weights.append(np.linalg.norm(move) * (length[here][both] + length[neighbour][both]) / 2)
         graph = coo_array((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), (index.size,) * 2)
         first, last = index[self.nearest(np.array([begin, end]))].tolist()
         far, before = dijkstra(graph.tocsr(), indices=first, return_predecessors=True)
@@ -214,13 +214,13 @@ class Grid:
 
     def cut(self, points: Array, free: "Fits") -> Array:
         """A path without the corners that can be cut."""
-        kept, i = [0], 0
+        corners, i = [0], 0
         while i < len(points) - 1:
             j = len(points) - 1
             while j > i + 1 and not self._clear(points[i], points[j], free):
                 j -= 1
-            kept.append(i := j)
-        return points[kept]
+            corners.append(i := j)
+        return points[corners]
 
     def _clear(self, begin: Array, end: Array, free: "Fits") -> bool:
         between = np.linspace(begin, end, 2 + int(2 * np.linalg.norm(end - begin) / self.cell))
@@ -257,18 +257,18 @@ def _paths(
         return
     low, high = _extent(problem, begin, end)
     grid = Grid(low, high, (high - low).max() / CELLS[len(place)])
-    each = _fits(stages, headings, np.array([start, goal]), grid.points)
+    fits = _fits(stages, headings, np.array([start, goal]), grid.points)
     for at in (begin, end):
-        each |= np.abs(grid.points - at).max(axis=1) <= NEAR * grid.cell
-    away, roomy = float(np.linalg.norm(end - begin)), np.array([each.all(axis=0)])
+        fits |= np.abs(grid.points - at).max(axis=1) <= NEAR * grid.cell
+    away, roomy = float(np.linalg.norm(end - begin)), np.array([fits.all(axis=0)])
     straight = [] if headings.angles else [np.linspace(begin, end, DENSE)]
     for backwards in (False, True) if headings.angles else (False,):
         known = straight.copy()
-        narrow = [Fits(each, True, backwards)] if headings.angles else []
-        for free in (Fits(roomy, False), *narrow, Fits(each, False)):
+        narrow = [Fits(fits, True, backwards)] if headings.angles else []
+        for free in (Fits(roomy, False), *narrow, Fits(fits, False)):
             for path in _routes(grid, begin, end, free, BESIDE * away):
                 dense = _drawn(path, DENSE)
-                if all(_apart(dense, one) > BESIDE * away for one in known):
+                if all(_apart(dense, other) > BESIDE * away for other in known):
                     known.append(dense)
                     yield path, backwards
 
@@ -294,15 +294,15 @@ def _extent(problem: Problem, begin: Array, end: Array) -> tuple[Array, Array]:
     """The corners of the region for paths: the bounds of the position, or a margin round all that is known."""
     dynamics, space = problem.dynamics, problem.dynamics.state_coordinates
     place, known = list(space.position), [begin, end]
-    for obstacle in (one for kept in problem.kept_clear for one in kept.world.obstacles):
+    for obstacle in (obstacle for term in problem.kept_clear for obstacle in term.world.obstacles):
         at = obstacle.position[["xyz".index(axis) for axis in space.plane]]
         reach = np.max(obstacle.size, where=np.isfinite(obstacle.size), initial=0.0)
         known += [at - reach, at + reach]
     low, high = np.min(known, axis=0), np.max(known, axis=0)
     margin = AROUND * (high - low).max()
     low, high = low - margin, high + margin
-    for one in problem.constraints:
-        for i, (least, most) in one.state_bounds(dynamics).items():
+    for constraint in problem.constraints:
+        for i, (least, most) in constraint.state_bounds(dynamics).items():
             if i in place and np.isfinite(np.min(least)) and np.isfinite(np.max(most)):
                 low[place.index(i)], high[place.index(i)] = np.min(least), np.max(most)
     return low, high
