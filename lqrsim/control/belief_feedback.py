@@ -49,16 +49,16 @@ class BeliefFeedback(Controller):
     @property
     def plan(self) -> Solution:
         """The plan of the mean. Its policy has the gains on the mean, and the covariance of the plan."""
-        n, own, policy = self.belief.size, self.solution, self.solution.policy
+        n, solution, policy = self.belief.size, self.solution, self.solution.policy
         known = np.vecdot(policy.gain[:, :, n:], policy.nominal[:, None, n:])
         law = AffinePolicy(
             gain=policy.gain[:, :, :n], offset=policy.offset + known, nominal=policy.nominal[:, :n], dt=policy.dt,
             state_coordinates=self.belief.robot.state_coordinates, control_coordinates=policy.control_coordinates,
         )  # fmt: skip
-        trajectory = replace(own.trajectory, states=own.trajectory.states[:, :n])
+        trajectory = replace(solution.trajectory, states=solution.trajectory.states[:, :n])
         return replace(
-            own, policy=law, trajectory=trajectory, goal=None if own.goal is None else own.goal[:n], cost_to_go=None,
-            cost_to_come=None, inverse_policy=None, candidates=(),
+            solution, policy=law, trajectory=trajectory, goal=None if solution.goal is None else solution.goal[:n],
+            cost_to_go=None, cost_to_come=None, inverse_policy=None, candidates=(),
         )  # fmt: skip
 
     @property

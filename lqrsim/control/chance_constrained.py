@@ -66,7 +66,7 @@ class SafePlan:
 
     def __post_init__(self) -> None:
         rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
-        keep(self, rounds=tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds))
+        keep(self, rounds=tuple(tuple(check_array("SafePlan: rounds", numbers, (4,)).tolist()) for numbers in rounds))
 
     @property
     def success(self) -> bool:
@@ -78,9 +78,11 @@ class SafePlan:
         """Cost of the plan with the obstacles as heavy as in the given problem, so that plans can be compared."""
         if self.weight == 1:
             return self.solution.cost
-        given, plan = _weighing(self.problem, 1 / self.weight), self.solution.trajectory
-        own, heavier = (costs_of(one, plan.states[None], plan.controls[None])[0] for one in (given, self.problem))
-        return float(self.solution.cost - (heavier - own))
+        original, plan = _weighing(self.problem, 1 / self.weight), self.solution.trajectory
+        lighter, heavier = (
+            costs_of(problem, plan.states[None], plan.controls[None])[0] for problem in (original, self.problem)
+        )
+        return float(self.solution.cost - (heavier - lighter))
 
     def __str__(self) -> str:
         lines = [f"{self.solution.summary()}", "  margin (m)       cost        chance of collision"]
@@ -94,8 +96,8 @@ class SafePlan:
                 f"  with {self.weight:g} times the weight of obstacles, without which it costs {self.cost:.6g}"
             )
         if self.instead:
-            each = ", ".join(f"{chance:.3g} with {what}" for what, chance in self.instead.items())
-            lines.append(f"  on this plan {each}")
+            chances = ", ".join(f"{chance:.3g} with {change}" for change, chance in self.instead.items())
+            lines.append(f"  on this plan {chances}")
         return "\n".join(lines)
 
 
@@ -170,9 +172,9 @@ def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float
         "no lag": (False, no_lag), "twice the range of controls": (True, {}), "exact sensors": (False, no_noise),
         "all of these": (True, no_lag | no_noise),
     }  # fmt: skip
-    found = {}
-    for what, (strong, changes) in cases.items():
-        solution, told = plan.solution, replace(uncertainty, **changes)
+    chances = {}
+    for improvement, (strong, changes) in cases.items():
+        solution, improved = plan.solution, replace(uncertainty, **changes)
         if strong:
             solution = replace(solution, policy=replace(policy, control_coordinates=wider))
         law = plan.controller
@@ -180,8 +182,8 @@ def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float
             law = OffsetFree(law.problem, solution, replace(law.uncertainty, **changes), **law.options)
         elif strong:
             law = replace(law, control_coordinates=wider)
-        found[what] = predict_tube(plan.problem, solution, told, law).collision_chance
-    return found
+        chances[improvement] = predict_tube(plan.problem, solution, improved, law).collision_chance
+    return chances
 
 
 class _Search:
@@ -212,8 +214,8 @@ class _Search:
             margin = deviations * self._spread(base).std
             if second:
                 margin = np.full_like(margin, np.sqrt((margin**2).mean()))
-            kept = self.surroundings.keep_away(margin)
-            problem = replace(problem, constraints=(*problem.constraints, *kept))
+            clearances = self.surroundings.keep_away(margin)
+            problem = replace(problem, constraints=(*problem.constraints, *clearances))
             # The first plan may cut through obstacles: a solve from it would choose the route by chance.
             start = None if second else base.solution.trajectory
         solution = smooth(problem, start=start) if start is not None else smooth(problem)

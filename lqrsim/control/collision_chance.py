@@ -42,22 +42,22 @@ class Surroundings:
     @classmethod
     def of(cls, problem: Problem, std: float) -> "Surroundings":
         """The obstacles of the problem's costs and constraints, each world once."""
-        kept, place = each_once(problem.kept_clear), problem.dynamics.state_coordinates.position
-        if any(one.moving for one in kept):
+        terms, place = each_once(problem.kept_clear), problem.dynamics.state_coordinates.position
+        if any(term.moving for term in terms):
             raise InputError(
                 "problem: got obstacles that move, want none: chances of collision are for obstacles that stand still"
             )
-        found = [(one, shape) for one in kept if len((shape := one.in_world(problem.dynamics)).world)]
-        shapes = tuple(shape for _, shape in found)
+        pairs = [(term, shape) for term in terms if len((shape := term.in_world(problem.dynamics)).world)]
+        shapes = tuple(shape for _, shape in pairs)
         moved_by = [shape.moved_by for shape in shapes]
-        position = place if set(moved_by) <= {place} else tuple(sorted({i for own in moved_by for i in own}))
-        return cls(tuple(one for one, _ in found), shapes, place, position, std)
+        position = place if set(moved_by) <= {place} else tuple(sorted({i for indices in moved_by for i in indices}))
+        return cls(tuple(term for term, _ in pairs), shapes, place, position, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:
         """Constraints that keep a margin from each obstacle, (T+1, O)."""
         ends = np.cumsum([len(shape.world) for shape in self.shapes])[:-1]
         pairs = zip(self.kept, np.split(margin, ends, axis=1), strict=True)
-        return [Clearance(one.world, **one.shape, margin=own) for one, own in pairs]
+        return [Clearance(term.world, **term.shape, margin=columns) for term, columns in pairs]
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
         """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p) and its variance (O,).
@@ -67,7 +67,7 @@ class Surroundings:
         if not self.shapes:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
         parts = [shape.with_slopes(states, self.position) for shape in self.shapes]
-        fixed = [one.kind == "plane" for shape in self.shapes for one in shape.world.obstacles]
+        fixed = [obstacle.kind == "plane" for shape in self.shapes for obstacle in shape.world.obstacles]
         return (
             np.concatenate([clearance for clearance, _ in parts], axis=1),
             np.concatenate([normals for _, normals in parts], axis=1),
@@ -77,26 +77,26 @@ class Surroundings:
     @property
     def by_mujoco(self) -> bool:
         """Whether MuJoCo computes the distances, between geoms."""
-        return any("geoms" in one.shape for one in self.kept)
+        return any("geoms" in term.shape for term in self.kept)
 
     def displacements(self, rng: np.random.Generator, trials: int) -> list[Array]:
         """Random displacements of each world's obstacles in K trials, (K, O, 3), in their plane; planes stay."""
         axes, worlds = np.arange(3) < (len(self.place) or 3), [shape.world.obstacles for shape in self.shapes]
-        std = [np.array([self.std * axes * (one.kind != "plane") for one in world]) for world in worlds]
-        return [own * rng.standard_normal((trials, *own.shape)) for own in std]
+        std = [np.array([self.std * axes * (obstacle.kind != "plane") for obstacle in world]) for world in worlds]
+        return [scale * rng.standard_normal((trials, *scale.shape)) for scale in std]
 
     def nearest(self, states: Array, displaced: list[Array]) -> Array:
         """Clearance of states (K, n) to the nearest obstacle, (K,), the obstacles of each world displaced (K, O, 3)."""
         pairs = zip(self.shapes, displaced, strict=True)
-        found = [shape.clearance(shape.places(states), away) for shape, away in pairs]
-        return np.min(found, axis=0, initial=np.inf) if found else np.full(len(states), np.inf)
+        clearances = [shape.clearance(shape.places(states), away) for shape, away in pairs]
+        return np.min(clearances, axis=0, initial=np.inf) if clearances else np.full(len(states), np.inf)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
         """Clearances at mean states (..., T+1, n); `across` (..., T, n, n) is the covariance with the previous knot."""
         place, many = list(self.position), states.shape[:-1]
         clearance, normal, displaced = self.clearances(states.reshape(-1, states.shape[-1]))
         clearance, normal = clearance.reshape(*many, -1), normal.reshape(*many, -1, len(place))
-        covariance, across = (one[..., place, :][..., place] for one in (covariance, across))
+        covariance, across = (matrix[..., place, :][..., place] for matrix in (covariance, across))
         ones = np.ones(len(place))  # a product with it is much faster than `sum` over a short axis
         variance = (normal @ covariance * normal) @ ones + displaced
         std = np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
@@ -115,16 +115,16 @@ class Surroundings:
         Args:
           states, covariance, across: as for `collision_chance`, without further axes.
         """
-        found = np.zeros_like(covariance)
+        emphasis = np.zeros_like(covariance)
         if not self.kept:
-            return found
+            return emphasis
         spread = self.spread(states, covariance, across)
         margin = spread.mean / spread.std
         slopes = beginnings(margin, spread.correlation) * margin**2 / spread.std**2
         place = np.array(self.position)
-        found[:, place[:, None], place] = np.einsum("to,toi,toj->tij", slopes, spread.normal, spread.normal)
-        largest = float(np.max(np.diagonal(found, axis1=1, axis2=2) @ (1 / weights)))
-        return found / largest if largest > 0 else found
+        emphasis[:, place[:, None], place] = np.einsum("to,toi,toj->tij", slopes, spread.normal, spread.normal)
+        largest = float(np.max(np.diagonal(emphasis, axis1=1, axis2=2) @ (1 / weights)))
+        return emphasis / largest if largest > 0 else emphasis
 
 
 def collision_chance(
@@ -148,12 +148,12 @@ def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, Arra
 
 def beginnings(margin: Array, correlation: Array) -> Array:
     """The chance that a collision with each obstacle begins at each knot, (..., T+1, O)."""
-    each, here, last = ndtr(-margin), margin[..., 1:, :], margin[..., :-1, :]
+    chance, here, last = ndtr(-margin), margin[..., 1:, :], margin[..., :-1, :]
     begins, near = np.zeros_like(margin), here < FAR
-    begins[..., 0, :] = each[..., 0, :]
+    begins[..., 0, :] = chance[..., 0, :]
     # In collision at a knot, but not at the previous knot.
     before = both_below(-here[near], -last[near], correlation[near])
-    begins[..., 1:, :][near] = np.maximum(each[..., 1:, :][near] - before, 0.0)
+    begins[..., 1:, :][near] = np.maximum(chance[..., 1:, :][near] - before, 0.0)
     return begins
 
 
@@ -161,7 +161,7 @@ def both_below(first: Array, second: Array, correlation: Array) -> Array:
     """P(a < first, b < second) of standard normal numbers with that correlation, elementwise, by Owen's T (1956)."""
     # T needs ratios to both numbers, and to the spread of one given the other; tiny numbers count as 1e-200. Beyond 40,
     # chances do not change.
-    a, b = (np.where(np.abs(one) < 1e-200, 1e-200, np.clip(one, -40.0, 40.0)) for one in (first, second))
+    a, b = (np.where(np.abs(bound) < 1e-200, 1e-200, np.clip(bound, -40.0, 40.0)) for bound in (first, second))
     spread = np.maximum(np.sqrt((1 - correlation) * (1 + correlation)), 1e-100)
     with np.errstate(over="ignore"):
         beyond = owens_t(a, (b - correlation * a) / (a * spread)) + owens_t(b, (a - correlation * b) / (b * spread))

@@ -240,11 +240,11 @@ class FunctionController(Controller, ControllerRun):
 
     def control(self, step: int, measured: Array) -> Array:
         t, controls = step * self.dt, self._coordinates[1]
-        found = [np.asarray(self.function(state.copy(), t), dtype=np.float64) for state in measured]
-        for one in found:
-            if one.shape != (len(controls),):
-                raise InputError(f"got controls of shape {one.shape}, want {(len(controls),)}")
-        return controls.clip(np.array(found))
+        commands = [np.asarray(self.function(state.copy(), t), dtype=np.float64) for state in measured]
+        for command in commands:
+            if command.shape != (len(controls),):
+                raise InputError(f"got controls of shape {command.shape}, want {(len(controls),)}")
+        return controls.clip(np.array(commands))
 
     @property
     def digest(self) -> str:

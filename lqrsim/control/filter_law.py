@@ -93,7 +93,7 @@ class FilterRun(ControllerRun):
         self._differences = np.empty((trials, law.model.sensor.size))
         self._wider = np.ones(trials)  # see `correct`
         shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
-        self.estimates, self.innovations = (np.full((*shape, one), np.nan) if record else None for one in sizes)
+        self.estimates, self.innovations = (np.full((*shape, size), np.nan) if record else None for size in sizes)
         self._limits = Limits(*law.limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
         # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
@@ -145,8 +145,8 @@ class FilterRun(ControllerRun):
         model.compiled.diverged(self._trials, ahead, first_implausible)
         for k in np.flatnonzero(first_implausible < model.size):
             i = int(first_implausible[k])
-            what = f"is beyond {FAR:g}" if np.isfinite(ahead[k, i]) else "is not finite"
-            self._diverged.setdefault(int(k), f"the estimate of {model.names[i]} {what}")
+            fault = f"is beyond {FAR:g}" if np.isfinite(ahead[k, i]) else "is not finite"
+            self._diverged.setdefault(int(k), f"the estimate of {model.names[i]} {fault}")
         return out
 
     def _predict(self, estimates: Array, commands: Array) -> None:
@@ -223,12 +223,12 @@ def _measured_coordinates(law: FilterLaw) -> Coordinates:
     if not set(names) <= set(space.names):
         return Coordinates(names=names, units=("",) * len(names))
     chosen = [space.names.index(name) for name in names]
-    whole = [
+    rotations = [
         place
         for place, i in enumerate(chosen)
         if i in space.rotation_vectors and chosen[place : place + 3] == [i, i + 1, i + 2]
     ]
     return Coordinates(
-        names=names, units=tuple(space.units[i] for i in chosen), rotation_vectors=tuple(whole),
+        names=names, units=tuple(space.units[i] for i in chosen), rotation_vectors=tuple(rotations),
         angles=tuple(place for place, i in enumerate(chosen) if i in space.angles),
     )  # fmt: skip

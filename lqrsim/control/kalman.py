@@ -53,14 +53,14 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         model.plan.steps + 1, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING
     )
     work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
-    own = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
-    roots = zeros_of(FilterRoots, own, T=model.plan.steps, Z=size, Y=measured)
-    given = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
+    arrays = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
+    roots = zeros_of(FilterRoots, arrays, T=model.plan.steps, Z=size, Y=measured)
+    system = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
     filter_along = module_of(source_of(square_root_filter), "Kalman filters").filter_along
-    filter_along(sizes, given, FilterRoots(*map(np.ravel, roots)))
+    filter_along(sizes, system, FilterRoots(*map(np.ravel, roots)))
     _, before, after, innovation_root, learned, _ = roots
     limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
-    predicted, corrected, innovation = (one @ one.transpose(0, 2, 1) for one in (before, after, innovation_root))
+    predicted, corrected, innovation = (root @ root.transpose(0, 2, 1) for root in (before, after, innovation_root))
     return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)
 
 
@@ -71,25 +71,25 @@ def _gains(learned: Array, root: Array) -> Array:
     """
     gain = np.empty_like(learned)
     for j in range(root.shape[1] - 1, -1, -1):
-        rest = (gain[:, :, j + 1 :] @ root[:, j + 1 :, j, None])[:, :, 0]
-        gain[:, :, j] = (learned[:, :, j] - rest) / root[:, j, j, None]
+        solved = (gain[:, :, j + 1 :] @ root[:, j + 1 :, j, None])[:, :, 0]
+        gain[:, :, j] = (learned[:, :, j] - solved) / root[:, j, j, None]
     return gain
 
 
 def check_observable(model: PlanModel) -> None:
     """Raise InputError, with the name, for an unknown that moves the robot but changes no measurement."""
     first = model.n + model.lagging
-    effect, groups = np.eye(model.size)[:, first:], [list(own) for own in model.own_states]
+    effect, groups = np.eye(model.size)[:, first:], [list(indices) for indices in model.own_states]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))
         seen = np.maximum(seen, np.abs(model.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
-        if all(seen[own].any() for own in groups):
+        if all(seen[group].any() for group in groups):
             return
         if t < model.plan.steps:
             effect = model.F[t] @ effect
-    for unknown, own in zip(model.remembered, groups, strict=True):
-        if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
+    for unknown, group in zip(model.remembered, groups, strict=True):
+        if (unknown.std or unknown.drift) and moved[group].max() > 0 and not seen[group].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
                 f"OffsetFree: unknowns: got {unknown.name}, which no measurement sees ({measured}),"

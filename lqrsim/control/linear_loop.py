@@ -29,25 +29,25 @@ def moments_of(loops: LoopArrays, stated: int, count: int | None = None, lost: f
       stated: number of the first entries of y that are the system's own; with losses, the last m of these are a.
       lost: fraction of the commands that get lost.
     """
-    (steps, laws, m, width), (systems, own) = loops.K.shape, loops.F.shape[1:3]
-    first = own if count is None else count
+    (steps, laws, m, width), (systems, size) = loops.K.shape, loops.F.shape[1:3]
+    first = size if count is None else count
     rows, columns, lossy = *loops.noise.shape[2:], 0 < lost < 1
     sizes = LoopSizes(
-        steps, systems, laws, own, width, m, first, stated, rows, columns, bool(loops.jointly.size), lossy,
+        steps, systems, laws, size, width, m, first, stated, rows, columns, bool(loops.jointly.size), lossy,
         lost / (1 - lost) if lossy else 0.0,
     )  # fmt: skip
-    lengths = {"T": steps, "L": systems, "C": laws, "Y": own, "X": width, "R": width - own, "m": m, "N": first}
-    work, found = zeros_of(LoopWork, **lengths), zeros_of(LoopMoments, **lengths)
+    lengths = {"T": steps, "L": systems, "C": laws, "Y": size, "X": width, "R": width - size, "m": m, "N": first}
+    work, moments = zeros_of(LoopWork, **lengths), zeros_of(LoopMoments, **lengths)
     P, M = work.P, work.M
-    M[..., own:, own:] = loops.transition
-    arguments = sizes, *(type(one)(*map(np.ravel, one)) for one in (loops, work, found))
+    M[..., size:, size:] = loops.transition
+    arguments = sizes, *(type(arrays)(*map(np.ravel, arrays)) for arrays in (loops, work, moments))
     advance = kernels().lay_out("advance", 0, *arguments)
     for t in range(steps + 1):
         advance(t, *arguments)
         if t < steps:
-            np.matmul(M[..., :own, :], P, out=work.moved)
-            np.matmul(work.moved, M.swapaxes(-1, -2), out=P[..., :own, :])
-    return LoopMoments(*(np.moveaxis(one, 0, 2) for one in found))
+            np.matmul(M[..., :size, :], P, out=work.moved)
+            np.matmul(work.moved, M.swapaxes(-1, -2), out=P[..., :size, :])
+    return LoopMoments(*(np.moveaxis(moment, 0, 2) for moment in moments))
 
 
 def kernels() -> CompiledModule:
@@ -69,8 +69,8 @@ class LinearLoop:
 
     def moments(self, count: int | None = None) -> LoopMoments:
         """The moments of the first entries of y, or of all, from the start to the plan's end."""
-        found = self.in_systems([self.model], count)
-        return LoopMoments(*(one[0, 0] if self.gain.ndim == 3 else one[0] for one in found))
+        moments = self.in_systems([self.model], count)
+        return LoopMoments(*(moment[0, 0] if self.gain.ndim == 3 else moment[0] for moment in moments))
 
     def in_systems(self, models: Sequence[PlanModel], count: int | None = None) -> LoopMoments:
         """The moments in several true systems, which differ in no sizes, and in neither sensors nor losses."""
@@ -78,10 +78,10 @@ class LinearLoop:
         n, stated, unknown = first.n, first.n + first.lagging, len(first.transition)
         gain = self.gain.reshape(-1, *self.gain.shape[-3:]).swapaxes(0, 1)
         offset = self.offset.reshape(-1, steps, m).swapaxes(0, 1)
-        own = stated if self.filter_gain is None else stated + gain.shape[-1]
-        F, K = np.zeros((steps, len(models), own, own + unknown)), np.zeros((*gain.shape[:-1], own + unknown))
-        G, c = np.empty((steps, len(models), m, own)), np.empty((steps, len(models), own))
-        noise, jointly = np.zeros((steps + 1, len(models), own, own)), np.zeros(0)
+        size = stated if self.filter_gain is None else stated + gain.shape[-1]
+        F, K = np.zeros((steps, len(models), size, size + unknown)), np.zeros((*gain.shape[:-1], size + unknown))
+        G, c = np.empty((steps, len(models), m, size)), np.empty((steps, len(models), size))
+        noise, jointly = np.zeros((steps + 1, len(models), size, size)), np.zeros(0)
         fresh = np.empty((steps + 1, len(models), unknown, unknown))
         if self.filter_gain is None:
             K[..., :n], shaking = gain, gain * first.shown_std
@@ -91,20 +91,23 @@ class LinearLoop:
             seen = received * (self.filter_gain @ first.H)[:-1, None]
             shown = np.sqrt(received) * (self.filter_gain @ first.measurement_root)[:-1, None]
             for after, on in ((gain, K), (assumed.F[:, None], F[..., stated:, :])):
-                on[..., stated:own], on[..., :n] = after, after @ seen
+                on[..., stated:size], on[..., :n] = after, after @ seen
                 on[..., stated : stated + n] -= on[..., :n]
             G[..., stated:], c[..., stated:] = assumed.G[:, None].swapaxes(-1, -2), assumed.c[:, None]
             shaking, shown = gain @ shown, assumed.F[:, None] @ shown
             noise[1:, :, stated:, stated:] = shown @ shown.swapaxes(-1, -2)
-            jointly = np.zeros((*gain.shape[:-1], own))
+            jointly = np.zeros((*gain.shape[:-1], size))
             jointly[..., stated:] = shaking @ shown.swapaxes(-1, -2)
-        for i, one in enumerate(models):
-            F[:, i, :stated, :stated], F[:, i, :stated, own:] = one.F[:, :stated, :stated], one.F[:, :stated, stated:]
-            G[:, i, :, :stated], c[:, i, :stated] = one.G[:, :stated].swapaxes(1, 2), one.c[:, :stated]
-            start, process = one.start_root @ one.start_root.T, one.process_noise
+        for i, model in enumerate(models):
+            F[:, i, :stated, :stated], F[:, i, :stated, size:] = (
+                model.F[:, :stated, :stated],
+                model.F[:, :stated, stated:],
+            )
+            G[:, i, :, :stated], c[:, i, :stated] = model.G[:, :stated].swapaxes(1, 2), model.c[:, :stated]
+            start, process = model.start_root @ model.start_root.T, model.process_noise
             noise[0, i, :stated, :stated], fresh[0, i] = start[:stated, :stated], start[stated:, stated:]
             noise[1:, i, :stated, :stated], fresh[1:, i] = process[:, :stated, :stated], process[:, stated:, stated:]
-        planned, reached = first.plan.controls, np.stack([one.reached for one in models], axis=1)
+        planned, reached = first.plan.controls, np.stack([model.reached for model in models], axis=1)
         arrays = LoopArrays(
             F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned,
             shaking @ shaking.swapaxes(-1, -2), jointly, reached, self.low, self.high,

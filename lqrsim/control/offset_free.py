@@ -136,8 +136,8 @@ class OffsetFree(Controller):
         self.filter = kalman_filter(self.model) if self._sensing is None else self._sensing.along
         if tolerate is None:
             moments = partial(with_filter, self.model, self.filter)
-            told = problem, solution, uncertainty, self.model, efforts, at_end, moments
-            design = Design(self.model, self.filter, *choose_tolerances(*told, call="OffsetFree(...)"))
+            arguments = problem, solution, uncertainty, self.model, efforts, at_end, moments
+            design = Design(self.model, self.filter, *choose_tolerances(*arguments, call="OffsetFree(...)"))
         else:
             weights = Weights.of(tolerate, efforts, problem.dynamics, at_end=at_end)
             design = Design.of(self.model, self.filter, weights)
@@ -228,8 +228,10 @@ class OffsetFree(Controller):
     def digest(self) -> str:
         model, limits = self.model, np.array(self._law.limits)
         parts = (self.gain, self.offset, self._law.nominal, self.filter.gain, model.output, model.transition, limits)
-        told = self.uncertainty
-        numbers = np.array([model.plan.dt, model.uncertainty.lag, told.latency, told.delay, told.command_loss])
+        uncertainty = self.uncertainty
+        numbers = np.array(
+            [model.plan.dt, model.uncertainty.lag, uncertainty.latency, uncertainty.delay, uncertainty.command_loss]
+        )
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.step_source.digest, moved, model.sensor.source.digest, model.sensor.data
         read = () if self._sensors is None else (self._sensors.digest,)
@@ -276,15 +278,15 @@ def with_margin(
         """The predictions for C laws, with the lag and without it: (2, C)."""
         loop = LinearLoop(truths[0], *one.laws, one.filter.gain, *limits, one.model)
         with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
-            found = loop.in_systems(truths, stated.n)
-            lost = np.asarray(~np.isfinite(found.covariance).all(axis=(-3, -2, -1)))
-        for part in found:
+            moments = loop.in_systems(truths, stated.n)
+            lost = np.asarray(~np.isfinite(moments.covariance).all(axis=(-3, -2, -1)))
+        for part in moments:
             part[lost] = 0.0
-        shown = predictions(problem, solution, uncertainty, stated, found)
-        return Predictions(*(np.where(lost, gone, own) for gone, own in zip(GONE, shown, strict=True)))
+        shown = predictions(problem, solution, uncertainty, stated, moments)
+        return Predictions(*(np.where(lost, gone, value) for gone, value in zip(GONE, shown, strict=True)))
 
-    found = predicted(design)
-    worth = found.worth(narrowest(stated, found.width[0]))
+    outcomes = predicted(design)
+    worth = outcomes.worth(narrowest(stated, outcomes.width[0]))
     if worth[1, 0] <= worth[0, 0] + CLIFF:
         return design
     if at_end is None:
@@ -296,10 +298,10 @@ def with_margin(
         partly = stated.under(replace(stated.uncertainty, lag=share * stated.uncertainty.lag))
         model = partly.assumed(memory, effort, doubt)
         designs.append(Design.of(model, kalman_filter(model), weights))
-    found = [predicted(one) for one in designs]
-    widths = np.array([one.width[0] for one in found])
+    outcomes = [predicted(candidate) for candidate in designs]
+    widths = np.array([outcome.width[0] for outcome in outcomes])
     least = narrowest(stated, widths)
-    worth = np.array([one.worth(least) for one in found])
+    worth = np.array([outcome.worth(least) for outcome in outcomes])
     worth = np.where(widths > WIDER * least, np.inf, worth[:, 0] + ABSENT * worth[:, 1])
     i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
     return designs[i].pick(int(j))

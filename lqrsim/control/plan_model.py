@@ -65,7 +65,7 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     if isinstance(sensors, str):
         raise InputError(f"sensors: got {excerpt(sensors)}, want a tuple of names: ({excerpt(sensors)},)")
     listed: Any = sensors
-    if isinstance(listed, (list, tuple)) and all(isinstance(one, str) for one in listed):
+    if isinstance(listed, (list, tuple)) and all(isinstance(entry, str) for entry in listed):
         names = check_items("sensors", listed, str, f"a tuple of names of states, of {', '.join(space.names)}")
         if not names or len(set(names)) < len(names):
             raise InputError(f"sensors: got {excerpt(listed)}, want at least one state, each at most once")
@@ -100,9 +100,9 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
         source += symbolic.write_function("measure_slope", "x, data, out", "data", slopes, of=of)
         return {"source": source, "size": len(values)}
 
-    made = symbolic.kept(function, ("sensor", states), make, source=str, size=int)
-    size = int(made["size"])
-    return Sensor(text_source(str(made["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
+    written = symbolic.kept(function, ("sensor", states), make, source=str, size=int)
+    size = int(written["size"])
+    return Sensor(text_source(str(written["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
 
 
 # The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
@@ -167,8 +167,14 @@ class PlanModel:
     def names(self) -> tuple[str, ...]:
         """Names of the entries of z for messages, (Z,)."""
         controls = self.dynamics.control_coordinates.names[: self.lagging]
-        unknowns = (one.name for one, own in zip(self.remembered, self.own_states, strict=True) for _ in own)
-        return (*self.dynamics.state_coordinates.names, *(f"what {one} has reached" for one in controls), *unknowns)
+        unknowns = (
+            unknown.name for unknown, states in zip(self.remembered, self.own_states, strict=True) for _ in states
+        )
+        return (
+            *self.dynamics.state_coordinates.names,
+            *(f"what {control} has reached" for control in controls),
+            *unknowns,
+        )
 
     # Sizes.
 
@@ -194,7 +200,7 @@ class PlanModel:
     @cached_property
     def remembered(self) -> tuple[Unknown, ...]:
         """The unknowns that have states."""
-        return tuple(one for one in self.uncertainty.unknowns if not one.white)
+        return tuple(unknown for unknown in self.uncertainty.unknowns if not unknown.white)
 
     @cached_property
     def own_states(self) -> list[range]:
@@ -212,12 +218,12 @@ class PlanModel:
     @cached_property
     def parameters(self) -> tuple[str, ...]:
         """The parameters of the dynamics that are unknown."""
-        named = (name for one in self.uncertainty.unknowns for name in one.shares)
+        named = (name for unknown in self.uncertainty.unknowns for name in unknown.shares)
         return tuple(dict.fromkeys(name for name in named if name in self.dynamics.parameters))
 
     @cached_property
     def _filters(self) -> list[ShapingFilter]:
-        return [shaping_filter(one, self.plan.dt) for one in self.remembered]
+        return [shaping_filter(unknown, self.plan.dt) for unknown in self.remembered]
 
     @cached_property
     def transition(self) -> Array:
@@ -228,19 +234,20 @@ class PlanModel:
     def output(self) -> Array:
         """From the unknowns' states to values of the parameters, and the gain and the offset of each control."""
         columns = [
-            self._column(one)[:, None] * part.output for one, part in zip(self.remembered, self._filters, strict=True)
+            self._column(unknown)[:, None] * part.output
+            for unknown, part in zip(self.remembered, self._filters, strict=True)
         ]
         return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
 
     def _column(self, unknown: Unknown) -> Array:
         """The weights of an unknown in these values, (P + 2 m,)."""
-        controls, own = self.dynamics.control_coordinates.names, len(self.parameters)
-        column = np.zeros(own + 2 * self.m)
+        controls, count = self.dynamics.control_coordinates.names, len(self.parameters)
+        column = np.zeros(count + 2 * self.m)
         for name, share in unknown.shares.items():
             if name.startswith(GAIN):
-                column[own + controls.index(name.removeprefix(GAIN))] = share
+                column[count + controls.index(name.removeprefix(GAIN))] = share
             elif name.startswith(OFFSET):
-                column[own + self.m + controls.index(name.removeprefix(OFFSET))] = share
+                column[count + self.m + controls.index(name.removeprefix(OFFSET))] = share
             else:
                 column[self.parameters.index(name)] = share
         return column
@@ -260,8 +267,8 @@ class PlanModel:
             estimation, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
             V=unknown + 2 * self.m, NUMBERS=len(self.compiled_dynamics.parameters), HELD=max(len(self.transition), 1),
         )  # fmt: skip
-        what = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
-        return module_of(source, what, N=self.n, M=self.m, W=self.n + self.m)
+        label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
+        return module_of(source, label, N=self.n, M=self.m, W=self.n + self.m)
 
     @cached_property
     def compiled_dynamics(self) -> DynamicsModel:
@@ -387,7 +394,7 @@ class PlanModel:
             squares[k] = np.vecdot(moved, moved).mean(axis=0)
             moved = A[k + 1 :] @ moved[:-1]
         reach = np.sqrt(np.maximum(squares.cumsum(axis=0), 1e-24))[np.array(periods) - 1]
-        same = np.array([[one == other for other in units] for one in units], dtype=np.float64)
+        same = np.array([[unit == other for other in units] for unit in units], dtype=np.float64)
         return np.sqrt(reach**2 @ same / same.sum(axis=0))
 
     def assumed(self, memory: float, effort: Array, doubt: float = 0.0) -> "PlanModel":
@@ -438,7 +445,7 @@ class PlanModel:
         commanded = self.arriving.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
         if self.uncertainty.lag == 0:
             commanded[:, n:first] = 0.0  # the command that stays in force after a loss has new noise
-        white = [one.std * self._column(one) for one in self.uncertainty.unknowns if one.white]
+        white = [unknown.std * self._column(unknown) for unknown in self.uncertainty.unknowns if unknown.white]
         pushed = np.zeros((steps, self.size, len(white)))
         if white:
             pushed[:, :n] = self.effects @ np.array(white).T
@@ -467,8 +474,8 @@ class PlanModel:
 
 def _diagonal(blocks: list[Array]) -> Array:
     size = sum(len(block) for block in blocks)
-    whole, at = np.zeros((size, size)), 0
+    matrix, at = np.zeros((size, size)), 0
     for block in blocks:
-        whole[at : at + len(block), at : at + len(block)] = block
+        matrix[at : at + len(block), at : at + len(block)] = block
         at += len(block)
-    return whole
+    return matrix

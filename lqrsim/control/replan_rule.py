@@ -110,7 +110,7 @@ class ReplanLog:
     def summary(self, *, times: bool = False) -> str:
         """The number of solves, and why the previous law continued, in one line; with `times`, how long solves took."""
         line = f"solved again {self.solved} times"
-        early = Counter(one.reason for one in self.records if one.used and one.reason)
+        early = Counter(record.reason for record in self.records if record.used and record.reason)
         if early:
             counts = ", ".join(f"{count} {reason}" for reason, count in early.most_common())
             line += f" ({early.total()} of these plans did not converge, but are no worse than continuing: {counts})"
@@ -118,7 +118,7 @@ class ReplanLog:
             reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
             line += f", kept the previous law {self.kept.total()} times: {reasons}"
         if times and self.records:
-            took = 1e3 * np.array([one.seconds for one in self.records])
+            took = 1e3 * np.array([record.seconds for record in self.records])
             line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
         return line
 
@@ -199,8 +199,8 @@ class ReplanRule:
     def checked(self, who: str, problem: Problem) -> Problem:
         """The problem. Raises InputError if it cannot replace the rule's own problem while a plan is in force."""
         check_kind(who, problem, Problem, "a Problem")
-        for field, what in _FIXED.items():
-            got, want = what(problem), what(self.problem)
+        for field, value_of in _FIXED.items():
+            got, want = value_of(problem), value_of(self.problem)
             if got != want:
                 raise InputError(f"{who}: {field}: got {got}, want {want}: it cannot change while a re-planner runs")
         return self.solver.check(problem)
@@ -235,8 +235,8 @@ class ReplanRule:
         row = active.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
         if self.delay and (self.predict or problem.control_rate is not None):
-            there, command = self._ahead(active, step, here, problem, late)
-            here, sent = there if self.predict else here, sent if command is None else command
+            predicted, command = self._ahead(active, step, here, problem, late)
+            here, sent = predicted if self.predict else here, sent if command is None else command
         done = min(first - active.first, plan.trajectory.steps - 1)
         previous = sent if problem.control_rate is not None else None
         return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem, previous)
@@ -248,9 +248,11 @@ class ReplanRule:
         policy, dt = active.plan.policy, problem.dt
         rows, controls = [active.row(step + i) for i in range(self.delay)], None
         if late > 1e-9 * dt:
-            rest, now = problem.dynamics.period_near(dt - late), rows.pop(0)
-            if rest > 0:
-                states, controls = compiled.rollout(problem, policy.gain[[now]], policy.offset[[now]], state, dt=rest)
+            remainder, now = problem.dynamics.period_near(dt - late), rows.pop(0)
+            if remainder > 0:
+                states, controls = compiled.rollout(
+                    problem, policy.gain[[now]], policy.offset[[now]], state, dt=remainder
+                )
                 state = states[-1]
         if rows:
             states, controls = compiled.rollout(problem, policy.gain[rows], policy.offset[rows], state)

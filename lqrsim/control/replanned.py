@@ -51,7 +51,7 @@ class ReplannedRun(ControllerRun):
         return self._of_all([run.innovations for run in self._runs])
 
     def _of_all(self, records: list[Array | None]) -> Array | None:
-        known = [one for one in records if one is not None]
+        known = [record for record in records if record is not None]
         return np.concatenate(known, axis=1) if known else None
 
     def control(self, step: int, measured: Array) -> Array:
@@ -87,8 +87,8 @@ class ReplannedRun(ControllerRun):
         # The unknowns' states that are constant to the end of the horizon and change only parameters.
         beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
         known = (model.output != 0).any(axis=0) & ~beyond
-        for one, own in zip(model.remembered, model.own_states, strict=True):
-            known[list(own)] &= one.constant
+        for unknown, states in zip(model.remembered, model.own_states, strict=True):
+            known[list(states)] &= unknown.constant
         granted = np.where(known, z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ granted
         values = {
@@ -103,8 +103,8 @@ class ReplannedRun(ControllerRun):
             return
         # In that model the actuators have no lag, gains or offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
-        rest = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
-        offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)
+        fixed = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
+        offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
         gain = in_c_order(gain[:, :, :n])
         if not self._always and self._leads_there(problem, gain, offset, here):

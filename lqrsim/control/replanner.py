@@ -279,8 +279,8 @@ class ReplannerRun(ControllerRun):
             self._activate(step)
         commands = np.empty((len(measured), len(self._of.coordinates[1])))
         for trial, active in enumerate(self.active):
-            row, policy, one = active.row(step), active.plan.policy, measured[trial : trial + 1]
-            commands[trial] = self._evaluate(one, policy.gain[row], policy.offset[row], policy.nominal[row])[0]
+            row, policy, state = active.row(step), active.plan.policy, measured[trial : trial + 1]
+            commands[trial] = self._evaluate(state, policy.gain[row], policy.offset[row], policy.nominal[row])[0]
         self._sent = within_rates(commands, self._problem, self._sent)
         return self._sent
 
@@ -327,6 +327,6 @@ class ReplannerRun(ControllerRun):
             # Seeded by the state of this trial, so that other trials do not change its draws.
             drawn = int.from_bytes(bytes.fromhex(sha256(state)[:16]), "big")
             assert callable(computing)
-            given = computing(np.random.default_rng([self._of.seed, step, drawn]))
-            took = check_number("Replanner: computing", given, at_least=0.0)
+            seconds = computing(np.random.default_rng([self._of.seed, step, drawn]))
+            took = check_number("Replanner: computing", seconds, at_least=0.0)
         return took > self._rule.delay * self._rule.problem.dt + 1e-9

@@ -58,12 +58,12 @@ class SampledLoop:
 
     def chance(self, predicted: float) -> float:
         """The chance of collision by these trials and a prediction. 0 only if both have none."""
-        trials, found = len(self.collided), int(self.collided.sum())
-        low = float(betaincinv(found, trials - found + 1, REFUTED)) if found else 0.0
-        high = float(betaincinv(found + 1, trials - found, 1 - REFUTED)) if found < trials else 1.0
+        trials, collisions = len(self.collided), int(self.collided.sum())
+        low = float(betaincinv(collisions, trials - collisions + 1, REFUTED)) if collisions else 0.0
+        high = float(betaincinv(collisions + 1, trials - collisions, 1 - REFUTED)) if collisions < trials else 1.0
         if not low <= predicted <= high:
-            return max(found, 0.5) / trials  # no number of trials shows a chance of 0
-        return (PRIOR + found) / (PRIOR / predicted + trials) if predicted else 0.0
+            return max(collisions, 0.5) / trials  # no number of trials shows a chance of 0
+        return (PRIOR + collisions) / (PRIOR / predicted + trials) if predicted else 0.0
 
 
 def sample_loop(
@@ -81,7 +81,7 @@ def sample_loop(
             states[t] = robots.states(t)
             finite = np.isfinite(states[t]).all(axis=1)
             collided |= ~finite
-            collided[finite] |= surroundings.nearest(states[t, finite], [one[finite] for one in displaced]) < 0
+            collided[finite] |= surroundings.nearest(states[t, finite], [moved[finite] for moved in displaced]) < 0
             off = counted.distance(states[t] - plan.states[t])
             farthest = np.maximum(farthest, np.where(finite, off, np.inf))
             if t < plan.steps:
@@ -103,21 +103,21 @@ class _Robots:
     """The true systems of K trials: their z as in `plan_model.py`, but in absolute numbers; and the links to them."""
 
     def __init__(self, model: PlanModel, limits: tuple[Array, Array], trials: int, rng: np.random.Generator) -> None:
-        plan, told = model.plan, model.uncertainty
+        plan, uncertainty = model.plan, model.uncertainty
         self.model, self.limits, self.rng, self._trials = model, limits, rng, trials
         start = np.concatenate([plan.states[0], model.reached[0], np.zeros(len(model.transition))])
         self.z = start + self._normal(model.size) @ model.start_root.T
         # Noise on controls is added before the limits, so it does not count as noise on states.
-        self._shaken = per_entry("Uncertainty: control", told.control, model.dynamics.control_coordinates)
-        self._roots = replace(model, uncertainty=replace(told, control=0.0)).process_root
-        arrived = Lag.of(told.lag, plan.dt)
+        self._shaken = per_entry("Uncertainty: control", uncertainty.control, model.dynamics.control_coordinates)
+        self._roots = replace(model, uncertainty=replace(uncertainty, control=0.0)).process_root
+        arrived = Lag.of(uncertainty.lag, plan.dt)
         predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
         self._command = np.zeros((trials, model.m))
         self._predict = model.compiled.lay_out("predict", trials, self._command, predictor, self.z)
         # Measurements and commands under way. The first measurement is repeated until it arrives. The plan's controls
         # are applied until the first command arrives.
         self._late_measured = deque[Array]()
-        first = [np.tile(plan.controls[min(i, plan.steps - 1)], (trials, 1)) for i in range(told.delay)]
+        first = [np.tile(plan.controls[min(i, plan.steps - 1)], (trials, 1)) for i in range(uncertainty.delay)]
         self._late_commands = deque(first)
         self._shown, self._applied = np.tile(plan.states[0], (trials, 1)), np.tile(plan.controls[0], (trials, 1))
 
@@ -133,18 +133,18 @@ class _Robots:
         return x
 
     def measure(self, t: int) -> Array:
-        told, measured = self.model.uncertainty, self._late_measured
+        uncertainty, measured = self.model.uncertainty, self._late_measured
         measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.shown_std)
-        shown = measured.popleft() if t >= told.latency else measured[0]
-        lost = self.rng.random((self._trials, 1)) < told.loss
+        shown = measured.popleft() if t >= uncertainty.latency else measured[0]
+        lost = self.rng.random((self._trials, 1)) < uncertainty.loss
         self._shown = np.where(lost, self._shown, shown)
         return self._shown
 
     def advance(self, t: int, commands: Array) -> Array:
         """Advance by a control period, under commands (K, m). Returns the applied commands."""
-        told, model = self.model.uncertainty, self.model
+        uncertainty, model = self.model.uncertainty, self.model
         self._late_commands.append(commands)
-        lost = self.rng.random((self._trials, 1)) < told.command_loss
+        lost = self.rng.random((self._trials, 1)) < uncertainty.command_loss
         self._applied = np.where(lost, self._applied, self._late_commands.popleft())
         np.clip(self._applied + self._normal(model.m) * self._shaken, *self.limits, out=self._command)
         with model.dynamics.quiet():

@@ -39,7 +39,7 @@ class Estimate(NamedTuple):
     covariance: Array  # of the errors of both, (K, Z+B, Z+B)
 
     def copy(self) -> "Estimate":
-        return Estimate(*(one.copy() for one in self))
+        return Estimate(*(array.copy() for array in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +62,13 @@ class SensorFilter:
     @cached_property
     def _wrench(self) -> Array:
         """From the values of the unknown parameters to the force and torque on the robot, (6, P)."""
-        names, found = self.model.parameters, np.zeros((6, len(self.model.parameters)))
+        names, wrench = self.model.parameters, np.zeros((6, len(self.model.parameters)))
         for j, name in enumerate(names):
             if name in _WRENCH:
-                found[_WRENCH.index(name), j] = 1.0
+                wrench[_WRENCH.index(name), j] = 1.0
             elif name.startswith("wind_"):
-                found["xyz".index(name[-1]), j] = self.sensors.drag
-        return found
+                wrench["xyz".index(name[-1]), j] = self.sensors.drag
+        return wrench
 
     def acting(self, z: Array, controls: Array) -> tuple[Array, Array]:
         """The controls (K, m) and the force and torque (K, 6) under which readings are taken, for estimates (K, Z).
@@ -115,10 +115,10 @@ class SensorFilter:
         planned = model.plan.controls[np.maximum(np.arange(knots) - 1, 0)]
         effects = np.concatenate([wrench @ self._wrench, controls * planned[:, None], controls], axis=2)
         H[:, :, first : model.size] = effects @ model.output
-        for one, at in zip(self.sensors.sensors, self.sensors.columns, strict=True):
+        for sensor, at in zip(self.sensors.sensors, self.sensors.columns, strict=True):
             if np.abs(H[:, at, : model.size]).max(initial=0.0) < _SILENT:
                 raise InputError(
-                    f"OffsetFree: sensors: got {one.name!r}, whose reading is the same in all states near the plan,"
+                    f"OffsetFree: sensors: got {sensor.name!r}, whose reading is the same in all states near the plan,"
                     " want sensors that see the robot"
                 )
         H[:, self.biased, model.size + np.arange(len(self.biased))] = 1.0
@@ -131,22 +131,22 @@ class SensorFilter:
         Those of one knot count as independent of each other and of the noise on the state.
         """
         model, (_, controls, wrench) = self.model, self._slopes
-        told, space = model.uncertainty, model.dynamics.control_coordinates
-        shaken = controls * (per_entry("Uncertainty: control", told.control, space) * (not model.lagging))
-        found = self.sensors.each("noise") ** 2 + np.vecdot(shaken, shaken)
-        for one in told.unknowns:
-            values = np.array([one.shares.get(name, 0.0) for name in model.parameters])
-            if one.white and values.any():
-                found = found + (one.std * wrench @ (self._wrench @ values)) ** 2
-        return found
+        uncertainty, space = model.uncertainty, model.dynamics.control_coordinates
+        shaken = controls * (per_entry("Uncertainty: control", uncertainty.control, space) * (not model.lagging))
+        variance = self.sensors.each("noise") ** 2 + np.vecdot(shaken, shaken)
+        for unknown in uncertainty.unknowns:
+            values = np.array([unknown.shares.get(name, 0.0) for name in model.parameters])
+            if unknown.white and values.any():
+                variance = variance + (unknown.std * wrench @ (self._wrench @ values)) ** 2
+        return variance
 
     def start(self, trials: int, z: Array) -> Estimate:
         """The estimate before the first reading, with the same z (Z,) for all trials."""
         size, biased = self.model.size, len(self.biased)
         covariance = np.zeros((trials, size + biased, size + biased))
         covariance[:, :size, :size] = self.model.start_root @ self.model.start_root.T
-        own = size + np.arange(biased)
-        covariance[:, own, own] = self.sensors.each("bias")[self.biased] ** 2
+        biases = size + np.arange(biased)
+        covariance[:, biases, biases] = self.sensors.each("bias")[self.biased] ** 2
         return Estimate(np.tile(z, (trials, 1)), np.zeros((trials, biased)), covariance)
 
     def predict(self, covariance: Array, knot: int) -> None:
@@ -156,8 +156,8 @@ class SensorFilter:
         covariance[:, :size] = F @ covariance[:, :size]
         covariance[:, :, :size] = covariance[:, :, :size] @ F.T
         covariance[:, :size, :size] += model.process_noise[t]
-        own = size + np.arange(len(self.biased))
-        covariance[:, own, own] += self.sensors.each("bias_walk")[self.biased] ** 2 * model.plan.dt
+        biases = size + np.arange(len(self.biased))
+        covariance[:, biases, biases] += self.sensors.each("bias_walk")[self.biased] ** 2 * model.plan.dt
 
     def correct(self, covariance: Array, knot: int, known: npt.NDArray[np.bool_], off: Array) -> Array:
         """Correct covariances in place by the readings that are known (K, Y), one number after the other.
@@ -178,10 +178,10 @@ class SensorFilter:
 
     def due(self, knot: int) -> npt.NDArray[np.bool_]:
         """Which numbers of the readings (Y,) are taken at a knot."""
-        found = np.zeros(len(self.sensors.names), dtype=bool)
+        mask = np.zeros(len(self.sensors.names), dtype=bool)
         for at, due in zip(self.sensors.columns, self.sensors.due(knot, self.model.plan.dt), strict=True):
-            found[at] = due
-        return found
+            mask[at] = due
+        return mask
 
     @cached_property
     def along(self) -> KalmanFilter:
@@ -192,9 +192,9 @@ class SensorFilter:
         """
         model, size, knots = self.model, self.model.size, self.model.plan.steps + 1
         slowest, corrected = max(self.late), np.empty((knots, size, size))
-        kept, late = self.start(1, np.zeros(size)).covariance, np.repeat(self.late, self._sizes)
+        settled, late = self.start(1, np.zeros(size)).covariance, np.repeat(self.late, self._sizes)
         for t in range(knots):
-            now = kept
+            now = settled
             for j in range(max(t - slowest, 0), t + 1):
                 now = now.copy()
                 if j:
@@ -202,7 +202,7 @@ class SensorFilter:
                 known = self.due(j) & (j + late <= t)
                 self.correct(now, j, known[None], np.zeros((1, len(known))))
                 if j == t - slowest:
-                    kept = now
+                    settled = now
             corrected[t] = now[0, :size, :size]
         before = model.start_root @ model.start_root.T
         predicted = np.concatenate([before[None], model.F @ corrected[:-1] @ model.F.transpose(0, 2, 1)])
@@ -217,11 +217,11 @@ class SensorFilter:
 
     def _aligned(self, readings: Array, near: Array) -> Array:
         """The readings (K, Y), with each quaternion or its negative, whichever is nearer to another reading's."""
-        found = readings.copy()
+        aligned = readings.copy()
         for at, turns in zip(self.sensors.columns, self.sensors.quaternions, strict=True):
             if turns:
-                found[:, at] *= np.where(np.vecdot(readings[:, at], near[:, at]) < 0, -1.0, 1.0)[:, None]
-        return found
+                aligned[:, at] *= np.where(np.vecdot(readings[:, at], near[:, at]) < 0, -1.0, 1.0)[:, None]
+        return aligned
 
     def difference(self, readings: Array, expected: Array) -> Array:
         """Readings minus expectations, (K, Y)."""

@@ -89,10 +89,10 @@ def choose_tolerances(
     tried, space = tolerances_to_try(model, effort, at_end, solution.target), solution.policy.control_coordinates
     limits = np.array(space.low), np.array(space.high)
     gain, offset = tracking_laws(model, tried)
-    found = moments((gain, offset), limits)
-    told = predictions(problem, solution, uncertainty, model, found)
-    least = narrowest(model, told.width)
-    worth = told.worth(least)
+    loop_moments = moments((gain, offset), limits)
+    predicted = predictions(problem, solution, uncertainty, model, loop_moments)
+    least = narrowest(model, predicted.width)
+    worth = predicted.worth(least)
 
     def lost(found: LoopMoments, laws: Laws, i: int) -> int:
         law = laws[0][i], laws[1][i]
@@ -106,7 +106,7 @@ def choose_tolerances(
 
     left = dict[int, int]()
     for best in sorted(range(len(worth)), key=lambda i: (worth[i], -i)):  # of equals the gentlest first
-        left[best] = lost(found, (gain, offset), best)
+        left[best] = lost(loop_moments, (gain, offset), best)
         if not left[best]:
             break
     else:
@@ -118,19 +118,19 @@ def choose_tolerances(
         )
     weights, laws = tried.pick(best), (gain[best], offset[best])
     # The same with emphasis, if it is predicted to fail less often.
-    if told.saturation[best] > MODELLED:
+    if predicted.saturation[best] > MODELLED:
         return weights, laws
-    mean, covariance, across = found.mean[best], found.covariance[best], found.across[best]
+    mean, covariance, across = loop_moments.mean[best], loop_moments.covariance[best], loop_moments.across[best]
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     emphasis = surroundings.emphasis(model.plan.states + mean, covariance, across, weights.state)
     if not emphasis.any():
         return weights, laws
     stressing = weights.stressing(emphasis, EMPHASIS)
     gain, offset = tracking_laws(model, stressing)
-    found = moments((gain, offset), limits)
-    stressed = predictions(problem, solution, uncertainty, model, found).worth(least)
+    loop_moments = moments((gain, offset), limits)
+    stressed = predictions(problem, solution, uncertainty, model, loop_moments).worth(least)
     i = int(np.argmin(stressed))
-    better = stressed[i] < worth[best] and lost(found, (gain, offset), i) <= left[best]
+    better = stressed[i] < worth[best] and lost(loop_moments, (gain, offset), i) <= left[best]
     return (stressing.pick(i), (gain[i], offset[i])) if better else (weights, laws)
 
 
@@ -141,12 +141,14 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     unplanned spin can only do so by other speeds of its wheels.
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
-    periods = [one for one in PERIODS if one <= longest]
+    periods = [period for period in PERIODS if period <= longest]
     tried = list(model.reach(effort, periods))
     if (free := np.isnan(target.state)).any():
-        tried += [np.where(free, WIDE * one, one) for one in tried]
-    each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
-    return Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
+        tried += [np.where(free, WIDE * tolerances, tolerances) for tolerances in tried]
+    choices = [Weights.of(tuple(tolerances.tolist()), effort, model.dynamics, at_end=at_end) for tolerances in tried]
+    return Weights(
+        np.array([choice.state for choice in choices]), choices[0].control, np.array([choice.end for choice in choices])
+    )
 
 
 def predictions(
@@ -223,19 +225,19 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, laws: Laws, limits: tupl
     The filter is assumed to be right about the noise. Its error is then independent of its estimate, and what it learns
     from a measurement is noise that moves the estimate. The unknowns' estimates are moved by no law.
     """
-    n, own = model.n, model.n + model.lagging
+    n, size = model.n, model.n + model.lagging
     learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
-    F, G, c, noise = (one[:, None, :own] for one in (model.F, model.G, model.c, learned))
-    gain, offset = (one.swapaxes(0, 1) for one in laws)
+    F, G, c, noise = (array[:, None, :size] for array in (model.F, model.G, model.c, learned))
+    gain, offset = (part.swapaxes(0, 1) for part in laws)
     planned = model.plan.controls
     arrays = LoopArrays(
-        F, G.swapaxes(-1, -2), c, noise, learned[:, own:, own:], model.transition, gain, planned[:, None] + offset,
+        F, G.swapaxes(-1, -2), c, noise, learned[:, size:, size:], model.transition, gain, planned[:, None] + offset,
         planned, np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
     )  # fmt: skip
-    found = LoopMoments(*(one[0] for one in moments_of(arrays, own, n)))
-    return found._replace(
-        covariance=found.covariance + kalman.corrected[:, :n, :n],
-        across=found.across + model.F[:, :n] @ kalman.corrected[:-1, :, :n],
+    moments = LoopMoments(*(moment[0] for moment in moments_of(arrays, size, n)))
+    return moments._replace(
+        covariance=moments.covariance + kalman.corrected[:, :n, :n],
+        across=moments.across + model.F[:, :n] @ kalman.corrected[:-1, :, :n],
     )
 
 
@@ -300,15 +302,15 @@ def track(
 
 def _policy_of(solution: Solution, law: Laws) -> AffinePolicy:
     """The policy of a law about the solution's plan. The command in force has no effect on a command that arrives."""
-    plan, (gain, offset), own = solution.trajectory, law, solution.policy
+    plan, (gain, offset), policy = solution.trajectory, law, solution.policy
     gain = gain[..., : plan.states.shape[1]]
     return AffinePolicy(
         gain=gain,
         offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),
         nominal=plan.states[:-1].copy(),
         dt=plan.dt,
-        state_coordinates=own.state_coordinates,
-        control_coordinates=own.control_coordinates,
+        state_coordinates=policy.state_coordinates,
+        control_coordinates=policy.control_coordinates,
     )
 
 
@@ -325,8 +327,8 @@ def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weigh
         except np.linalg.LinAlgError:
             return None
 
-    if (found := laws(risk)) is not None:
-        return found
+    if (averse := laws(risk)) is not None:
+        return averse
     low, high = 0.0, risk
     while high - low > 1e-6 * high:
         middle = 0.5 * (low + high)

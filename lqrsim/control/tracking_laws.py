@@ -64,8 +64,8 @@ class Weights:
 
     def stressing(self, emphasis: Array, factors: tuple[float, ...]) -> "Weights":
         """These with an emphasis (T+1, n, n) times each of C factors, as those of C laws to compare."""
-        many, each = np.ones((len(factors), 1)), np.array(factors)[:, None, None, None]
-        return Weights(many * self.state, self.control, many * self.end, each * emphasis)
+        many, factor = np.ones((len(factors), 1)), np.array(factors)[:, None, None, None]
+        return Weights(many * self.state, self.control, many * self.end, factor * emphasis)
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
@@ -134,14 +134,14 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     every = np.zeros((len(state), own))
     every[:, :n] = state
     sizes, laws = PassSizes(len(state), own, model.size, m, lost), np.empty(undo.shape)
-    given = PassArrays(weights.control, every.ravel(), undo.ravel(), held.ravel(), laws.ravel())
+    arrays = PassArrays(weights.control, every.ravel(), undo.ravel(), held.ravel(), laws.ravel())
     work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
-    improve = module_of(source_of(tracking_law), "tracking laws").lay_out("improve", 0, sizes, given, work)
+    improve = module_of(source_of(tracking_law), "tracking laws").lay_out("improve", 0, sizes, arrays, work)
     for t in range(steps - 1, -1, -1):
         if averse is not None:
             cost[0, :, :own], cost[0, :, -1] = averse.worst(t, cost[0, :, :own], cost[0, :, -1])
         np.matmul(back[t], cost @ onto[t], out=products)
-        improve(t, sizes, given, work)
+        improve(t, sizes, arrays, work)
         if emphasis is not None:
             cost[:, :n, :n] += emphasis[:, t]
     gain, offset = laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1]

@@ -131,16 +131,16 @@ def predict_tube(
             raise InputError("predict_tube: controller: got an OffsetFree of another plan, want one of the solution")
         loop, law = controller.loop(uncertainty), controller
     else:
-        asked: object = solution.policy if controller is None else controller
-        policy = check_kind("predict_tube: controller", asked, AffinePolicy, "an OffsetFree or an AffinePolicy")
+        chosen: object = solution.policy if controller is None else controller
+        policy = check_kind("predict_tube: controller", chosen, AffinePolicy, "an OffsetFree or an AffinePolicy")
         model = PlanModel.of(problem.dynamics, plan, uncertainty)
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         space = policy.control_coordinates
         loop = LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
         law = Feedback(policy)
-    surroundings, told = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
-    late = [f"{field} of {getattr(told, field)}" for field in ("latency", "delay") if getattr(told, field)]
+    surroundings, modelled = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
+    late = [f"{field} of {getattr(modelled, field)}" for field in ("latency", "delay") if getattr(modelled, field)]
     if samples is None:
         slow = problem.dynamics.by_mujoco or problem.dynamics.level in ("jax", "plain") or surroundings.by_mujoco
         affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST), MOST)
@@ -157,9 +157,9 @@ def predict_tube(
     shown, estimate = trials.moments if late and trials else loop.moments(), None
     model, n = loop.model, loop.model.n
     if not late and loop.filter_gain is not None:
-        whole, guess = shown.covariance, slice(n + model.lagging, 2 * n + model.lagging)
-        both = whole[:, :n, guess]
-        estimate = whole[:, :n, :n] + whole[:, guess, guess] - both - both.transpose(0, 2, 1)
+        joint, guess = shown.covariance, slice(n + model.lagging, 2 * n + model.lagging)
+        both = joint[:, :n, guess]
+        estimate = joint[:, :n, :n] + joint[:, guess, guess] - both - both.transpose(0, 2, 1)
     mean, covariance, across = shown.mean[:, :n], shown.covariance[:, :n, :n], shown.across[:, :n, :n]
     chance, linear = collision_chance(plan.states + mean, covariance, across, surroundings)
     strays = None
@@ -182,8 +182,10 @@ def _tube_of_belief(belief: Belief, problem: Problem, solution: Solution) -> Tub
     To first order the two are independent.
     """
     n, plan, policy = belief.size, solution.trajectory, solution.policy
-    each = zip(plan.states[:-1], plan.controls, strict=True)
-    A, B = (np.array(one) for one in zip(*(belief.linearize(x, u, plan.dt)[:2] for x, u in each), strict=True))
+    knots = zip(plan.states[:-1], plan.controls, strict=True)
+    A, B = (
+        np.array(matrices) for matrices in zip(*(belief.linearize(x, u, plan.dt)[:2] for x, u in knots), strict=True)
+    )
     closed, known = A + B @ policy.gain, belief.covariance(plan.states)
     pushed = belief.innovations.matrices(belief, plan.states[:-1], plan.controls)
     pushed = pushed @ pushed.swapaxes(1, 2)

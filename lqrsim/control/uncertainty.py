@@ -135,10 +135,10 @@ class Uncertainty:
             numbers = getattr(self, name)
             for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
                 check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
-            if not isinstance(numbers, Mapping) and (given := real(f"Uncertainty: {name}", numbers)).ndim:
-                if given.ndim > 1:
+            if not isinstance(numbers, Mapping) and (values := real(f"Uncertainty: {name}", numbers)).ndim:
+                if values.ndim > 1:
                     raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want one number, or one per entry")
-                keep(self, **{name: tuple(given.tolist())})
+                keep(self, **{name: tuple(values.tolist())})
 
     def check(self, dynamics: Dynamics) -> None:
         """Check that the uncertainty fits a system."""
@@ -162,21 +162,21 @@ class Uncertainty:
         memory = check_seconds("memory", memory, above=0.0)
         share = 0.0 if memory == np.inf else MEAN
         constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
-        for one in self.unknowns:
-            constants.setdefault(tuple(sorted(one.shares.items())), []).append(one)
-        kept = []
+        for unknown in self.unknowns:
+            constants.setdefault(tuple(sorted(unknown.shares.items())), []).append(unknown)
+        merged = []
         for same in constants.values():
-            std = float(np.hypot.reduce([one.std * (1.0 if one.constant else share) for one in same]))
-            drift = float(np.hypot.reduce([one.drift for one in same if one.constant] or [0.0]))
-            kept.append(Unknown(same[0].of, std, drift=max(drift, std / np.sqrt(memory))))
-        return replace(self, unknowns=(*kept, *(one for one in self.unknowns if not one.constant)))
+            std = float(np.hypot.reduce([unknown.std * (1.0 if unknown.constant else share) for unknown in same]))
+            drift = float(np.hypot.reduce([unknown.drift for unknown in same if unknown.constant] or [0.0]))
+            merged.append(Unknown(same[0].of, std, drift=max(drift, std / np.sqrt(memory))))
+        return replace(self, unknowns=(*merged, *(unknown for unknown in self.unknowns if not unknown.constant)))
 
 
 def possible_unknowns(dynamics: Dynamics) -> list[str]:
     """All names that an Unknown can have."""
     controls = dynamics.control_coordinates.names
-    own = dynamics.parameters | dynamics.disturbances
-    return [*own, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
+    declared = dynamics.parameters | dynamics.disturbances
+    return [*declared, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
 
 
 def check_seconds(field: str, value: float, **bounds: float) -> float:
@@ -190,12 +190,12 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
     With a bound, each must be above it; by default numbers may be 0, and names may be left out.
     """
     if isinstance(numbers, Mapping):
-        given = space._by_name(field, numbers, check_number)
-        missing = [name for i, name in enumerate(space.names) if i not in given]
+        named = space._by_name(field, numbers, check_number)
+        missing = [name for i, name in enumerate(space.names) if i not in named]
         if missing and above is not None:
             wanted = f"one for each of {', '.join(space.names)}, by name or unit"
             raise InputError(f"{field}: got none for {', '.join(missing)}, want {wanted}")
-        values = np.array([given.get(i, 0.0) for i in range(len(space))])
+        values = np.array([named.get(i, 0.0) for i in range(len(space))])
     elif real(field, numbers).ndim == 0:
         values = np.full(len(space), check_number(field, numbers))
     else:
@@ -255,26 +255,26 @@ def triangular_root(root: Array) -> Array:
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
     """Combine several uncertainties; noises of the same kind add up."""
     total = Uncertainty()
-    for one in parts:
-        numbers = {name: _added(name, getattr(total, name), getattr(one, name)) for name in SUMMED}
+    for part in parts:
+        numbers = {name: _added(name, getattr(total, name), getattr(part, name)) for name in SUMMED}
         total = Uncertainty(
-            unknowns=(*total.unknowns, *one.unknowns),
+            unknowns=(*total.unknowns, *part.unknowns),
             **numbers,
-            lag=total.lag + one.lag,  # approximately right for two lags in series
-            delay=total.delay + one.delay,
-            latency=total.latency + one.latency,
-            loss=1 - (1 - total.loss) * (1 - one.loss),
-            command_loss=1 - (1 - total.command_loss) * (1 - one.command_loss),
-            obstacles=float(np.hypot(total.obstacles, one.obstacles)),
-            left_out=(*total.left_out, *one.left_out),
+            lag=total.lag + part.lag,  # approximately right for two lags in series
+            delay=total.delay + part.delay,
+            latency=total.latency + part.latency,
+            loss=1 - (1 - total.loss) * (1 - part.loss),
+            command_loss=1 - (1 - total.command_loss) * (1 - part.command_loss),
+            obstacles=float(np.hypot(total.obstacles, part.obstacles)),
+            left_out=(*total.left_out, *part.left_out),
         )
     return total
 
 
 def _added(name: str, first: PerEntry, second: PerEntry) -> PerEntry:
     """Standard deviations of the sum of two noises."""
-    for one, other in ((first, second), (second, first)):
-        if not isinstance(one, Mapping) and np.ndim(one) == 0 and one == 0:
+    for noise, other in ((first, second), (second, first)):
+        if not isinstance(noise, Mapping) and np.ndim(noise) == 0 and noise == 0:
             return other
     if isinstance(first, Mapping) or isinstance(second, Mapping):
         raise InputError(f"Uncertainty: {name}: got two dictionaries, {excerpt(first)} and {excerpt(second)}, want one")

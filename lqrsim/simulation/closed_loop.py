@@ -260,9 +260,9 @@ class ClosedLoop:
 
     def begin(self) -> None:
         """Measure the states at the first knot, after what came before."""
-        whole, trials = self.whole, self.trials
+        whole_plan, trials = self.whole, self.trials
         for step in range(self.knot):
-            states, controls = (np.tile(one[step], (trials, 1)) for one in (whole.states, whole.controls))
+            states, controls = (np.tile(rows[step], (trials, 1)) for rows in (whole_plan.states, whole_plan.controls))
             self.effects.follow(step, states, controls)
             read = self._readings
             shown = states if read is None else read.follow(step, states, self._held(step))
@@ -381,7 +381,7 @@ class ClosedLoop:
     def rollout(self, *, undisturbed: Array | None = None) -> Rollout:
         """A Rollout of all records, with the states of an undisturbed run."""
         records, collisions = self.records, self.collisions
-        plant, plan, each = self.plant, self.trajectory, self.physics.drawn_parts
+        plant, plan, parts = self.plant, self.trajectory, self.physics.drawn_parts
         goal, radius = self.followed.goal, self._radius
         if (moved := self.controller_run.moved_goal()) is not None:
             # A radius that was given holds for another goal only in the same unit.
@@ -392,8 +392,8 @@ class ClosedLoop:
         begun = () if self.starts is None else ("given first states",)
         passing = () if self.moving is None else (f"moving obstacles {', '.join(self.moving.names)}",)
         records.turn_to_plan(self.state_coordinates)
-        frames = records.stacked_frames(each, all_of_them=self.frames)
-        records.erase(frames, each)
+        frames = records.stacked_frames(parts, all_of_them=self.frames)
+        records.erase(frames, parts)
         return Rollout(
             robot=plant.robot.name,
             body=plant.robot.body,
@@ -420,9 +420,9 @@ class ClosedLoop:
             diverged_at=records.time_of(records.lost_since),
             failed_at=records.time_of(records.failed_since),
             reasons=tuple(records.reasons),
-            frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
+            frame_times=np.arange(frames.shape[1]) * (plan.dt / parts),
             frames=frames,
-            disturbances=(*(one.describe(plant) for one in self.acting), *begun, *passing, *changed),
+            disturbances=(*(disturbance.describe(plant) for disturbance in self.acting), *begun, *passing, *changed),
             seed=self.seed,
             first_trial=self.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
@@ -439,13 +439,14 @@ def _record_of(moving: World | None, begun: float) -> MovingObstacles | None:
     """The obstacles that move, where they are at the time at which the run begins, in s."""
     if moving is None or not len(moving):
         return None
-    each = moving.moved(begun).obstacles
+    obstacles = moving.moved(begun).obstacles
     positions, rotations, sizes, velocities = (
-        np.array([getattr(one, field) for one in each]) for field in ("position", "rotation", "size", "velocity")
+        np.array([getattr(obstacle, field) for obstacle in obstacles])
+        for field in ("position", "rotation", "size", "velocity")
     )
     return MovingObstacles(
-        names=moving.names, kinds=tuple(one.kind for one in each), positions=positions, rotations=rotations,
-        sizes=sizes, velocities=velocities,
+        names=moving.names, kinds=tuple(obstacle.kind for obstacle in obstacles), positions=positions,
+        rotations=rotations, sizes=sizes, velocities=velocities,
     )  # fmt: skip
 
 
@@ -497,8 +498,8 @@ def _coordinates_of(controller: Controller, plant: Plant) -> tuple[Coordinates, 
             f" {_place(moves)}"
         )
     # A command that the robot clips is at a limit, whatever limits the policy assumed.
-    own = dynamics.control_coordinates
-    low, high = np.maximum(spaces[1].low, own.low), np.minimum(spaces[1].high, own.high)
+    control_space = dynamics.control_coordinates
+    low, high = np.maximum(spaces[1].low, control_space.low), np.minimum(spaces[1].high, control_space.high)
     return spaces[0], spaces[1].limited((low, high))
 
 

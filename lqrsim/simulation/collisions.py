@@ -35,7 +35,7 @@ class Collisions:
     ) -> None:
         self.plant, self.shape, self.dt, self._passing = plant, plant.shape, dt, passing
         moving = () if passing is None else passing.world.obstacles
-        self._velocities = np.array([one.velocity for one in moving]).reshape(-1, 3)
+        self._velocities = np.array([obstacle.velocity for obstacle in moving]).reshape(-1, 3)
         self._fastest = float(np.linalg.norm(self._velocities, axis=1).max(initial=0.0))
         self._displaced, self._moved = plant.shape.across(displaced), bool(displaced.any())
         self.at = np.full(len(states), np.inf)
@@ -56,10 +56,10 @@ class Collisions:
                 self.touch(int(row), start, touching[row])
             if len(self.plant.world) or len(self._velocities):
                 self._search_line(step, part, parts, self.shape.places(states), open_)
-        found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
+        rows = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # Rounding may put a time in the period past the period's end.
-        self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
-        return found
+        self.at[rows] = np.minimum(self.at[rows], (step + 1) * self.dt)
+        return rows
 
     def touch(self, row: int, time: float, touching: npt.NDArray[np.bool_]) -> None:
         """Record a contact that MuJoCo detected, with these obstacles (obstacles,)."""

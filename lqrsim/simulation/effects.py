@@ -59,14 +59,14 @@ class Effects:
         if plant.simulator is None or not plant.has_medium:  # an MJCF may have a drag beside its fluid
             winds.append((slice(0, 3), plant.robot.drag))
         self._pushes = [_ForceHook(*hook, slice(3, 6), 1.0) for hook in self._hooks("torque")]
-        for one in self._effects:
-            self._pushes += [_ForceHook(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [one])]
-            self._pushes += [_ForceHook(*hook, *wind) for hook in self._hooks("wind", [one]) for wind in winds]
+        for named in self._effects:
+            self._pushes += [_ForceHook(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [named])]
+            self._pushes += [_ForceHook(*hook, *wind) for hook in self._hooks("wind", [named]) for wind in winds]
 
     def _hooks(self, kind: str, effects: Sequence[tuple[str, Effect]] | None = None) -> list[tuple[str, Any]]:
         """The hooks of one kind, of all effects or these, each with its label for messages."""
-        given = [(name, getattr(effect, kind)) for name, effect in effects or self._effects]
-        return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
+        hooks = [(name, getattr(effect, kind)) for name, effect in effects or self._effects]
+        return [(f"{name}: {kind}: returned", hook) for name, hook in hooks if hook is not None]
 
     def initial_states(self, planned: Array, given: Array | None = None) -> Array:
         """The first states (K, n) of the trials, from the plan's; or given ones, which no disturbance may change."""
@@ -105,8 +105,8 @@ class Effects:
             measure(step, states.copy())
         for _, actuate in self._actuations:
             actuate(step, controls.copy())
-        for one in self._pushes:
-            one.hook(step, states)
+        for push in self._pushes:
+            push.hook(step, states)
         for _, kick in self._kicks:
             kick(step, states, controls)
 
@@ -120,8 +120,10 @@ class Effects:
     def read(self, step: int, readings: dict[str, Array]) -> dict[str, Array]:
         """The readings (K, any) of sensors, by name, with errors."""
         for label, read in self._reads:
-            found = check_kind(label, read(step, dict(readings)), dict, "readings by the names of sensors")
-            readings = {name: shaped(f"{label}: {name}", found.get(name), one.shape) for name, one in readings.items()}
+            noisy = check_kind(label, read(step, dict(readings)), dict, "readings by the names of sensors")
+            readings = {
+                name: shaped(f"{label}: {name}", noisy.get(name), reading.shape) for name, reading in readings.items()
+            }
         return readings
 
     def actuate(self, step: int, controls: Array) -> Array:
@@ -133,8 +135,8 @@ class Effects:
     def push(self, step: int, states: Array) -> tuple[Array, Array]:
         """Forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3), in world axes, at states (K, n)."""
         pushed = np.zeros((len(states), 9))
-        for one in self._pushes:
-            pushed[:, one.part] += one.factor * shaped(one.label, one.hook(step, states), (len(states), 3))
+        for push in self._pushes:
+            pushed[:, push.part] += push.factor * shaped(push.label, push.hook(step, states), (len(states), 3))
         return pushed[:, :6], pushed[:, 6:]
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:
@@ -157,15 +159,15 @@ class Readings:
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """The exact readings that arrive at a knot of the plan, before the run begins; as `arriving`."""
-        taken = self._sensors.reader()(states[:1], controls[:1], np.zeros((1, 6)))
-        return self._arriving(step, np.repeat(taken, len(states), axis=0))
+        exact = self._sensors.reader()(states[:1], controls[:1], np.zeros((1, 6)))
+        return self._arriving(step, np.repeat(exact, len(states), axis=0))
 
     def arriving(self, step: int, states: Array, held: Array | None) -> Array:
         """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
         exact = self._sensors.readings(self._physics.sense(held))
-        named = {one.name: exact[:, at] for one, at in self._columns()}
+        named = {sensor.name: exact[:, at] for sensor, at in self._columns()}
         named = self._effects.read(step, named)
-        return self._arriving(step, np.concatenate([named[one.name] for one, _ in self._columns()], axis=1))
+        return self._arriving(step, np.concatenate([named[sensor.name] for sensor, _ in self._columns()], axis=1))
 
     def _columns(self) -> zip:
         return zip(self._sensors.sensors, self._sensors.columns, strict=True)
@@ -219,11 +221,13 @@ class _Streams(Sequence[np.random.Generator]):
             return [self[number] for number in range(*place.indices(len(self)))]
         trial = self._trials[place]
         if trial not in self._made:
-            made = self._make(trial, self._stream)
+            generator = self._make(trial, self._stream)
             for draw in ("standard_normal", "random"):  # TrialScore uses objects that draw but are no Generators
-                if not callable(getattr(made, draw, None)):
-                    raise InputError(f"generators: got {excerpt(made)}, want a numpy.random.Generator of each trial")
-            self._made[trial] = made
+                if not callable(getattr(generator, draw, None)):
+                    raise InputError(
+                        f"generators: got {excerpt(generator)}, want a numpy.random.Generator of each trial"
+                    )
+            self._made[trial] = generator
         return self._made[trial]
 
 

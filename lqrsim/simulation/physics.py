@@ -90,7 +90,9 @@ class MujocoPhysics(Physics):
         self._act = self.simulations.bind("act") if plant.robot.activations else np.zeros((trials, 0))
         # Velocity of the medium, to which winds are added.
         self._medium = self.simulations.expand("opt.wind") if plant.has_medium else None
-        self._in_qpos, self._in_qvel, self._in_ctrl = (_span(one) for one in (plant.qpos, plant.qvel, plant.ctrl))
+        self._in_qpos, self._in_qvel, self._in_ctrl = (
+            _span(indices) for indices in (plant.qpos, plant.qvel, plant.ctrl)
+        )
         self.solid = np.zeros(trials, dtype=bool)
         self._before = self.simulations.state
         self._inactive: list[tuple[Array, npt.NDArray[np.intp], Array]] = []
@@ -321,15 +323,15 @@ def part_of(plant: Plant, substeps: int) -> int:
 
 def _quaternions(plant: Plant) -> list[int]:
     """The indices at which quaternions begin in the robot's own qpos."""
-    found, first = [], 0
+    starts, first = [], 0
     for name in plant.robot.joints:
         joint = plant.model.joint(name)
         if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
-            found.append(first)
+            starts.append(first)
         elif joint.type[0] == mujoco.mjtJoint.mjJNT_FREE:
-            found.append(first + 3)
+            starts.append(first + 3)
         first += joint.qpos0.size
-    return found
+    return starts
 
 
 def _turned(after: Array, before: Array, now: Array) -> Array:

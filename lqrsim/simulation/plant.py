@@ -74,27 +74,27 @@ class Plant(OneVersion):
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
         in_space = self.shape.centers is not None and not self.shape.in_plane
         bounded = "radius" not in robot.shape or robot.dynamics.state_coordinates.position
-        own, near = int(scene.model.body(robot.body).id), scene.world
+        root, near = int(scene.model.body(robot.body).id), scene.world
         if in_space or not bounded:  # the obstacles that MuJoCo lets it touch, except what it stands on
-            ids = set(touchable(scene.model, list(scene.geoms), own))
+            ids = set(touchable(scene.model, list(scene.geoms), root))
             pairs = zip(scene.geoms, scene.world.obstacles, strict=True)
-            near = World([one for geom, one in pairs if geom in ids])
+            near = World([obstacle for geom, obstacle in pairs if geom in ids])
         if in_space:
             self.shape = replace(self.shape, world=near)
         self.world = self.shape.world
         self.obstacles = self.world.names if bounded else near.names
-        self.body = own
+        self.body = root
         jointed = (int(scene.model.joint(name).bodyid[0]) for name in robot.joints)
-        attached = {own, *jointed}
+        attached = {root, *jointed}
         for body in range(scene.model.nbody):  # parents come before their children
             if scene.model.body_parentid[body] in attached:
                 attached.add(body)
         self.bodies = np.array(sorted(attached), dtype=np.intp)
-        mounts = mounting_pairs(scene.model, [geom for geom, one in self._scenery() if one in self.obstacles])
+        mounts = mounting_pairs(scene.model, [geom for geom, name in self._scenery() if name in self.obstacles])
         # What a choice of obstacles leaves out does not collide, but ground and what the robot stands on; for a robot
         # whose own steps are MuJoCo's all of it does.
         left = [] if robot.geoms is not None else sorted({*obstacle_geoms(scene.model)} - {*scene.geoms})
-        left = touching_pairs(scene.model, touchable(scene.model, left, own))
+        left = touching_pairs(scene.model, touchable(scene.model, left, root))
         apart = np.concatenate([mounts, left])
         self._apart = apart[np.isin(scene.model.geom_bodyid[apart[:, 0]], self.bodies)]
         self.model = self._compile()
@@ -249,12 +249,12 @@ class Plant(OneVersion):
 
     def _places_on(self, number: int, place: Array, states: Array) -> Array:
         """The position of a point of a body, (k, 1, 3), in these states (k, n)."""
-        data, found = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
+        data, places = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
         for k, qpos in enumerate(self.robot.configuration(states)[0]):
             data.qpos[self.qpos] = qpos
             mujoco.mj_kinematics(self.model, data)
-            found[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
-        return found
+            places[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
+        return places
 
     @property
     def obstacle_geoms(self) -> npt.NDArray[np.int64]:
@@ -279,14 +279,14 @@ class Plant(OneVersion):
         for geom, name in self._scenery():
             geoms[geom].name = name  # sensors need names
         _separate(spec, geoms, self._apart, self.scene.model)
-        taken = {sensor.name for sensor in spec.sensors}
+        sensors = {sensor.name for sensor in spec.sensors}
         for name in self.obstacles:
             if not contacts:
                 geom = next(geom for geom in geoms if geom.name == name)
                 geom.contype = geom.conaffinity = 0
                 continue
-            sensor = free_name(f"contact with {name}", taken)
-            taken.add(sensor)
+            sensor = free_name(f"contact with {name}", sensors)
+            sensors.add(sensor)
             spec.add_sensor(
                 name=sensor,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -331,17 +331,17 @@ def extent(plant: Plant) -> float:
         size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
         if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
             size = float(model.geom_size[geom, 0])  # upright: its outline from above
-        own, jointed = np.linalg.norm(model.geom_pos[geom]), False
+        distance, jointed = np.linalg.norm(model.geom_pos[geom]), False
         for body in path:
             first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
             jointed |= count > 0
-            own += np.linalg.norm(model.body_pos[body])
+            distance += np.linalg.norm(model.body_pos[body])
             for joint in range(first, first + count):
                 slides = model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
-                own += np.inf if slides else 2 * np.linalg.norm(model.jnt_pos[joint])
+                distance += np.inf if slides else 2 * np.linalg.norm(model.jnt_pos[joint])
         if not jointed:
-            own = np.linalg.norm((data.geom_xpos[geom] - data.xpos[plant.body])[axes])
-        reach = max(reach, float(own) + size + float(thick[geom]))
+            distance = np.linalg.norm((data.geom_xpos[geom] - data.xpos[plant.body])[axes])
+        reach = max(reach, float(distance) + size + float(thick[geom]))
     return off + reach + float(thickest)
 
 
@@ -365,7 +365,7 @@ def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs
             for other in same:
                 geoms[other].conaffinity |= of_others[same]
         geoms[fixed].contype, geoms[fixed].conaffinity = of_others[same], 0
-    names = {frozenset((geoms[one].name, geoms[other].name)) for one, other in apart.tolist()}
+    names = {frozenset((geoms[geom].name, geoms[other].name)) for geom, other in apart.tolist()}
     for pair in list(spec.pairs):
         if frozenset((pair.geomname1, pair.geomname2)) in names:
             spec.delete(pair)

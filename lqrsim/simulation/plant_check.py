@@ -154,17 +154,17 @@ def check_plant(
             f"samples: got {samples}, which take {samples * (waiting + substeps):.3g} physics steps, want at most"
             f" {MOST_STEPS}: fewer samples, or a shorter period or time to settle"
         )
-    found, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
+    compared, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
             state, control = near.draw(rng)
             if simulator is not None:
-                found.append(_in_simulator(simulator, plant, state, control, round(waiting), period))
+                compared.append(_in_simulator(simulator, plant, state, control, round(waiting), period))
                 continue
             sample, touched = _sample(plant, data, state, control, round(waiting), period)
-            found.append(sample)
+            compared.append(sample)
             touching.update(sorted(touched))
-    check = _worst_of(found, robot, period, tolerance, touching)
+    check = _worst_of(compared, robot, period, tolerance, touching)
     return check if simulator is None else replace(check, simulator=simulator.name)
 
 
@@ -193,15 +193,15 @@ class _Region(NamedTuple):
         spread: float | None, controls: Limits | None,
     ) -> "_Region":  # fmt: skip
         """The region by the arguments of `check_plant`."""
-        own = states, inputs = spaces_of(robot.dynamics)
+        spaces = states, inputs = spaces_of(robot.dynamics)
         n, points, middles, seconds = len(states), np.zeros((1, len(states))), None, 0.0
         if problem is not None:
-            check_same_system("problem", "a problem", spaces_of(problem.dynamics), own, "the robot")
+            check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces, "the robot")
             start, goal, seconds = problem.start, problem.weighed_goal, problem.steps * problem.dt
             start = np.zeros(n) if start is None else start
             points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), LINE)
         if plan is not None:
-            check_same_system("plan", "a plan", spaces_of(plan.policy), own, "the robot")
+            check_same_system("plan", "a plan", spaces_of(plan.policy), spaces, "the robot")
             points, middles = plan.trajectory.states[:-1], plan.trajectory.controls
             check_array("plan: trajectory", np.hstack([points, middles]), (None, n + len(inputs)))
         scale = SPREAD * _changes(points, states.units, seconds)
@@ -226,10 +226,10 @@ class _Region(NamedTuple):
 
 def _changes(points: Array, units: Sequence[str], seconds: float) -> Array:
     """What each column of points (k, n) changes by, in its unit: at least a little, and 1 if nothing is known of it."""
-    own = np.ptp(points, axis=0).tolist()
-    most = {unit: max(change for change, other in zip(own, units, strict=True) if other == unit) for unit in units}
+    extents = np.ptp(points, axis=0).tolist()
+    most = {unit: max(change for change, other in zip(extents, units, strict=True) if other == unit) for unit in units}
     changes = []
-    for change, unit in zip(own, units, strict=True):
+    for change, unit in zip(extents, units, strict=True):
         known = max(change, SLIGHT * most[unit])
         if not known and seconds and unit.endswith("/s"):  # the peak of a motion that is accelerated, then braked
             known = 2 * most.get(unit.removesuffix("/s"), 0.0) / seconds
@@ -241,8 +241,8 @@ def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> Array:
     """The lowest and the highest state, (2, n), infinite where unbounded, and the first mean, which lies between."""
     names = robot.dynamics.state_coordinates.names
     within = np.tile([[-np.inf], [np.inf]], len(names))
-    for one in () if problem is None else problem.constraints:
-        for i, (least, most) in one.state_bounds(robot.dynamics).items():  # the widest of all knots
+    for constraint in () if problem is None else problem.constraints:
+        for i, (least, most) in constraint.state_bounds(robot.dynamics).items():  # the widest of all knots
             within[:, i] = max(within[0, i], np.min(least)), min(within[1, i], np.max(most))
     for name, least, mean, most in zip(names, within[0], middle, within[1], strict=True):
         if not least <= mean <= most:
@@ -286,11 +286,11 @@ def _sample(
         mujoco.mj_step(plant.model, data)
     before = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=state)
     touched, model = set[tuple[str, str]](), plant.model
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]  # geoms of its kinematic tree
+    of_robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]  # geoms of its kinematic tree
     for _ in range(plant.substeps(period)):
         mujoco.mj_step(plant.model, data)
         pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
-        touched |= {(_name(model, a), _name(model, b)) for a, b in pairs if own[a] or own[b]}
+        touched |= {(_name(model, a), _name(model, b)) for a, b in pairs if of_robot[a] or of_robot[b]}
     if any(data.warning[kind].number for kind in UNSTABLE):
         raise InputError(
             f"scene {plant.scene.name}: got a simulation that becomes unstable from"

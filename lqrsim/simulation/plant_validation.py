@@ -75,14 +75,14 @@ def check_maps(plant: "Plant") -> None:
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
     qpos, qvel = (np.asarray(part) for part in robot.configuration(np.zeros(n)))
     joints, actuators = ", ".join(robot.joints) or "no joints", ", ".join(robot.actuators) or "no actuators"
-    for what, got, want, of in (
+    for field, got, want, of in (
         ("configuration: qpos", qpos, len(plant.qpos), joints),
         ("configuration: qvel", qvel, len(plant.qvel), joints),
         ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(plant.ctrl), actuators),
         ("state", np.asarray(robot.state(qpos, qvel)), n - robot.activations, "its dynamics"),
     ):
         if got.shape != (want,):
-            raise InputError(f"robot {robot.name}: {what}: got shape {got.shape}, want ({want},) for {of}")
+            raise InputError(f"robot {robot.name}: {field}: got shape {got.shape}, want ({want},) for {of}")
     if plant.simulator is None:
         _check_limits(plant)
     if robot.dynamics.state_coordinates.position:
@@ -107,19 +107,21 @@ def _check_limits(plant: "Plant") -> None:
         corners = np.repeat(np.clip(0.0, *finite)[None], 2 * m, axis=0)
         for k in range(m):
             corners[2 * k : 2 * k + 2, k] = finite[:, k]
-    asked = np.asarray(robot.actuation(corners), dtype=np.float64)
-    if asked.shape != (len(corners), len(plant.ctrl)):
+    commands = np.asarray(robot.actuation(corners), dtype=np.float64)
+    if commands.shape != (len(corners), len(plant.ctrl)):
         return  # the map takes one control only; running it raises an error
     low, high = model.actuator_ctrlrange[plant.ctrl].T
     spare = 1e-9 * np.maximum(np.abs(low), np.abs(high))
-    beyond = model.actuator_ctrllimited[plant.ctrl].astype(bool) & ~((asked >= low - spare) & (asked <= high + spare))
+    beyond = model.actuator_ctrllimited[plant.ctrl].astype(bool) & ~(
+        (commands >= low - spare) & (commands <= high + spare)
+    )
     if beyond.any():
         row, k = (int(place) for place in np.argwhere(beyond)[0])
-        given = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
+        controls = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
         name = plant.scene.mjcf.controls[plant.ctrl[k]].name
         raise InputError(
-            f"robot {robot.name}: control_limits: got controls ({given}), for which actuation() commands"
-            f" {asked[row, k]:g} of actuator {name!r}, want its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"
+            f"robot {robot.name}: control_limits: got controls ({controls}), for which actuation() commands"
+            f" {commands[row, k]:g} of actuator {name!r}, want its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"
         )
 
 
@@ -143,8 +145,8 @@ def _check_position(plant: "Plant") -> None:
         raise InputError(f"{who}: got ({', '.join(names)}) in {_of(space)}; {_remedy(plant, names, moves)}")
     for state in (np.zeros(n), middle):
         place = state[list(space.position)]
-        there, said = body(state), space.in_world(place)
-        off = there - said
+        origin, said = body(state), space.in_world(place)
+        off = origin - said
         if space.from_above:
             off[2] = 0.0  # its height is not known
         if np.abs(off).max() <= OFF:
@@ -153,11 +155,11 @@ def _check_position(plant: "Plant") -> None:
         if across >= 0 and np.abs(np.delete(off, across)).max() <= OFF:
             raise InputError(
                 f"{who}: got the plane {space.plane!r} at {SPACE[across]} = {said[across]:g} m, where MuJoCo has body"
-                f" {robot.body!r} at {SPACE[across]} = {there[across]:g} m; want offset={there[across]:g}"
+                f" {robot.body!r} at {SPACE[across]} = {origin[across]:g} m; want offset={origin[across]:g}"
             )
         raise InputError(
             f"{who}: got {_point(place)} m in {_of(space)}, where MuJoCo has the origin of body {robot.body!r} at"
-            f" {_point(there)} m; want configuration() to put it there (slides count from the body's pos in the MJCF)"
+            f" {_point(origin)} m; want configuration() to put it there (slides count from the body's pos in the MJCF)"
         )
 
 
@@ -187,14 +189,14 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
         mujoco.mj_kinematics(model, data)
         centres = balls.centres(robot.dynamics, state) if anchors else ()
         for k, site, (body, *place) in anchors:
-            there = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
-            off = there - centres[k]
+            position = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
+            off = position - centres[k]
             if plant.shape.in_plane and robot.dynamics.state_coordinates.from_above:
                 off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
                 raise InputError(
                     f"{who}: got {balls.ball_names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
-                    f" MuJoCo has {site!r} at {_point(there)} m; want them in the same place"
+                    f" MuJoCo has {site!r} at {_point(position)} m; want them in the same place"
                 )
 
 
@@ -204,15 +206,15 @@ def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:
     rows = np.round(moves)
     directions = [_direction(row) for row in (rows if exact else moves)]
     moved = ", ".join(f"{name} along {direction}" for name, direction in zip(names, directions, strict=True))
-    found = f"MuJoCo moves body {plant.robot.body!r} by a metre of {moved}"
+    motion = f"MuJoCo moves body {plant.robot.body!r} by a metre of {moved}"
     if exact and (np.abs(rows).sum(axis=1) == 1).all() and (rows.sum(axis=1) == 1).all():
         axes = "".join(SPACE[int(row.argmax())] for row in rows)
         if axes in PLANES:
-            return f"{found}; want plane={axes!r}"
+            return f"{motion}; want plane={axes!r}"
         if sorted(axes) == sorted(SPACE):
             order = ", ".join(repr(names[axes.index(letter)]) for letter in SPACE)
-            return f"{found}; want position=({order})"
-    return f"{found}; want each to move it by a metre along its own axis: check the joints and configuration()"
+            return f"{motion}; want position=({order})"
+    return f"{motion}; want each to move it by a metre along its own axis: check the joints and configuration()"
 
 
 def _of(space: Coordinates) -> str:

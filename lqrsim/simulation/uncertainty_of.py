@@ -31,10 +31,12 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
       disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
     """
     parts = list[Uncertainty]()
-    for one in as_disturbances(disturbances):
-        one.check(plant)
-        field = f"{type(one).__name__}: uncertainty"
-        parts.append(check_kind(field, one.uncertainty(plant), Uncertainty, "a method that returns an Uncertainty"))
+    for disturbance in as_disturbances(disturbances):
+        disturbance.check(plant)
+        field = f"{type(disturbance).__name__}: uncertainty"
+        parts.append(
+            check_kind(field, disturbance.uncertainty(plant), Uncertainty, "a method that returns an Uncertainty")
+        )
     total = gathered(parts)
     total.check(plant.robot.dynamics)
     return total

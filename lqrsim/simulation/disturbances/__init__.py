@@ -79,7 +79,11 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     have their own states, because its MJCF describes their lag. In a liquid there are currents in place of turbulence.
     """
     strength = PRESETS[check_name("preset", name, PRESETS)]
-    return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one) and _acts(one)]
+    return [
+        disturbance.scaled(strength)
+        for disturbance in _light(plant)
+        if _can_have(plant, disturbance) and _acts(disturbance)
+    ]
 
 
 def _light(plant: Plant) -> list[Disturbance]:

@@ -72,11 +72,11 @@ class Saturation(Disturbance):
     strength: NonNegative = 1.0
 
     def __post_init__(self) -> None:
-        given = [name for name in ("lowest", "highest") if getattr(self, name) is not None]
-        if bool(given) == (self.share is not None):
-            got = "both" if given else "neither"
+        stated = [name for name in ("lowest", "highest") if getattr(self, name) is not None]
+        if bool(stated) == (self.share is not None):
+            got = "both" if stated else "neither"
             raise InputError(f"Saturation: share: got {got} share and limits, want lowest, highest or both, or a share")
-        for name in given:
+        for name in stated:
             keep(self, **{name: self._checked(name, getattr(self, name))})
 
     def describe(self, plant: Plant) -> str:

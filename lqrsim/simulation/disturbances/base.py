@@ -81,9 +81,9 @@ class Effect:
     def __post_init__(self) -> None:
         if self.factors is not None:
             factors: dict[str, Array] = {}
-            for name, one in self.factors.items():
+            for name, factor in self.factors.items():
                 check_name("Effect: factors", name, PARAMETERS)
-                factors[name] = check_array(f"Effect: factors: {name}", one, (None, None))
+                factors[name] = check_array(f"Effect: factors: {name}", factor, (None, None))
                 if not (factors[name] > 0).all():
                     raise InputError(f"Effect: factors: {name}: got {factors[name].min():g}, want numbers > 0")
             keep(self, factors=factors)
@@ -109,8 +109,8 @@ class Disturbance(abc.ABC):
     def scaled(self, strength: float) -> "Disturbance":
         """The disturbance with `strength` times the effect, for sweeps: 0 has none, 1 is the disturbance itself."""
         if self._scales:
-            one: Any = self
-            return replace(one, **{self._scales: self._times(getattr(self, self._scales), strength)})
+            disturbance: Any = self
+            return replace(disturbance, **{self._scales: self._times(getattr(self, self._scales), strength)})
         raise InputError(
             f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
         )
@@ -135,16 +135,16 @@ class Disturbance(abc.ABC):
     def _unknowns(self, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:
         """The unknowns that are not zero. Unknowns that the robot's dynamics lack are listed as left out, by name."""
         known, missing = possible_unknowns(plant.robot.dynamics), dict[str, None]()
-        kept = list[Unknown]()
-        for one in wanted:
-            if one.std == 0:
+        unknowns = list[Unknown]()
+        for unknown in wanted:
+            if unknown.std == 0:
                 continue
-            missing |= dict.fromkeys(name for name in one.shares if name not in known)
-            shares = {name: share for name, share in one.shares.items() if name in known}
+            missing |= dict.fromkeys(name for name in unknown.shares if name not in known)
+            shares = {name: share for name, share in unknown.shares.items() if name in known}
             if shares:
-                kept.append(replace(one, of=shares))
+                unknowns.append(replace(unknown, of=shares))
         why = f"the dynamics of robot {plant.robot.name} have no {', '.join(missing)}"
-        return replace(self._left_out(plant, why, acts=bool(missing)), unknowns=kept)
+        return replace(self._left_out(plant, why, acts=bool(missing)), unknowns=unknowns)
 
     # Fields that are numbers: one, or one for each component; and strengths.
 
@@ -186,7 +186,7 @@ class Disturbance(abc.ABC):
     def _times(self, numbers: PerEntry, strength: float) -> Any:
         """Numbers times the strength, which must not be so large that they overflow."""
         if isinstance(numbers, Mapping):
-            return {name: self._times(one, strength) for name, one in numbers.items()}
+            return {name: self._times(number, strength) for name, number in numbers.items()}
         with np.errstate(over="ignore"):
             product = self._strength(strength) * np.asarray(numbers, dtype=np.float64)
         if not np.isfinite(product).all():

@@ -91,7 +91,9 @@ class Mismatch(Disturbance):
         self.check(plant)
         parts = self.parts(plant)
         if self.factor is None:
-            factors = 1 + (self.std or 0.0) * np.array([[cut_normal(one) for _ in parts] for one in generators])
+            factors = 1 + (self.std or 0.0) * np.array(
+                [[cut_normal(generator) for _ in parts] for generator in generators]
+            )
         else:
             factors = np.tile(self._fit(self.factor, parts, "factor"), (len(generators), 1))
         return self.effect(plant, factors)
@@ -166,10 +168,10 @@ class Payload(Disturbance):
         return Effect(alter=alter)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        load, whole = load_of(plant, self._number(plant)), "mass"
+        load, total = load_of(plant, self._number(plant)), "mass"
         declared = possible_unknowns(plant.robot.dynamics)
-        alone = load not in declared and whole in declared and len(plant.bodies) == 1
-        return self._unknowns(plant, [Unknown(whole if alone else load, self.mass)])
+        alone = load not in declared and total in declared and len(plant.bodies) == 1
+        return self._unknowns(plant, [Unknown(total if alone else load, self.mass)])
 
 
 class InertiaMismatch(Mismatch):
@@ -280,10 +282,10 @@ def load_of(plant: Plant, body: int) -> str:
 def controls_of(plant: Plant) -> dict[str | None, str]:
     """Map each actuator to the control that it is proportional to, if no other actuator depends on that control."""
     names = plant.robot.dynamics.control_coordinates.names
-    each = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
-    none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in each)
+    commands = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
+    none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in commands)
     follows = (one != none) | (two != none) | ~np.isfinite(one + two)  # (controls, MuJoCo's controls)
-    found: dict[str | None, str] = {}
+    controls: dict[str | None, str] = {}
     counts = plant.model.actuator_ctrlnum[plant.actuators]
     for j, actuator, count in zip(np.cumsum(counts) - counts, plant.robot.actuators, counts, strict=True):
         if count != 1:
@@ -293,20 +295,20 @@ def controls_of(plant: Plant) -> dict[str | None, str]:
             i = followed[0]
             proportional = none[i, j] == 0 and np.isclose(two[i, j], 2 * one[i, j], rtol=1e-9, atol=0)
             if proportional and follows[i].sum() == 1:
-                found[actuator] = names[i]
-    return found
+                controls[actuator] = names[i]
+    return controls
 
 
 def driven_by(plant: Plant, body: int) -> str | None:
     """The actuator that drives the joint of a body; None if there is none, or several."""
     model = plant.model
-    found = [
+    actuators = [
         name
         for name, number in zip(plant.robot.actuators, plant.actuators, strict=True)
         if model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT
         and model.jnt_bodyid[model.actuator_trnid[number, 0]] == body
     ]
-    return found[0] if len(found) == 1 else None
+    return actuators[0] if len(actuators) == 1 else None
 
 
 def cut_normal(generator: np.random.Generator) -> float:

@@ -96,9 +96,9 @@ class InitialStateError(AddedError):
 
 
 def _off(plant: Plant, states: Array, errors: Array) -> Array:
-    moved, found = errors.any(axis=-1), states + errors
-    found[moved] = plant.robot.with_closed_loops(found[moved])
-    return found
+    moved, noisy = errors.any(axis=-1), states + errors
+    noisy[moved] = plant.robot.with_closed_loops(noisy[moved])
+    return noisy
 
 
 class WrenchNoise(GaussianDisturbance):
@@ -206,7 +206,7 @@ def as_disturbances(given: object) -> tuple[Disturbance, ...]:
     """The disturbances, with each `Noise` converted to StateNoise. Raises InputError for anything else."""
     wanted = "disturbances, such as ControlNoise(0.05)"
     items = check_items("disturbances", given, (Disturbance, Noise), wanted)
-    return tuple(StateNoise(one) if isinstance(one, Noise) else one for one in items)
+    return tuple(StateNoise(item) if isinstance(item, Noise) else item for item in items)
 
 
 @checked

@@ -40,31 +40,32 @@ class SensorErrors(Disturbance):
     _scales = "strength"
 
     def __post_init__(self) -> None:
-        given = self.sensors
-        if not isinstance(given, Mapping):
-            known = check_items("SensorErrors: sensors", given, Sensor, "a list of Sensor")
-            given = {one.name: {key: getattr(one, key) for key in SETTINGS} for one in known}
-        for name, one in given.items():
+        sensors = self.sensors
+        if not isinstance(sensors, Mapping):
+            known = check_items("SensorErrors: sensors", sensors, Sensor, "a list of Sensor")
+            sensors = {sensor.name: {key: getattr(sensor, key) for key in SETTINGS} for sensor in known}
+        for name, settings in sensors.items():
             wanted = "settings of a Sensor by name"
-            for key in check_kind(f"SensorErrors: sensors: {name}", one, Mapping, wanted):
+            for key in check_kind(f"SensorErrors: sensors: {name}", settings, Mapping, wanted):
                 check_name(f"SensorErrors: sensors: {name}", key, SETTINGS)
-        keep(self, sensors=given)
-        keep(self, sensors={one.name: {key: getattr(one, key) for key in SETTINGS} for one in self.known})
+        keep(self, sensors=sensors)
+        keep(self, sensors={sensor.name: {key: getattr(sensor, key) for key in SETTINGS} for sensor in self.known})
 
     @cached_property
     def known(self) -> tuple[Sensor, ...]:
-        given: Any = self.sensors
-        return tuple(Sensor(name, **one) for name, one in given.items())
+        sensors: Any = self.sensors
+        return tuple(Sensor(name, **settings) for name, settings in sensors.items())
 
     def check(self, plant: Plant) -> None:
         plant.sensors(self.known)
 
     def describe(self, plant: Plant) -> str:
-        each = (
-            f"{one.name} (noise {one.noise:g}, bias {one.bias:g} and {one.bias_walk:g} in 1 s, loss {one.loss:g})"
-            for one in plant.sensors(self.known).sensors
+        listed = (
+            f"{sensor.name} (noise {sensor.noise:g}, bias {sensor.bias:g} and {sensor.bias_walk:g} in 1 s,"
+            f" loss {sensor.loss:g})"
+            for sensor in plant.sensors(self.known).sensors
         )
-        return f"errors of sensors, times {self.strength:g}: {', '.join(each)}"
+        return f"errors of sensors, times {self.strength:g}: {', '.join(listed)}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         known, knots = plant.sensors(self.known), plan.steps + 1
@@ -73,15 +74,15 @@ class SensorErrors(Disturbance):
         errors += known.each("bias") * normal(generators, 1, size)
         walks = normal(generators, plan.steps, size).cumsum(axis=1)
         errors[:, 1:] += known.each("bias_walk") * np.sqrt(plan.dt) * walks
-        losses = np.array([one.loss for one in known.sensors])
+        losses = np.array([sensor.loss for sensor in known.sensors])
         lost = uniform(generators, knots, len(losses)) < self.strength * losses
         errors *= self.strength
         for i, columns in enumerate(known.columns):
             errors[..., columns][lost[..., i]] = np.nan
-        of = {one.name: errors[..., columns] for one, columns in zip(known.sensors, known.columns, strict=True)}
+        of = {sensor.name: errors[..., columns] for sensor, columns in zip(known.sensors, known.columns, strict=True)}
 
         def read(step: int, readings: dict[str, Array]) -> dict[str, Array]:
-            return {name: one + of[name][:, step] if name in of else one for name, one in readings.items()}
+            return {name: reading + of[name][:, step] if name in of else reading for name, reading in readings.items()}
 
         return Effect(read=read)
 
@@ -116,10 +117,10 @@ class ReadingErrors(Disturbance):
             errors[uniform(generators, *errors.shape[1:]) < self.strength * self.loss] = np.nan
 
         def read(step: int, readings: Mapping[str, Array]) -> dict[str, Array]:
-            found = dict(readings)
-            if READINGS in found:
-                found[READINGS] = found[READINGS] + errors[:, step] * found[DEVIATIONS]
-            return found
+            noisy = dict(readings)
+            if READINGS in noisy:
+                noisy[READINGS] = noisy[READINGS] + errors[:, step] * noisy[DEVIATIONS]
+            return noisy
 
         return Effect(read=read)
 
