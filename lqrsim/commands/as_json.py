@@ -54,7 +54,7 @@ def of_solution(solution: "ls.Solution") -> Object:
         **_fields(plan, "steps dt"),
         "clearance": clearance,
         "goal": {"is": target.name, "distance": away, "radius": solution.goal_radius, "unit": target.unit},
-        "candidates": [_fields(one, "start cost iterations status") for one in solution.candidates],
+        "candidates": [_fields(candidate, "start cost iterations status") for candidate in solution.candidates],
     }
 
 

@@ -59,9 +59,9 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 def result(**parts: object) -> None:
     """Add to the output of `--json`; without it, do nothing."""
-    found = _RESULT.get()
-    if found is not None:
-        found.update(parts)
+    output = _RESULT.get()
+    if output is not None:
+        output.update(parts)
 
 
 def wants_result() -> bool:
@@ -72,9 +72,9 @@ def wants_result() -> bool:
 def wrote(path: Path) -> None:
     """Say that a file or folder was written."""
     say(f"wrote {path}")
-    found = _RESULT.get()
-    if found is not None:
-        found.setdefault("wrote", []).append(path)
+    output = _RESULT.get()
+    if output is not None:
+        output.setdefault("wrote", []).append(path)
 
 
 def say(text: str = "") -> None:
@@ -117,8 +117,8 @@ def keeping(write: Callable[[Any], object]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as stop:
-        if (found := getattr(stop, "found", None)) is not None:
-            write(found)
+        if (partial_result := getattr(stop, "found", None)) is not None:
+            write(partial_result)
         raise
 
 

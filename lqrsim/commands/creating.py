@@ -111,8 +111,12 @@ class Export:
         if (self.c is None) == (self.minari is None):
             raise ls.InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
         unused, target = (OF_C, "--c") if self.c is None else (OF_MINARI, "--minari")
-        if given := [one.name for one in fields(self) if one.name in unused and getattr(self, one.name) != one.default]:
-            raise ls.InputError(f"--{given[0]}: got {getattr(self, given[0])} without {target}, want it with that")
+        if misplaced := [
+            field.name for field in fields(self) if field.name in unused and getattr(self, field.name) != field.default
+        ]:
+            raise ls.InputError(
+                f"--{misplaced[0]}: got {getattr(self, misplaced[0])} without {target}, want it with that"
+            )
         if self.c is not None:
             self._to_c(self.c)
         if self.minari is not None:
@@ -122,11 +126,11 @@ class Export:
     def _to_c(self, folder: Path) -> None:
         console.check_output("--c", folder)
         policy: Any = ls.load(self.source)  # `export_c` refuses anything that cannot be exported
-        found = ls.export_c(policy, folder, **stated(self, ls.export_c))
-        for path in found.files:
+        exported = ls.export_c(policy, folder, **stated(self, ls.export_c))
+        for path in exported.files:
             console.wrote(path)
-        console.say(found.summary())
-        console.result(sha256=found.sha256, table_bytes=found.table_bytes, rounding=found.rounding)
+        console.say(exported.summary())
+        console.result(sha256=exported.sha256, table_bytes=exported.table_bytes, rounding=exported.rounding)
 
     def _to_minari(self, name: str) -> None:
         try:
@@ -135,9 +139,11 @@ class Export:
             raise ls.InputError(f"--minari: {error}, and 'lqrsim[minari]'") from None
         if self.source.is_dir():
             results = ls.stress.Results(self.source, scenario=self.scenario)
-            cells = [ls.stress.Cell.named(one, results.cells) for one in self.cell] or results.cells
+            cells = [ls.stress.Cell.named(cell_name, results.cells) for cell_name in self.cell] or results.cells
             shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
-            runs = (ls.stress.replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
+            runs = (
+                ls.stress.replay(results, cell, shard.first, trials=shard.count, frames=False) for cell, shard in shards
+            )
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
             named = self.scenario or results.manifest["campaign"]["scenario"]
             _ = results.resolved  # raises an exception if that is code which was not named
@@ -149,10 +155,10 @@ class Export:
             named = self.scenario or console.load_with_scenario(solution, None)[0].scenario
         # A path as text, from which `recover_environment` can make it.
         env = make_env(named, solution=str(solution.absolute()), actions=self.actions)
-        found = write_minari(name, env, runs)
-        console.wrote(found.spec.data_path)
-        console.say(f"{found.total_episodes} episodes of {found.total_steps} control periods")
-        console.result(episodes=found.total_episodes, steps=found.total_steps)
+        dataset = write_minari(name, env, runs)
+        console.wrote(dataset.spec.data_path)
+        console.say(f"{dataset.total_episodes} episodes of {dataset.total_steps} control periods")
+        console.result(episodes=dataset.total_episodes, steps=dataset.total_steps)
 
 
 def check_robot_name(name: str) -> None:
@@ -163,11 +169,11 @@ def check_robot_name(name: str) -> None:
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
         raise ls.InputError(f"name: got {excerpt(name)}, want {wanted}")
-    reserved = TAKEN | {one.lower() for one in (*dir(builtins), *keyword.kwlist)}
+    reserved = TAKEN | {word.lower() for word in (*dir(builtins), *keyword.kwlist)}
     if name in reserved:
         raise ls.InputError(f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another")
-    found = importlib.util.find_spec(name)
-    if found is not None and found.origin is not None:  # a folder without modules has no origin
+    spec = importlib.util.find_spec(name)
+    if spec is not None and spec.origin is not None:  # a folder without modules has no origin
         raise ls.InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")
 
 

@@ -144,10 +144,10 @@ class Cache:
             return 0
         items = disk_cache.items()
         together = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)
-        for what, alike in sorted(((what, list(some)) for what, some in together), key=lambda one: -one[1][0].used):
+        for kind, alike in sorted(((kind, list(some)) for kind, some in together), key=lambda one: -one[1][0].used):
             used = time.strftime("%Y-%m-%d %H:%M", time.localtime(alike[0].used))
             count = f" ({len(alike)} items)" if len(alike) > 1 else ""
-            console.say(f"{sum(item.size for item in alike) / 1e6:8.2f} MB  last used {used}  {what}{count}")
+            console.say(f"{sum(item.size for item in alike) / 1e6:8.2f} MB  last used {used}  {kind}{count}")
         total = sum(item.size for item in items) / 1e6
         console.say(
             f"{len(items)} items, {total:.1f} of at most {disk_cache.LIMIT / 1e6:.0f} MB, in {disk_cache.folder()}"

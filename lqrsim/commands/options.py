@@ -32,13 +32,13 @@ def _value_or_default(info: PrimitiveTypeInfo) -> Any:
     if len(kinds) != 2 or NoneType not in kinds:
         return None
     (kind,) = kinds - {NoneType}
-    found = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, info.markers))
-    if not isinstance(found, PrimitiveConstructorSpec):
-        return found
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, info.markers))
+    if not isinstance(spec, PrimitiveConstructorSpec):
+        return spec
     return replace(
-        found,
-        is_instance=lambda value: value is None or found.is_instance(value),
-        str_from_instance=lambda value: ["None"] if value is None else found.str_from_instance(value),
+        spec,
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: ["None"] if value is None else spec.str_from_instance(value),
     )
 
 
@@ -53,16 +53,16 @@ def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Comma
     """
     node: Any = _parsed(file)
     for part in name.split("."):
-        node = next(one for one in node.body if getattr(one, "name", None) == part)
+        node = next(child for child in node.body if getattr(child, "name", None) == part)
     words = ast.get_docstring(node) or ""
     types, defaults = dict[str, ast.expr](), dict[str, ast.expr]()
     if isinstance(node, ast.ClassDef):
-        for one in node.body:
-            if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name) and one.value is not None:
-                types[one.target.id], defaults[one.target.id] = one.annotation, one.value
+        for entry in node.body:
+            if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name) and entry.value is not None:
+                types[entry.target.id], defaults[entry.target.id] = entry.annotation, entry.value
     else:
-        for one, value in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True):
-            types[one.arg], defaults[one.arg] = one.annotation, value
+        for entry, value in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True):
+            types[entry.arg], defaults[entry.arg] = entry.annotation, value
 
     def add(command: type[Command]) -> type[Command]:
         options = dict[str, Any]()
@@ -101,11 +101,11 @@ def _type_of(annotation: ast.expr) -> Any:
 @cache
 def _kinds() -> dict[str, ast.expr]:
     """The annotations that have a name in `annotations.py`, such as `Positive`."""
-    found = dict[str, ast.expr]()
-    for one in _parsed("annotations.py").body:
-        if isinstance(one, ast.Assign) and isinstance(one.targets[0], ast.Name):
-            found[one.targets[0].id] = one.value
-    return found
+    kinds = dict[str, ast.expr]()
+    for statement in _parsed("annotations.py").body:
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            kinds[statement.targets[0].id] = statement.value
+    return kinds
 
 
 @cache

@@ -45,10 +45,10 @@ class FailureOptions(StudyOptions):
 
         try:
             with console.keeping(write), console.progress(*self.SEARCH) as progress:
-                found = self._search(problem, report=console.say, progress=progress)
+                result = self._search(problem, report=console.say, progress=progress)
         except ls.stress.NoFailure as none:
             return _say_none(none)
-        return write(found)
+        return write(result)
 
     SEARCH: ClassVar[tuple[str, str]]  # what the command does, and in which units, for its progress
 
@@ -178,18 +178,18 @@ class Certify:
         console.say(certificate.summary())
         try:
             with console.progress("splitting", "repetition") as progress:
-                found = ls.stress.certify(certificate, **stated(self, ls.stress.certify, progress=progress))
+                recheck = ls.stress.certify(certificate, **stated(self, ls.stress.certify, progress=progress))
         except ls.stress.NoFailure as none:
             return _say_none(none)
-        console.say(found.summary())
-        one = found.measured.probability
+        console.say(recheck.summary())
+        estimate = recheck.measured.probability
         console.result(
             probability=certificate.probability, low=certificate.low, high=certificate.high,
-            measured={"probability": one.value, "low": one.low, "high": one.high},
-            repetitions=len(found.measured.splitting.repetitions), differences=found.differences,
-            changed=found.changed or None,
+            measured={"probability": estimate.value, "low": estimate.low, "high": estimate.high},
+            repetitions=len(recheck.measured.splitting.repetitions), differences=recheck.differences,
+            changed=recheck.changed or None,
         )  # fmt: skip
-        return 1 if found.differences else 0
+        return 1 if recheck.differences else 0
 
 
 def _say_none(none: Exception) -> int:
@@ -242,11 +242,13 @@ class FunnelCommand(StudyOptions):
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
         level_test(space, steps, **stated(self, level_test))  # checked before the solve
         disturbances = []
-        for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
-            if isinstance(one, ls.disturbances.InitialStateError):
+        for disturbance in (
+            disturbance for name in self.disturbances for disturbance in disturbance_set(name, scenario)
+        ):
+            if isinstance(disturbance, ls.disturbances.InitialStateError):
                 console.say("without the InitialStateError of the set: runs begin in states of the funnel")
-                one = one.scaled(0.0)  # keeps the other disturbances' random numbers
-            disturbances.append(one.scaled(self.strength))
+                disturbance = disturbance.scaled(0.0)  # keeps the other disturbances' random numbers
+            disturbances.append(disturbance.scaled(self.strength))
         options = stated(self, ls.funnel, **study.closed_loop, disturbances=disturbances)
 
         def write(found: "Funnel") -> int:
@@ -259,5 +261,5 @@ class FunnelCommand(StudyOptions):
             return 0 if found.levels.any() else 1
 
         with console.keeping(write), console.progress("looking", "knot") as progress:
-            found = ls.funnel(**options, progress=progress)
-        return write(found)
+            funnel = ls.funnel(**options, progress=progress)
+        return write(funnel)

@@ -76,7 +76,9 @@ class Reproduce:
         chosen = [name for name in SCRIPTS if name in named]
         out = self.out
         console.check_output("--out", out)
-        kept = _kept(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
+        earlier = (
+            _kept(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
+        )
         results, failures, begun = dict[str, ScriptResult](), list[Failure](), time.monotonic()
         with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
             for name in chosen:
@@ -92,9 +94,9 @@ class Reproduce:
                     console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
                 bar.update()
         if results:
-            together = kept["results"] | results
+            together = earlier["results"] | results
             ordered = {name: together[name] for name in SCRIPTS if name in together}
-            saved = {"machine": kept["machine"], "quick": self.quick, "results": ordered}
+            saved = {"machine": earlier["machine"], "quick": self.quick, "results": ordered}
             with replacing(out / "results.json") as unfinished:
                 unfinished.write_text(json.dumps(plain(saved), allow_nan=False) + "\n", encoding="utf-8")
             with replacing(out / "results.md") as unfinished:
@@ -163,7 +165,7 @@ def results_page(saved: Mapping[str, Any]) -> str:
         run = [f"{result['seconds']} s"]
         # With --keep, a result may be of another version or machine than the page's first lines say.
         used = result["result"]["versions"].items()
-        if other := [f"{what} {version}" for what, version in used if versions.get(what) != version]:
+        if other := [f"{package} {version}" for package, version in used if versions.get(package) != version]:
             run.append(f"with {' and '.join(other)}")
         if (machine := result.get("machine", saved["machine"])) != saved["machine"]:
             run.append(f"on {machine}")
@@ -180,17 +182,17 @@ def results_page(saved: Mapping[str, Any]) -> str:
 
 def _count(statements: Sequence[Mapping[str, Any]]) -> str:
     """Text with the number of statements that hold."""
-    counts = {verdict: sum(one["holds"] is verdict for one in statements) for verdict in VERDICTS}
+    counts = {verdict: sum(statement["holds"] is verdict for statement in statements) for verdict in VERDICTS}
     said = f"Of {len(statements)} tests of what the paper says, {counts[True]} hold and {counts[False]} do not"
     return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."
 
 
 def verdicts(results: Mapping[str, ScriptResult], out: Path) -> Iterator[str]:
     """Three lines for each statement, for a terminal."""
-    statements = [statement for one in results.values() for statement in one["statements"]]
-    for one in statements:
-        yield f"{VERDICTS[one['holds']].strip('*').upper():<14} {one['where']}: {one['paper']}"
-        yield f"{'':<14} {one['ours']}  [want: {one['test']}]"
-        yield f"{'':<14} {out / 'figures' / one['figure']}.png"
+    statements = [statement for result in results.values() for statement in result["statements"]]
+    for statement in statements:
+        yield f"{VERDICTS[statement['holds']].strip('*').upper():<14} {statement['where']}: {statement['paper']}"
+        yield f"{'':<14} {statement['ours']}  [want: {statement['test']}]"
+        yield f"{'':<14} {out / 'figures' / statement['figure']}.png"
     if statements:
         yield _count(statements)

@@ -29,8 +29,8 @@ class List:
     def run(self) -> int:
         from lqrsim.scenarios.references import resolve
 
-        found = {name: resolve(name) for name in self.scenarios or ls.scenarios.names()}
-        for name, scenario in found.items():
+        scenarios = {name: resolve(name) for name in self.scenarios or ls.scenarios.names()}
+        for name, scenario in scenarios.items():
             problem = scenario.problem
             console.say(f"{name}: {scenario.summary}")
             console.say(f"  robot:    {scenario.robot.name} in scene {scenario.scene.name}")
@@ -39,7 +39,7 @@ class List:
             console.say(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
             for line in str(scenario.robot).splitlines()[2:]:  # of a robot from an MJCF; the first two say the same
                 console.say(line)
-        console.result(scenarios=[as_json.of_scenario(name, scenario) for name, scenario in found.items()])
+        console.result(scenarios=[as_json.of_scenario(name, scenario) for name, scenario in scenarios.items()])
         return 0
 
 
@@ -92,8 +92,8 @@ class Solve:
         console.check_output("--out", folder)
         problem = scenario.problem
         if self.clearance is not None:
-            kept = ls.Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)
-            problem = replace(problem, constraints=[*problem.constraints, kept])
+            clearance = ls.Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)
+            problem = replace(problem, constraints=[*problem.constraints, clearance])
         if self.control_limits is not None:
             problem = replace(problem, control_limits=self.control_limits)
         of_smooth = {
@@ -101,10 +101,10 @@ class Solve:
             "--starts": self.starts is not None,
             "--paper-start": self.paper_start,
         }
-        if self.solver != "smooth" and (wrong := [name for name, given in of_smooth.items() if given]):
+        if self.solver != "smooth" and (wrong := [name for name, used in of_smooth.items() if used]):
             raise ls.InputError(f"{', '.join(wrong)}: got --solver {self.solver}, want --solver smooth")
-        given = {name: getattr(self, name) for name in ("tolerance", "max_iterations", "time_limit", "starts")}
-        options = {"stop": self.stop, **{name: value for name, value in given.items() if value is not None}}
+        settings = {name: getattr(self, name) for name in ("tolerance", "max_iterations", "time_limit", "starts")}
+        options = {"stop": self.stop, **{name: value for name, value in settings.items() if value is not None}}
         if self.finish == "none":
             options["finish"] = None
         scenario = replace(scenario, problem=problem, start=self._start(scenario))
@@ -137,8 +137,8 @@ class Solve:
         """The start of the solve. Raises InputError for several starts, or a start that the scenario lacks."""
         from lqrsim.scenarios.solutions import stored_start
 
-        given = {"--start": self.start is not None, "--paper-start": self.paper_start, "--starts": self.starts}
-        named = [name for name, one in given.items() if one]
+        choices = {"--start": self.start is not None, "--paper-start": self.paper_start, "--starts": self.starts}
+        named = [name for name, chosen in choices.items() if chosen]
         if len(named) > 1:
             raise ls.InputError(f"{', '.join(named)}: got {len(named)} of them, want one: each chooses the start")
         if self.start is not None:
@@ -208,8 +208,8 @@ class Simulate:
         if self.design_disturbances is not None:
             check_designed((self.controller,))
         controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
-        named = [one for name in self.disturbances for one in disturbance_set(name, scenario)]
-        disturbances = [*(one.scaled(self.strength) for one in named), *self._single_disturbances()]
+        named = [disturbance for name in self.disturbances for disturbance in disturbance_set(name, scenario)]
+        disturbances = [*(disturbance.scaled(self.strength) for disturbance in named), *self._single_disturbances()]
         plant, near = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
         options = stated(self, ls.simulate, controller=controller, disturbances=disturbances, **near)
         with console.progress("simulating", "step") as progress:
@@ -218,10 +218,11 @@ class Simulate:
         if self.controller in DESIGNED and self.design_disturbances is None:
             console.say(f"{self.controller} was designed for {DEFAULT_DESIGN}; for others: --design-disturbances NAME")
         violations = _violations(scenario.problem, rollout)
-        for one in (one for one in violations or () if one["trials"]):
+        for violation in (violation for violation in violations or () if violation["trials"]):
             console.say(
-                f"{one['trials']} of {rollout.trials} trials violate a constraint, {one['constraint']}, by up to"
-                f" {one['most']:.3g} (trial {one['trial']} at {one['time']:.2f} s); outcomes do not count this"
+                f"{violation['trials']} of {rollout.trials} trials violate a constraint, {violation['constraint']}, by"
+                f" up to {violation['most']:.3g} (trial {violation['trial']} at {violation['time']:.2f} s); outcomes do"
+                " not count this"
             )
         if violations is None and scenario.problem.constraints:
             console.say(
@@ -323,9 +324,9 @@ def _violations(problem: "ls.Problem", rollout: "ls.Rollout") -> list[dict[str, 
     if other or isinstance(problem.dynamics, Belief):
         return None
     listed = list[dict[str, Any]]()
-    for name, found in problem.violations(rollout).items():
-        worst, count = int(found[:, 0].argmax()), int((found[:, 0] > 0).sum())
-        by, when = found[worst].tolist()
+    for name, excesses in problem.violations(rollout).items():
+        worst, count = int(excesses[:, 0].argmax()), int((excesses[:, 0] > 0).sum())
+        by, when = excesses[worst].tolist()
         where = {"trial": rollout.first_trial + worst, "time": when} if count else {"trial": None, "time": None}
         listed.append({"constraint": name, "trials": count, "most": by, **where})
     return listed

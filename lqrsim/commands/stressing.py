@@ -66,8 +66,8 @@ class Stress(SetupOptions):
             )
         console.say(results.summary())
         console.wrote(folder)
-        own = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
-        console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *own])}")
+        options = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
+        console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *options])}")
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0
@@ -107,8 +107,8 @@ class Replay:
         if summary := rollout.controller_run.summary():
             console.say(summary)
         different = differences(results, cell, self.trial, rollout)
-        for one in different:
-            console.say(f"NOT as in the table: {one}")
+        for difference in different:
+            console.say(f"NOT as in the table: {difference}")
         if not different:
             console.say("identical to the table")
         console.wrote(ls.save(rollout, self.out))

@@ -103,12 +103,12 @@ class Render:
             raise ls.InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
         # Whoever opens such a file chooses the camera and the time.
         is_page = kind == ".html"
-        taken = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if is_page else [])]
-        others = [f"--{f.name}" for f in fields(self) if f.name not in taken and getattr(self, f.name) != f.default]
+        accepted = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if is_page else [])]
+        others = [f"--{f.name}" for f in fields(self) if f.name not in accepted and getattr(self, f.name) != f.default]
         several = max(len(self.rollouts), len(self.solution), len(self.funnel)) > 1
         if others or several or not (is_page or self.trial is None or len(self.trial) == 1):
-            what = "runs, solutions or funnels" if is_page else "runs, trials or funnels, or none"
-            got = ", ".join(others) or f"several {what}"
+            kinds = "runs, solutions or funnels" if is_page else "runs, trials or funnels, or none"
+            got = ", ".join(others) or f"several {kinds}"
             want = "one run, one --trial, at most one --funnel, and no other options"
             if is_page:
                 want = "one run, at most one --solution and --funnel, and of other options --trial and --overlays"

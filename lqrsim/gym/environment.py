@@ -128,9 +128,9 @@ class Expert:
 
     def __init__(self, env: Any, controller: ControllerLike | None = None) -> None:
         kinds = (Environment, VectorEnvironment)
-        made = check_kind("env", getattr(env, "unwrapped", env), kinds, "an environment of lqrsim.gym")
-        self._law, _ = as_controller(controller, made.solution, made.task.plant.robot.dynamics)
-        self._task, self._steps = made.task, made.solution.trajectory.steps
+        unwrapped = check_kind("env", getattr(env, "unwrapped", env), kinds, "an environment of lqrsim.gym")
+        self._law, _ = as_controller(controller, unwrapped.solution, unwrapped.task.plant.robot.dynamics)
+        self._task, self._steps = unwrapped.task, unwrapped.solution.trajectory.steps
         self._run: ControllerRun | None = None
 
     def __call__(self, observation: npt.ArrayLike) -> Array:

@@ -61,8 +61,8 @@ class Task:
             kinds = "a Scenario, or a reference to one, such as 'quadrotor,query=3'"
             scenario = resolve(check_kind("scenario", scenario, str, kinds))
         self.scenario, self.plant = scenario, scenario.plant()
-        own, robot = spaces_of(scenario.problem.dynamics), self.plant.robot
-        check_same_system("scenario", "a problem", own, spaces_of(robot.dynamics), f"robot {robot.name}")
+        spaces, robot = spaces_of(scenario.problem.dynamics), self.plant.robot
+        check_same_system("scenario", "a problem", spaces, spaces_of(robot.dynamics), f"robot {robot.name}")
         self._actions = actions
         self._given = None if solution is None else given(self.scenario, solution)
         for remark in [] if self._given is None else remarks(self.scenario, self._given):
@@ -119,25 +119,25 @@ class Task:
         wanted = "a name, such as 'moderate', or a tuple of names and disturbances"
         strength = check_number("strength", strength, at_least=0.0)
         items = (given,) if isinstance(given, str) else check_items("disturbances", given, (str, Disturbance), wanted)
-        found: list[Disturbance] = []
-        for one in items:
-            found += disturbance_set(one, self.scenario) if isinstance(one, str) else (one,)
-        return tuple(found if strength == 1 else [one.scaled(strength) for one in found])
+        disturbances: list[Disturbance] = []
+        for item in items:
+            disturbances += disturbance_set(item, self.scenario) if isinstance(item, str) else (item,)
+        return tuple(disturbances if strength == 1 else [disturbance.scaled(strength) for disturbance in disturbances])
 
     def trials(self, following: int, options: Any) -> tuple[int, tuple[Disturbance, ...]]:
         """The first trial for the options of a `reset`, by default `following`, and the disturbances."""
-        given = reset_options(options)
-        for name in given:
+        settings = reset_options(options)
+        for name in settings:
             check_name("options", name, RESET_OPTIONS)
-        first = check_seed("options: trial", given.get("trial", following))
-        if "preset" in given and "disturbances" in given:
+        first = check_seed("options: trial", settings.get("trial", following))
+        if "preset" in settings and "disturbances" in settings:
             raise InputError("options: got disturbances and preset, want one of the two")
-        if "preset" not in given and "disturbances" not in given:
-            if "strength" in given:
+        if "preset" not in settings and "disturbances" not in settings:
+            if "strength" in settings:
                 raise InputError("options: got strength alone, want it with disturbances or preset")
             return first, self._disturbances
-        disturbances = given.get("disturbances", given.get("preset"))
-        return first, self.disturbances_of(disturbances, given.get("strength", 1.0))
+        disturbances = settings.get("disturbances", settings.get("preset"))
+        return first, self.disturbances_of(disturbances, settings.get("strength", 1.0))
 
 
 def reset_options(options: Any) -> dict[str, Any]:

@@ -50,8 +50,8 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
         parse_dataset_id(check_text("name", name, NAMED))
     except (ValueError, TypeError):  # a TypeError for a name without a version
         raise InputError(f"name: got {excerpt(name)}, want {NAMED}") from None
-    made = check_kind("env", getattr(env, "unwrapped", env), Environment, "an Environment of lqrsim.gym")
-    task, facts, episodes = made.task, list[Any](), list[Any]()
+    unwrapped = check_kind("env", getattr(env, "unwrapped", env), Environment, "an Environment of lqrsim.gym")
+    task, facts, episodes = unwrapped.task, list[Any](), list[Any]()
     runs = [rollouts] if isinstance(rollouts, Rollout) else rollouts
 
     def buffers() -> Iterator[Any]:
@@ -61,11 +61,11 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
                 trial = {"trial": rollout.first_trial + row, "outcome": rollout.outcome[row], "rollout": len(facts)}
                 episodes.append(trial)
                 yield EpisodeBuffer(seed=rollout.seed, **arrays)
-            facts.append({one: getattr(rollout, one) for one in FACTS} | {"versions": dict(rollout.versions)})
+            facts.append({fact: getattr(rollout, fact) for fact in FACTS} | {"versions": dict(rollout.versions)})
         if not episodes:
             raise InputError("rollouts: got no trial that ran for a control period, want at least one")
 
-    about = {"description": f"{task.scenario.name}: {task.scenario.summary}", "env": made, **about}
+    about = {"description": f"{task.scenario.name}: {task.scenario.summary}", "env": unwrapped, **about}
     try:
         with _whole(get_dataset_path(name)), warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"minari\.")  # what is not known, such as an author
@@ -82,12 +82,12 @@ def _whole(folder: Path) -> Iterator[None]:
     """Remove a new data set, and namespaces made for it, unless the block succeeds. Raises InputError if it exists."""
     if os.path.lexists(folder):
         raise InputError(f"name: got the name of {folder}, which exists, want another name or version")
-    made = [one for one in folder.parents if not one.exists()]
+    namespaces = [parent for parent in folder.parents if not parent.exists()]
     try:
         yield
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
-        for namespace in made:
+        for namespace in namespaces:
             with contextlib.suppress(OSError):
                 if set(os.listdir(namespace)) <= {"namespace_metadata.json"}:  # nobody else has written into it
                     shutil.rmtree(namespace)
@@ -101,9 +101,11 @@ def _checked(task: Task, rollouts: Iterable[Any]) -> Iterator[Rollout]:
     if not isinstance(rollouts, Iterable) or isinstance(rollouts, np.ndarray):
         raise InputError(f"rollouts: got {excerpt(rollouts)}, want {wanted}")
     for rollout in rollouts:
-        own = check_kind("rollouts", rollout, Rollout, wanted).plan
+        run_plan = check_kind("rollouts", rollout, Rollout, wanted).plan
         check_same_system("rollouts", "a run", spaces_of(rollout), system, "the environment")
-        if own.dt != plan.dt or not all(map(np.array_equal, (own.states, own.controls), (plan.states, plan.controls))):
+        if run_plan.dt != plan.dt or not all(
+            map(np.array_equal, (run_plan.states, run_plan.controls), (plan.states, plan.controls))
+        ):
             raise InputError("rollouts: got runs of another plan than env's, want env to have their solution=")
         yield rollout
 

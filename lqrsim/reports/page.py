@@ -196,7 +196,7 @@ def _text_and_tables(
     results: Results, table: analysis.Table, worst: Sequence[Trials], scenario: Scenario
 ) -> dict[str, Any]:
     campaign, unit = results.campaign, tracking_unit(scenario.problem.dynamics.state_coordinates)
-    whole = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
+    finished = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
     erred = sum(int((outcomes.outcome == "error").sum()) for outcomes in table.values())
     done, all_trials = sum(map(len, table.values())), len(results.cells) * campaign.trials
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
@@ -217,7 +217,7 @@ def _text_and_tables(
         "breaks": breaks_table(table),
         "broken_below": f"{100 * BROKEN_BELOW:g} %",
         "reach": f"{radius:g} {target.unit} of the {target.name}",
-        "compared": comparison_tables(whole, unit),
+        "compared": comparison_tables(finished, unit),
         "modes": failure_table(table),
         "measures": measure_tables(table, scenario),
         "worst": worst_table(worst, unit),
@@ -283,8 +283,8 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
 
     def told(curves: Curves, spec: str, unit: str = "") -> str:
         """The middles of curves, in words."""
-        each = {name: [f"{of[at][1]:{spec}}{unit} at {at:g}" for at in of] for name, of in curves.items()}
-        return "; ".join(f"{name}: {', '.join(middles)}" for name, middles in each.items())
+        texts = {name: [f"{of[at][1]:{spec}}{unit} at {at:g}" for at in of] for name, of in curves.items()}
+        return "; ".join(f"{name}: {', '.join(middles)}" for name, middles in texts.items())
 
     return {
         "name": name,
@@ -334,10 +334,10 @@ def breaks_table(table: analysis.Table) -> PageTable:
     """The strength at which each policy breaks in each sweep."""
     rows = [
         [
-            one.policy, one.sweep, "not at any" if one.strength is None else f"{one.strength:g}",
-            "" if one.success is None else _percent(one.success),
+            broken.policy, broken.sweep, "not at any" if broken.strength is None else f"{broken.strength:g}",
+            "" if broken.success is None else _percent(broken.success),
         ]
-        for one in analysis.breaks(table, below=BROKEN_BELOW)
+        for broken in analysis.breaks(table, below=BROKEN_BELOW)
     ]  # fmt: skip
     return PageTable("Where policies break", ("policy", "sweep", "at strength", "success there"), rows)
 

@@ -64,7 +64,7 @@ def mjcf(
     keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
     mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None
     of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts, "armature": armature}
-    is_stated = any(one is not None for one in of_urdf.values())
+    is_stated = any(setting is not None for setting in of_urdf.values())
     file = load_scene(path, **of_urdf) if is_stated else path
     robot = MjcfRobot(file, body=body, floors=floors, turns_about=turns_about, obstacles=obstacles, mocap=mocap)
     if parameters:
@@ -97,8 +97,8 @@ def _state(robot: MjcfRobot, field: str, place: Place) -> Array:
         space = robot.dynamics.state_coordinates
         units = dict(zip(space.names, space.units, strict=True))
         meant = [f"{name} in {units[name]}" for name in re.findall(r"\w+", keyframe) if units.get(name)]
-        told = f": {', '.join(meant)}" if meant else ""
-        raise InputError(f"{field}: got {excerpt(keyframe)}, want {{'x': 1.0}}, numbers without units{told}")
+        hint = f": {', '.join(meant)}" if meant else ""
+        raise InputError(f"{field}: got {excerpt(keyframe)}, want {{'x': 1.0}}, numbers without units{hint}")
     if not isinstance(keyframe, str | None):
         raise InputError(f"{field}: keyframe: got {excerpt(keyframe)}, want its name")
     try:

@@ -69,19 +69,23 @@ def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]
     """The disturbances of a set at strength 1; see the top of this file for its names."""
     from lqrsim.simulation.disturbances import PRESETS, preset
 
-    whole, colon, kind = name.partition(":")
-    check_name("disturbances", whole, ["scenario", *PRESETS])
-    found = scenario.disturbances if whole == "scenario" else tuple(preset(whole, scenario.plant()))
-    if not found:
-        why = f"scenario {scenario.name} states none" if whole == "scenario" else "the robot has none of them"
+    set_name, colon, kind = name.partition(":")
+    check_name("disturbances", set_name, ["scenario", *PRESETS])
+    disturbances = scenario.disturbances if set_name == "scenario" else tuple(preset(set_name, scenario.plant()))
+    if not disturbances:
+        why = f"scenario {scenario.name} states none" if set_name == "scenario" else "the robot has none of them"
         raise InputError(
             f"disturbances: got {name!r}, but {why}, want a set with disturbances: a preset, such as --sweep light (of"
             " lqrsim simulate: --disturbances light)"
         )
     if not colon:
-        return found
-    check_name(f"kind of disturbance in {whole}", kind, dict.fromkeys(type(one).__name__ for one in found))
-    return tuple(one for one in found if type(one).__name__ == kind)
+        return disturbances
+    check_name(
+        f"kind of disturbance in {set_name}",
+        kind,
+        dict.fromkeys(type(disturbance).__name__ for disturbance in disturbances),
+    )
+    return tuple(disturbance for disturbance in disturbances if type(disturbance).__name__ == kind)
 
 
 def names_code(reference: str) -> bool:

@@ -48,20 +48,20 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
     Args:
       path: path of a solution, of a policy, of a certificate, or of a rollout or funnel, for its plan.
     """
-    found = load(path)
-    if isinstance(found, FailureCertificate):
-        found = found.solution
-    if isinstance(found, OutputFeedbackPolicy):
+    stored = load(path)
+    if isinstance(stored, FailureCertificate):
+        stored = stored.solution
+    if isinstance(stored, OutputFeedbackPolicy):
         raise InputError(
             f"start: got {path}, a policy with an estimator, want a solution, a policy of the state, a rollout or a"
             " funnel"
         )
-    if isinstance(found, Solution | AffinePolicy):
-        policy = found if isinstance(found, AffinePolicy) else found.policy
+    if isinstance(stored, Solution | AffinePolicy):
+        policy = stored if isinstance(stored, AffinePolicy) else stored.policy
         _check_fits("start", path, scenario, spaces_of(policy), len(policy.gain))
-        return found
-    plan = found.plan
-    _check_fits("start", path, scenario, spaces_of(found), plan.steps)
+        return stored
+    plan = stored.plan
+    _check_fits("start", path, scenario, spaces_of(stored), plan.steps)
     return plan
 
 
@@ -71,27 +71,27 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     The solution may not have converged, or may be of another problem; `remarks` then says so.
     """
     stored = isinstance(solution, str | os.PathLike)
-    what = str(solution) if stored else "one"
-    found = load(solution, Solution) if stored else solution
-    check_kind("solution", found, Solution, "a Solution, or the path of one")
-    law, plan, problem = found.policy, found.trajectory, scenario.problem
-    _check_fits("solution", what, scenario, spaces_of(law), plan.steps)
+    label = str(solution) if stored else "one"
+    loaded = load(solution, Solution) if stored else solution
+    check_kind("solution", loaded, Solution, "a Solution, or the path of one")
+    law, plan, problem = loaded.policy, loaded.trajectory, scenario.problem
+    _check_fits("solution", label, scenario, spaces_of(law), plan.steps)
     if plan.dt != problem.dt and problem.duration is None:
-        raise InputError(f"solution: got {what} with a control period of {plan.dt:g} s, want {problem.dt:g} s")
+        raise InputError(f"solution: got {label} with a control period of {plan.dt:g} s, want {problem.dt:g} s")
     names = law.state_coordinates.names
     none = np.full(len(names), np.nan)
-    goals = zip(*(none if one is None else one for one in (found.goal, problem.weighed_goal)), strict=True)
+    goals = zip(*(none if goal is None else goal for goal in (loaded.goal, problem.weighed_goal)), strict=True)
     for name, (got, want) in zip(names, goals, strict=True):
         if got != want and not (np.isnan(got) and np.isnan(want)):
             raise InputError(
-                f"solution: got {what} with the goal {name} = {got:.9g}, want {want:.9g} (nan: none), as"
+                f"solution: got {label} with the goal {name} = {got:.9g}, want {want:.9g} (nan: none), as"
                 f" {scenario.name} has it"
             )
     if not np.isfinite(plan.states).all():
         raise InputError(
-            f"solution: got {what}, whose plan is not finite ({found.status.name}), want one that can be run"
+            f"solution: got {label}, whose plan is not finite ({loaded.status.name}), want one that can be run"
         )
-    return replace(found, goal_radius=scenario.target_radius(target=found.target))
+    return replace(loaded, goal_radius=scenario.target_radius(target=loaded.target))
 
 
 def remarks(scenario: Scenario, solution: Solution) -> list[str]:
@@ -117,7 +117,9 @@ def difference(solution: Solution, problem: Problem) -> str:
         return ""
     pairs = {name: (solution.problem_parts.get(name, "none"), text or "none") for name, text in problem.parts.items()}
     named = [
-        f"{name} {' instead of '.join(_differing(one, other))}" for name, (one, other) in pairs.items() if one != other
+        f"{name} {' instead of '.join(_differing(solved, stated))}"
+        for name, (solved, stated) in pairs.items()
+        if solved != stated
     ]
     text = "; ".join(named)
     text = text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
@@ -132,12 +134,12 @@ def _differing(*texts: str) -> list[str]:
     """Two descriptions without the items with which both begin or end."""
     items = [re.split(r"(?<=[,;] )|(?<= \+ )", text) for text in texts]
     least = min(map(len, items)) - 1
-    begin = next((i for i, (one, other) in enumerate(zip(*items, strict=False)) if one != other), least)
+    begin = next((i for i, (item, other) in enumerate(zip(*items, strict=False)) if item != other), least)
     begin = min(begin, least)
-    back = zip(*(reversed(one[begin + 1 :]) for one in items), strict=False)
-    end = next((i for i, (one, other) in enumerate(back) if one != other), least - begin)
-    kept = ("".join(one[begin : len(one) - end]).strip(" ,;") for one in items)
-    return [f"{'... ' * (begin > 0)}{one}{' ...' * (end > 0)}" for one in kept]
+    back = zip(*(reversed(parts[begin + 1 :]) for parts in items), strict=False)
+    end = next((i for i, (item, other) in enumerate(back) if item != other), least - begin)
+    middles = ("".join(parts[begin : len(parts) - end]).strip(" ,;") for parts in items)
+    return [f"{'... ' * (begin > 0)}{middle}{' ...' * (end > 0)}" for middle in middles]
 
 
 def _check_fits(field: str, what: object, scenario: Scenario, spaces: Spaces, steps: int) -> None:

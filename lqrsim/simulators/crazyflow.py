@@ -113,9 +113,9 @@ class _Drones:
         speeds = np.empty_like(controls)
         speeds[:, frame_of(self._of.drone).order] = speed_of(self._of.drone, controls)
         advance = stepper(self._of.drone, self._of.integrator, self._frequency, steps)
-        for trial, given in enumerate(np.concatenate([self.states, speeds, wrench, self._factors], axis=1)):
-            if np.isfinite(given).all():
-                self.states[trial] = advance(given)
+        for trial, inputs in enumerate(np.concatenate([self.states, speeds, wrench, self._factors], axis=1)):
+            if np.isfinite(inputs).all():
+                self.states[trial] = advance(inputs)
 
 
 @cache
@@ -145,11 +145,11 @@ def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
     jax, sim = package("jax", "crazyflow"), package("crazyflow.sim", "crazyflow")
     with jax.enable_x64(True), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they concern its scene, which is not used
-        one = sim.Sim(
+        simulation = sim.Sim(
             drone=drone, dynamics="first_principles", control="rotor_vel", integrator=integrator, freq=frequency
         )
-        del one.step_pipeline["clip_floor_pos"]
-        advance, template = one.build_step_fn(), one.data
+        del simulation.step_pipeline["clip_floor_pos"]
+        advance, template = simulation.build_step_fn(), simulation.data
 
         @jax.jit
         def compiled(given: Any) -> Any:
@@ -160,10 +160,10 @@ def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
                 pos=at(0, 3), quat=at(3, 4), vel=at(7, 3), ang_vel=at(10, 3), rotor_vel=at(13, 4), force=at(21, 3),
                 torque=at(24, 3),
             )  # fmt: skip
-            own, (mass, inertia), thrust = template.params, given[27:29], given[29:33]
-            changed = own.replace(
-                mass=own.mass * mass, J=own.J * inertia, J_inv=own.J_inv / inertia,
-                rpm2thrust=own.rpm2thrust * thrust[:, None], rpm2torque=own.rpm2torque * thrust[:, None],
+            parameters, (mass, inertia), thrust = template.params, given[27:29], given[29:33]
+            changed = parameters.replace(
+                mass=parameters.mass * mass, J=parameters.J * inertia, J_inv=parameters.J_inv / inertia,
+                rpm2thrust=parameters.rpm2thrust * thrust[:, None], rpm2torque=parameters.rpm2torque * thrust[:, None],
             )  # fmt: skip
             data = template.replace(
                 states=moved, params=changed, controls=template.controls.replace(rotor_vel=at(17, 4))

@@ -36,7 +36,7 @@ def succeeded(outcomes: Outcomes) -> npt.NDArray[np.bool_]:
 
 def _checked_table(table: Table) -> Table:
     known = isinstance(table, Mapping) and all(isinstance(cell, Cell) for cell in table)
-    if not known or not all(isinstance(one, Outcomes) for one in table.values()):
+    if not known or not all(isinstance(outcomes, Outcomes) for outcomes in table.values()):
         raise InputError(f"table: got {excerpt(table)}, want a mapping from Cell to Outcomes")
     return table
 
@@ -76,7 +76,7 @@ def alike(cell: Cell, outcomes: Outcomes) -> bool:
     if cell.strength and not outcomes.deterministic:
         return False
     numbers = (outcomes.ended, outcomes.rms, outcomes.worst, outcomes.effort)
-    same = all(np.array_equal(one, np.full_like(one, one[0]), equal_nan=True) for one in numbers)
+    same = all(np.array_equal(values, np.full_like(values, values[0]), equal_nan=True) for values in numbers)
     return same and len(set(outcomes.outcome.tolist())) == 1
 
 
@@ -154,7 +154,7 @@ def compared(
       paired: whether trials of the same number are compared with each other, see `comparisons`. If not, the difference
         of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
     """
-    compared = [_compared(one, other, firsts[one], seconds[other], paired=paired) for one, other in pairs]
+    compared = [_compared(first, second, firsts[first], seconds[second], paired=paired) for first, second in pairs]
     tested = [place for place, pair in enumerate(compared) if not np.isnan(pair.p_value)]
     p_values = statistics.holm([compared[place].p_value for place in tested]).tolist()
     for place, adjusted in zip(tested, p_values, strict=True):

@@ -130,7 +130,7 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     impossible = policies.impossible_policies(scenario, given)
     for policy in campaign.policies:
         if policy in impossible:
-            possible = ", ".join(one for one in policies.CAMPAIGN_POLICIES if one not in impossible)
+            possible = ", ".join(name for name in policies.CAMPAIGN_POLICIES if name not in impossible)
             raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
     policies.check_used(given, campaign.policies)
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
@@ -192,10 +192,12 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         hashes[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
         save_load.save(given, folder / files.GIVEN)
-    remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
+    remarks = [
+        f"{policy} {remark}" for policy, solution in solutions.items() for remark in solving.remarks(scenario, solution)
+    ]
     impossible = policies.impossible_policies(scenario, given)
     # Policies that were chosen leave out others on purpose.
-    missing = [one for one in policies.DEFAULT_POLICIES if one in impossible]
+    missing = [policy for policy in policies.DEFAULT_POLICIES if policy in impossible]
     missing = missing if {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*missing} else []
     left_out = "; ".join(f"{policy}, {impossible[policy]}" for policy in missing)
     about = {
@@ -216,14 +218,14 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
         value, was = now.get(field), before.get(field)
         if field != "time_limit" and value != was:
             raise InputError(f"{field}: got {excerpt(value)}, want {excerpt(was)}, as in {folder}, or another folder")
-    for field, what in (
+    for field, parts in (
         ("model", "robot, MJCF, choice of obstacles, simulator or goal radius"), ("problem", "problem"),
         ("start", "start"),
     ):  # fmt: skip
         if specification[field] != manifest[field]:
             older = other_lqrsim(manifest["versions"])
             older = f", or with the hashes of {older}" if older else ""
-            raise InputError(f"scenario: got a {what} other than the one {folder} was begun with{older}, want another")
+            raise InputError(f"scenario: got a {parts} other than the one {folder} was begun with{older}, want another")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / files.GIVEN
@@ -249,7 +251,7 @@ def _digest_of_runs(scenario: Scenario) -> str:
     stated: tuple[Any, ...] = (names, numbers, scenario.near_enough(), without_addresses(str(scenario.simulator)))
     stated += (scenario.sensors,) * bool(scenario.sensors)  # folders from before there were sensors stay valid
     rules = states.rules, controls.rules
-    arrays = (np.asarray(one, dtype=np.float64) for one in (*maps[0], *maps[1], *balls))
+    arrays = (np.asarray(values, dtype=np.float64) for values in (*maps[0], *maps[1], *balls))
     return sha256(scene.xml, repr(stated), *rules, *(part for array in arrays for part in (f"{array.shape}", array)))
 
 
@@ -257,7 +259,9 @@ def _code(campaign: Campaign) -> dict[str, str | None]:
     """The hash of the file that defines each of the user's disturbances; None if no file defines it."""
     used = (*campaign.sweeps.values(), campaign.design_disturbances or ())
     hashes: dict[str, str | None] = {}
-    for kind in sorted({type(one) for one in itertools.chain(*used)}, key=lambda kind: kind.__qualname__):
+    for kind in sorted(
+        {type(disturbance) for disturbance in itertools.chain(*used)}, key=lambda kind: kind.__qualname__
+    ):
         if not _is_own(kind):
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
             hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())

@@ -156,13 +156,13 @@ def _about(shard: Shard, campaign: str) -> dict[str, Any]:
 def _texts(file: pq.ParquetFile, name: str, size: int) -> npt.NDArray[np.str_]:
     # In parts, of a column of `size` bytes: a text that rows have in common stands in the file once, and is unpacked
     # for each.
-    found = list[str]()
+    column = list[str]()
     for part in file.iter_batches(max(_AT_ONCE // (_SNAPPY * size + 1), 1), columns=[name], use_threads=False):
         texts = part.column(0).to_pylist()
         if (longest := max(map(len, texts), default=0)) > LONGEST:
             raise ValueError(f"a text of {longest} characters")
-        found += texts
-    return np.array(found, dtype=np.str_)
+        column += texts
+    return np.array(column, dtype=np.str_)
 
 
 def _digest(table: Table, about: Mapping[str, Any]) -> str:
@@ -200,17 +200,17 @@ def _chunks(contents: bytes) -> list[list[_Chunk]]:
         raise ValueError("no footer of parquet")
     footer = _struct(io.BytesIO(contents[-8 - length : -8]), _DEEPEST)
     columns = [[chunk[3] for chunk in group[1]] for group in footer[4]]
-    return [[_Chunk(one[4], one[5], one[7]) for one in group] for group in columns]
+    return [[_Chunk(chunk[4], chunk[5], chunk[7]) for chunk in group] for group in columns]
 
 
 def _struct(data: io.BytesIO, depth: int) -> dict[int, Any]:
     """The fields of a structure by their numbers."""
-    found, number = dict[int, Any](), 0
+    values, number = dict[int, Any](), 0
     while head := data.read(1)[0]:
         number = number + (head >> 4) if head >> 4 else _integer(data)
         kind = head & 15
-        found[number] = kind == _BOOLEANS[0] if kind in _BOOLEANS else _value(data, kind, depth)
-    return found
+        values[number] = kind == _BOOLEANS[0] if kind in _BOOLEANS else _value(data, kind, depth)
+    return values
 
 
 def _value(data: io.BytesIO, kind: int, depth: int) -> Any:
@@ -309,7 +309,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def _check(manifest: dict[str, Any]) -> None:
     """Raise InputError unless all fields are there, and the hashes fit."""
-    _check_names("manifest", manifest, [one.name for one in fields(_Manifest)])
+    _check_names("manifest", manifest, [field.name for field in fields(_Manifest)])
     _Manifest(**manifest)
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
@@ -318,7 +318,7 @@ def _check(manifest: dict[str, Any]) -> None:
     if canonical(manifest["cells"]) != canonical(_cells(campaign)):
         raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
     pairs = [[sweep, strength] for _, sweep, strength in manifest["cells"]]
-    if not isinstance(fixed := manifest["deterministic"], list) or any(one not in pairs for one in fixed):
+    if not isinstance(fixed := manifest["deterministic"], list) or any(pair not in pairs for pair in fixed):
         raise InputError(f"deterministic: got {excerpt(fixed)}, want a list of pairs of a sweep and a strength")
     if set(manifest["policies"]) != set(campaign["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
@@ -344,7 +344,7 @@ def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
-    return sha256(canonical({name: one for name, one in manifest.items() if name != "sha256"}))
+    return sha256(canonical({name: value for name, value in manifest.items() if name != "sha256"}))
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
@@ -364,6 +364,6 @@ def digest_of_solution(solution: Solution) -> str:
     arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]
     if solution.cost_to_go is not None:  # re-planning begins with the cost-to-go and the multipliers
         arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
-    arrays += [one.values for one in solution.multipliers]
+    arrays += [multiplier.values for multiplier in solution.multipliers]
     rules = policy.state_coordinates.rules, policy.control_coordinates.rules
     return sha256(*(part for array in arrays for part in (f"{array.shape}", array)), *rules)

@@ -104,11 +104,11 @@ class DataTable:
         widths = [max(3, *(len(entry) for entry in column)) for column in zip(*rows, strict=True)]
         rule = ["-" * width if text else "-" * (width - 1) + ":" for width, text in zip(widths, texts, strict=True)]
         sides = ["<" if text else ">" for text in texts]
-        head, *rest = (
-            f"| {' | '.join(f'{one:{side}{width}}' for one, side, width in zip(row, sides, widths, strict=True))} |"
+        head, *body = (
+            f"| {' | '.join(f'{entry:{side}{width}}' for entry, side, width in zip(row, sides, widths, strict=True))} |"
             for row in (rows[0], rule, *rows[1:])
         )
-        return _lines(head, *rest, *(line for note in self.notes for line in ("", _markdown_text(note))))
+        return _lines(head, *body, *(line for note in self.notes for line in ("", _markdown_text(note))))
 
     __str__ = markdown
 

@@ -218,9 +218,9 @@ def largest_effects(rollout: Rollout) -> list[LargestEffect]:
         ),
     ]
     largest = []
-    for what, sizes, unit in sizes_over_time:
+    for quantity, sizes, unit in sizes_over_time:
         until = np.nan_to_num(sizes[: last + 1])
         step = int(until.argmax())
         if until[step] > 0:
-            largest.append(LargestEffect(what, float(until[step]), unit, float(rollout.times[step])))
+            largest.append(LargestEffect(quantity, float(until[step]), unit, float(rollout.times[step])))
     return largest

@@ -279,8 +279,8 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
 @contextlib.contextmanager
 def _silenced() -> Iterator[None]:
     """In this block dask prints no tracebacks; errors that matter are raised."""
-    known = [one for one in logging.Logger.manager.loggerDict.values() if isinstance(one, logging.Logger)]
-    loggers = [one for one in known if one.name.split(".")[0] == "distributed"]
+    known = [logger for logger in logging.Logger.manager.loggerDict.values() if isinstance(logger, logging.Logger)]
+    loggers = [logger for logger in known if logger.name.split(".")[0] == "distributed"]
     for logger in loggers:
         logger.disabled = True
     try:

@@ -68,13 +68,13 @@ class ReliabilityProblem(Study):
         """The present meaning of the names: disturbances, model and policy. Raises InputError as `score`."""
         score = self.score
         law, _ = as_controller(score.controller, score.solution, score.plant.robot.dynamics)
-        described = tuple(one.describe(score.plant) for one in self.disturbances)
+        described = tuple(disturbance.describe(score.plant) for disturbance in self.disturbances)
         return {"disturbances": described, "model": sha256(self.resolved.scene.xml), "policy_digest": law.digest}
 
     def summary(self) -> str:
         """Lines that describe the run, the failure, and the plan's end. Raises InputError as `score`."""
         score = self.score
-        words = "; ".join(one.describe(score.plant) for one in self.disturbances)
+        words = "; ".join(disturbance.describe(score.plant) for disturbance in self.disturbances)
         lines = [
             f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}: {words}",
             f"a trial draws {score.size:,} numbers; failure: {self.failure}",
@@ -208,8 +208,8 @@ class RareFailures:
     @property
     def stopped(self) -> str:
         """The progress if it was stopped, such as "after 3 of 10 repetitions"; else empty."""
-        done, asked = len(self.splitting.repetitions), self.options["repetitions"]
-        return f"after {done} of {asked} repetitions" if done < asked else ""
+        done, requested = len(self.splitting.repetitions), self.options["repetitions"]
+        return f"after {done} of {requested} repetitions" if done < requested else ""
 
     @property
     def plain_trials(self) -> float | None:
@@ -234,7 +234,7 @@ class RareFailures:
         """The disturbances whose draws have few values, if there were levels between no failure and failures."""
         score = self.problem.score
         drawn = zip(self.problem.disturbances, score.sizes, strict=True)
-        few = [one.describe(score.plant) for one, size in drawn if one.discrete and size]
+        few = [disturbance.describe(score.plant) for disturbance, size in drawn if disturbance.discrete and size]
         return "; ".join(few) if len(self.splitting.levels) > 1 else ""
 
     @checked
@@ -248,27 +248,33 @@ class RareFailures:
 
     def certificate(self) -> FailureCertificate:
         """The probability with everything needed to measure it again; `save` writes it, and `certify` checks it."""
-        problem, one = self.problem, self.probability
+        problem, estimate = self.problem, self.probability
         stated = {field.name: getattr(problem, field.name) for field in fields(problem)}
         stated |= {name: self.options[name] for name in ("seed", "particles", "keep")}
         return FailureCertificate(
-            **{**stated, **problem.facts, "solution": problem.score.solution}, probability=one.value, low=one.low,
-            high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions, versions=versions(),
+            **{**stated, **problem.facts, "solution": problem.score.solution}, probability=estimate.value,
+            low=estimate.low, high=estimate.high, confidence=estimate.confidence,
+            repetitions=self.splitting.repetitions, versions=versions(),
         )  # fmt: skip
 
     @checked
     def save(self, folder: str | os.PathLike[str], *, shown: Count = 8) -> Rollout:
         """Write rare.json, certificate.npz, and `shown` typical failures as rollout.npz. Returns these."""
-        folder, result, one = check_path("folder", folder, "the path of a folder"), self.splitting, self.probability
+        folder, result, estimate = (
+            check_path("folder", folder, "the path of a folder"),
+            self.splitting,
+            self.probability,
+        )
         numbers = self.typical(shown)
-        found = {
-            "probability": one.value, "low": one.low, "high": one.high, "confidence": one.confidence,
-            "standard_error": result.standard_error, "repetitions": result.repetitions.tolist(),
+        findings = {
+            "probability": estimate.value, "low": estimate.low, "high": estimate.high,
+            "confidence": estimate.confidence, "standard_error": result.standard_error,
+            "repetitions": result.repetitions.tolist(),
             "levels": result.levels.tolist(), "moves": result.step_sizes.tolist(), "simulations": result.simulations,
             "plain_trials": self.plain_trials, "failures": len(result.scores),
         }  # fmt: skip
-        asked, score = {**self.options, "shown": shown}, self.problem.score
-        write_json(self.problem, score.solution, folder / "rare.json", asked, found, self.stopped)
+        settings, score = {**self.options, "shown": shown}, self.problem.score
+        write_json(self.problem, score.solution, folder / "rare.json", settings, findings, self.stopped)
         save_load.save(self.certificate(), folder / "certificate.npz")
         return _saved(score, numbers, folder)
 
@@ -284,13 +290,13 @@ class Recheck:
 
     def summary(self) -> str:
         """Lines that describe the repeated measurement and the comparison."""
-        done, asked = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
-        lines = [f"measured again: {done} of {asked} repetitions, {self.measured.splitting.simulations:,} trials"]
+        done, certified = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
+        lines = [f"measured again: {done} of {certified} repetitions, {self.measured.splitting.simulations:,} trials"]
         if self.changed:
             lines.append(
                 f"{self.measured.probability:.2g}; intervals are compared, for the bits may differ: got {self.changed}"
             )
-        lines += [f"NOT as certified: {one}" for one in self.differences]
+        lines += [f"NOT as certified: {difference}" for difference in self.differences]
         if not self.differences:
             lines.append("as certified: the intervals overlap" if self.changed else "as certified, to the last bit")
         return "\n".join(lines)
@@ -321,7 +327,7 @@ def certify(
         raise InputError(f"repetitions: got {count}, want at most the certificate's {every}")
     if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
-    stated: dict[str, Any] = {one.name: getattr(certificate, one.name) for one in fields(ReliabilityProblem)}
+    stated: dict[str, Any] = {field.name: getattr(certificate, field.name) for field in fields(ReliabilityProblem)}
     if scenario is not None:
         stated["scenario"] = scenario
     problem = ReliabilityProblem(**stated)
@@ -336,16 +342,19 @@ def certify(
         progress=progress,
     )  # fmt: skip
     fresh = f"seed {seed} (was {certificate.seed})" if seed not in (None, certificate.seed) else ""
-    others, one = fresh or changed(certificate.versions), measured.probability
+    others, estimate = fresh or changed(certificate.versions), measured.probability
     if others:
-        if one.low > certificate.high or certificate.low > one.high:
-            differences.append(f"probability: got {one:.2g}, want an interval that overlaps")
+        if estimate.low > certificate.high or certificate.low > estimate.high:
+            differences.append(f"probability: got {estimate:.2g}, want an interval that overlaps")
     else:
         pairs = zip(measured.splitting.repetitions.tolist(), certificate.repetitions.tolist(), strict=False)
         differences += [
             f"repetition {i}: got {got!r}, want {want!r}" for i, (got, want) in enumerate(pairs) if got != want
         ]
-        ends = (one.value, one.low, one.high), (certificate.probability, certificate.low, certificate.high)
+        ends = (
+            (estimate.value, estimate.low, estimate.high),
+            (certificate.probability, certificate.low, certificate.high),
+        )
         if count == every and ends[0] != ends[1]:
             differences.append(f"probability with its interval: got {ends[0]}, want {ends[1]}")
     return Recheck(certificate, measured, tuple(differences), others)
@@ -366,8 +375,8 @@ class SmallestFailure:
     @property
     def stopped(self) -> str:
         """The progress if it was stopped, such as "after 3 of 40 rounds"; else empty."""
-        done, asked = len(self.point.history) - 1, self.options["rounds"]
-        return f"after {done} of {asked} rounds" if done < asked and not self.point.converged else ""
+        done, requested = len(self.point.history) - 1, self.options["rounds"]
+        return f"after {done} of {requested} rounds" if done < requested and not self.point.converged else ""
 
     def summary(self) -> str:
         """Lines with the distance, FORM's estimate, the fraction of each disturbance, and the largest disturbances."""
@@ -389,7 +398,8 @@ class SmallestFailure:
         lines += [f"{100 * share:6.1f} % of the squared distance: {words} ({count:,} numbers)"
                   for share, count, words in parts if count]  # fmt: skip
         lines += [
-            f"largest {one.what}: {one.size:.3g} {one.unit}".rstrip() + f" at {one.time:.2f} s" for one in self.largest
+            f"largest {effect.what}: {effect.size:.3g} {effect.unit}".rstrip() + f" at {effect.time:.2f} s"
+            for effect in self.largest
         ]
         return "\n".join(lines)
 
@@ -398,15 +408,15 @@ class SmallestFailure:
     def save(self, folder: str | os.PathLike[str]) -> Rollout:
         """Write break.json, and the trial as rollout.npz. Returns the trial; raises InputError."""
         folder, point = check_path("folder", folder, "the path of a folder"), self.point
-        found = {
+        findings = {
             "distance": point.distance, "first_order_probability": point.first_order_probability,
             "history": point.history.tolist(), "left": None if np.isnan(point.remaining) else point.remaining,
             "converged": point.converged, "simulations": self.simulations, "shares": self.shares,
-            "sizes": self.problem.score.sizes, "largest": [vars(one) for one in self.largest],
+            "sizes": self.problem.score.sizes, "largest": [vars(effect) for effect in self.largest],
             "numbers": point.numbers.tolist(),
         }  # fmt: skip
         score = self.problem.score
-        write_json(self.problem, score.solution, folder / "break.json", self.options, found, self.stopped)
+        write_json(self.problem, score.solution, folder / "break.json", self.options, findings, self.stopped)
         return _saved(score, point.numbers[None], folder)
 
 
@@ -422,12 +432,12 @@ def write_json(
     problem: ReliabilityProblem, solution: Solution, path: Path, options: Mapping[str, Any], found: object, stopped: str
 ) -> None:
     """Write the settings of a search, and what it found."""
-    asked = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
-    asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
+    settings = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
+    settings["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
         "format": f"lqrsim {path.stem}",
         "version": 3,
-        "asked": asked,
+        "asked": settings,
         "disturbances": disturbances_as_json(problem.disturbances),
         "model": sha256(problem.resolved.scene.xml),
         "problem": problem.resolved.problem.digest,

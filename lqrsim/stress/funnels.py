@@ -282,11 +282,11 @@ def funnel(
         every = [*levels, *[missing] * (len(starts) - len(levels))]
         return replace(
             blank,
-            levels=np.array([each.level for each in every]),
-            trials=np.array([each.trials for each in every]),
-            successes=np.array([each.successes for each in every]),
-            reasons=tuple(each.reason for each in every),
-            simulated=sum(each.simulated for each in every),
+            levels=np.array([result.level for result in every]),
+            trials=np.array([result.trials for result in every]),
+            successes=np.array([result.successes for result in every]),
+            reasons=tuple(result.reason for result in every),
+            simulated=sum(result.simulated for result in every),
         )
 
     with keeping(lambda _: so_far() if levels else None):
@@ -428,8 +428,8 @@ class _Trials:
     @property
     def described(self) -> tuple[str, ...]:
         """The disturbances that act, in words. Errors of the start must be zero here; others are refused."""
-        acting = (one for one in self.disturbances if not isinstance(one, InitialStateError))
-        return tuple(one.describe(self.plant) for one in acting)
+        acting = (disturbance for disturbance in self.disturbances if not isinstance(disturbance, InitialStateError))
+        return tuple(disturbance.describe(self.plant) for disturbance in acting)
 
     def reached(self, states: Array, knot: int, seed: int, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
         """Whether the trials with these numbers (K,), begun in the states (K, n), reach the goal, (K,)."""
@@ -453,7 +453,7 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
         if solution.cost_to_go is None:
             raise InputError(f"shape: got none and no cost-to-go ({solution.status.name}), want shape=")
         curve = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
-        return np.array([_inverse(one) for one in curve])
+        return np.array([_inverse(hessian) for hessian in curve])
     if isinstance(shape, Tube):
         if not np.array_equal(shape.plan.states, plan.states):
             raise InputError("shape: got a tube of another plan, want a tube of the solution")
@@ -482,7 +482,7 @@ def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
     """The level at which an angle deviates by half a turn; a larger ellipsoid contains some states twice."""
     space = solution.policy.state_coordinates
     turning = [[i, i + 1, i + 2] for i in space.rotation_vectors]
-    groups = [[i] for i in space.angles] + [[i for i in one if i not in space.angles] for one in turning]
+    groups = [[i] for i in space.angles] + [[i for i in rotation if i not in space.angles] for rotation in turning]
     end = np.inf
     for group in groups:
         rows = [chosen.index(i) for i in group if i in chosen]

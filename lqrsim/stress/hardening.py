@@ -75,8 +75,8 @@ class HardeningRound:
 
     def __str__(self) -> str:
         if self.rare is None:
-            found = f"none of {self.unfailing:,} trials failed, so at most {self.probability.high:.2g} of them do"
-            return f"cost {self.cost:.6g}, no failure found{f': {found}' if self.unfailing else ''}"
+            bound = f"none of {self.unfailing:,} trials failed, so at most {self.probability.high:.2g} of them do"
+            return f"cost {self.cost:.6g}, no failure found{f': {bound}' if self.unfailing else ''}"
         ranked = sorted(self.hit.items(), key=lambda one: -one[1])
         parts = [f"{100 * share:.0f} % hit {name}" for name, share in ranked if share >= 0.005]
         parts += [f"{100 * self.strays:.0f} % leave the plan for good"] if self.strays >= 0.005 else []
@@ -127,7 +127,7 @@ class HardenedPlan:
 
     def summary(self) -> str:
         """A line for each plan, and whether the result is as requested."""
-        return "\n".join([*(f"plan {number}: {one}" for number, one in enumerate(self.rounds, 1)), self.verdict()])
+        return "\n".join([*(f"plan {number}: {plan}" for number, plan in enumerate(self.rounds, 1)), self.verdict()])
 
     __str__ = summary
 
@@ -136,13 +136,13 @@ class HardenedPlan:
         """Write solution.npz and harden.json, and the files of `rare` if there are failures; returns those it wrote."""
         folder = check_path("folder", folder, "the path of a folder")
         rounds = [
-            {"cost": one.cost, "hit": one.hit, "strays": one.strays, "probability": asdict(one.probability)}
-            for one in self.rounds
+            {"cost": plan.cost, "hit": plan.hit, "strays": plan.strays, "probability": asdict(plan.probability)}
+            for plan in self.rounds
         ]
-        found = {"success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds}
+        findings = {"success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds}
         save_load.save(self.solution, folder / "solution.npz")
-        asked = {"chance": self.chance, **self.options}
-        write_json(self.problem, self.solution, folder / "harden.json", asked, found, self.stopped)
+        settings = {"chance": self.chance, **self.options}
+        write_json(self.problem, self.solution, folder / "harden.json", settings, findings, self.stopped)
         return None if self.rare is None else self.rare.save(folder, shown=shown)
 
 
@@ -201,16 +201,16 @@ def harden(
 
     with keeping(so_far):
         while len(search.rounds) < rounds and (solution := search.next()) is not None:
-            what = f"plan {len(search.rounds) + 1}"
+            label = f"plan {len(search.rounds) + 1}"
             if not search.rounds:
                 say(replace(problem, solution=solution).summary())
-            search.add(solution, measure(solution, what))
-            say(f"{what}: {search.rounds[-1]}")
+            search.add(solution, measure(solution, label))
+            say(f"{label}: {search.rounds[-1]}")
             if search.enough():
-                again = measure(solution, f"{what} again")
+                again = measure(solution, f"{label} again")
                 search.rounds.pop()  # only now, so that Ctrl-C keeps it
                 search.add(solution, again)
-                say(f"{what} again, with fresh random numbers: {search.rounds[-1]}")
+                say(f"{label} again, with fresh random numbers: {search.rounds[-1]}")
                 if search.enough():
                     break
     return search.result(search.shortfall())
@@ -231,7 +231,7 @@ class _Search:
         met = uncertainty_of(scenario.plant(), problem.disturbances)  # also refuses sets that there are not
         self.uncertainty = met if design is None else design_uncertainty(scenario, design)
         self.surroundings = Surroundings.of(self.stated, self.uncertainty.obstacles)
-        self.names = [one.name for shape in self.surroundings.shapes for one in shape.world.obstacles]
+        self.names = [obstacle.name for shape in self.surroundings.shapes for obstacle in shape.world.obstacles]
         self.rounds: list[HardeningRound] = []
         self.ended = ""  # why there is no next plan
 
@@ -253,8 +253,8 @@ class _Search:
             return None
         more = self.wanted(last) - self.near
         for share in (1.0, 0.5, 0.25):  # as much of it as there is room for
-            kept = self.surroundings.keep_away(np.maximum(self.near + share * more, 0.0) * self.std)
-            problem = replace(self.stated, constraints=(*self.stated.constraints, *kept))
+            clearances = self.surroundings.keep_away(np.maximum(self.near + share * more, 0.0) * self.std)
+            problem = replace(self.stated, constraints=(*self.stated.constraints, *clearances))
             solution = smooth(problem, start=last.solution.trajectory)
             if solution.success:
                 return solution
@@ -346,7 +346,7 @@ class _Search:
     def result(self, reason: str) -> HardenedPlan:
         """The last plan if there is no reason against it, else the safest of the plans so far."""
         # A plan without failures is as safe as its trials prove.
-        measured = [(one.probability.high if one.rare is None else one.probability.value) for one in self.rounds]
+        measured = [(plan.probability.high if plan.rare is None else plan.probability.value) for plan in self.rounds]
         chosen = int(np.argmin(measured)) if reason else len(self.rounds) - 1
         return HardenedPlan(
             problem=self.asked, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,

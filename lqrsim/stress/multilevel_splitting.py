@@ -82,11 +82,11 @@ class SplittingResult:
 
     def summary(self) -> str:
         """Two lines: the probability with its interval, and the number of simulated trials."""
-        one, plain = self.probability, self.plain_trials
-        interval = f"{100 * one.confidence:g} % interval, {len(self.repetitions)} repetitions"
+        estimate, plain = self.probability, self.plain_trials
+        interval = f"{100 * estimate.confidence:g} % interval, {len(self.repetitions)} repetitions"
         needed = f"about {rounded(plain)}" if np.isfinite(plain) else "unknown, because all repetitions agree"
         return (
-            f"probability of failure: {one:.2g} ({interval})\n"
+            f"probability of failure: {estimate:.2g} ({interval})\n"
             f"simulated: {self.simulations:,} trials; plain trials for the same standard error: {needed}"
         )
 
@@ -126,7 +126,7 @@ def failure_probability(
     tell = progress or (lambda done, total, text: None)
     counted = CountedScore(score)
     splitting = _Splitting(counted, size, particles, moves)
-    first, *rest = np.random.SeedSequence(seed).spawn(repetitions + 1)
+    first, *keys = np.random.SeedSequence(seed).spawn(repetitions + 1)
     levels, step_sizes, batches = np.zeros(1), np.zeros(0), [1]
     if keep:
         rng = np.random.default_rng(first)
@@ -134,17 +134,17 @@ def failure_probability(
     done: list[tuple[Array, Array, Array]] = []
 
     def so_far() -> SplittingResult | None:
-        shares = np.array([one for one, _, _ in done])
+        shares = np.array([fractions for fractions, _, _ in done])
         if len(done) < 2 or not shares.prod(axis=1).any():
             return None
         estimates = shares.prod(axis=1)
         error = float(estimates.std(ddof=1) / np.sqrt(len(done)))
-        failures, scores = (np.concatenate([one[i] for one in done]) for i in (1, 2))
+        failures, scores = (np.concatenate([repetition[i] for repetition in done]) for i in (1, 2))
         interval = _estimate(shares, particles, batches)
         return SplittingResult(interval, error, estimates, levels, step_sizes, counted.evaluations, failures, scores)
 
     with keeping(lambda _: so_far()):
-        for number, key in enumerate(rest):
+        for number, key in enumerate(keys):
             estimates = [shares.prod() for shares, _, _ in done]
             tell(number, repetitions, f"{np.mean(estimates):.2g}" if estimates else "")
             rng = np.random.default_rng(key)
@@ -251,14 +251,14 @@ class _Splitting:
             # Later vectors are copies, a few of which may always tie.
             tie = not levels and np.sum(scores == level) > 1 and above.sum() < enough
             if tie or not above.any():
-                kept = [(vectors[above], scores[above])]
-                while sum(len(some) for _, some in kept) < enough and drawn < MOST_BATCHES:
+                survivors = [(vectors[above], scores[above])]
+                while sum(len(some) for _, some in survivors) < enough and drawn < MOST_BATCHES:
                     on_level(level)
                     # As many vectors again, from the distribution above the last level.
                     vectors, scores = self.move(vectors, scores, levels[-1], b, rng) if levels else self.draw(rng)
                     above, drawn = scores > level, drawn + 1
-                    kept.append((vectors[above], scores[above]))
-                vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+                    survivors.append((vectors[above], scores[above]))
+                vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
             if not len(scores):
                 tied = drawn * self.particles
                 raise NoFailure(
@@ -287,7 +287,7 @@ class _Splitting:
         """The fraction above each level, 0 once no vector is left; and the failures with their scores."""
         vectors, scores, shares = np.zeros((0, self.size)), np.zeros(0), np.zeros(len(levels))
         for number, level in enumerate(levels):
-            kept: list[tuple[Array, Array]] = []
+            survivors: list[tuple[Array, Array]] = []
             for _ in range(batches[number]):
                 if number == 0:
                     moved, moved_scores = self.draw(rng)
@@ -296,8 +296,8 @@ class _Splitting:
                     moved, moved_scores = self.resample(vectors, scores, last, rng)
                     moved, moved_scores = self.move(moved, moved_scores, last, step_sizes[number - 1], rng)
                 above = moved_scores > level
-                kept.append((moved[above], moved_scores[above]))
-            vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+                survivors.append((moved[above], moved_scores[above]))
+            vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
             shares[number] = len(scores) / (self.particles * batches[number])
             if shares[number] == 0:
                 break

@@ -105,25 +105,25 @@ def outcomes(
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
     belief = problem.dynamics if problem is not None and isinstance(problem.dynamics, Belief) else None
     if problem is not None:
-        own = spaces_of(problem.dynamics if belief is None else belief.robot)
-        check_same_system("problem", "a problem", own, spaces_of(rollout), "the rollout")
+        spaces = spaces_of(problem.dynamics if belief is None else belief.robot)
+        check_same_system("problem", "a problem", spaces, spaces_of(rollout), "the rollout")
     if goal_radius is not None or goal_tolerance is not None:
         rollout = replace(rollout, goal_radius=rollout.target.radius(None, goal_radius, goal_tolerance))
     plan, ended, counts = rollout.plan, rollout.ended, rollout.counts
     outcome = np.array(rollout.outcome, dtype=np.str_)
-    whole = np.isin(outcome, ("reached", "timed out"))
+    completed = np.isin(outcome, ("reached", "timed out"))
     error = np.where(counts, rollout.tracking_error, 0.0)
     spent = np.clip(ended[:, None] - rollout.times[:-1], 0.0, plan.dt)  # seconds of each control period
 
     driven = (spent > 0) & np.isfinite(rollout.applied).all(axis=2)
     effort = np.where(driven, spent * np.sum(np.square(rollout.applied), axis=2), 0.0).sum(axis=1)
     cost = np.full(rollout.trials, np.nan)
-    if problem is not None and whole.any():
-        states = rollout.states[whole]
+    if problem is not None and completed.any():
+        states = rollout.states[completed]
         if belief is not None:
             known = np.zeros((*states.shape[:2], len(belief.state_coordinates) - belief.size))
             states = np.concatenate([states, known], axis=2)
-        cost[whole] = compiled.costs_of(problem, states, rollout.applied[whole])
+        cost[completed] = compiled.costs_of(problem, states, rollout.applied[completed])
     return Outcomes(
         trial=rollout.first_trial + np.arange(rollout.trials),
         outcome=outcome,
@@ -131,8 +131,8 @@ def outcomes(
         ended=ended,
         worst=error.max(axis=1),
         rms=np.sqrt(np.square(error).sum(axis=1) / np.maximum(counts.sum(axis=1), 1)),
-        final=np.where(whole, rollout.tracking_error[:, -1], np.nan),
-        goal=np.where(whole, rollout.goal_distance, np.nan),
+        final=np.where(completed, rollout.tracking_error[:, -1], np.nan),
+        goal=np.where(completed, rollout.goal_distance, np.nan),
         clearance=rollout.least_clearance(),
         effort=effort,
         saturated=np.where(driven, rollout.saturated, False).sum(axis=1) / np.maximum(driven.sum(axis=1), 1),

@@ -163,14 +163,14 @@ class Results:
     def designs(self) -> dict[str, str]:
         """For which disturbances each policy was designed that is designed for any, by policy."""
         stated, designs = self.manifest["campaign"]["design_disturbances"], dict[str, str]()
-        what = f"the preset {DEFAULT_DESIGN}"
+        disturbances = f"the preset {DEFAULT_DESIGN}"
         if stated is not None:  # as it is written in Python
             settings = (", ".join(f"{name}={value}" for name, value in item["settings"].items()) for item in stated)
-            what = ", ".join(f"{item['kind']}({text})" for item, text in zip(stated, settings, strict=True))
+            disturbances = ", ".join(f"{item['kind']}({text})" for item, text in zip(stated, settings, strict=True))
         for policy in self.manifest["policies"]:
             kind = POLICY_KINDS[policy]
             if kind.designed:
-                designs[policy] = f"designed for {what}, whatever the disturbances of a cell"
+                designs[policy] = f"designed for {disturbances}, whatever the disturbances of a cell"
             elif kind.per_cell:
                 designs[policy] = "designed anew for the disturbances of each cell, at their strength"
         return designs
@@ -368,22 +368,24 @@ def compare(
       with low and high; p, adjusted for the number of rows (Holm, 1979). With different seeds, first trials and second
       trials take the place of trials, only first and only second. Failure rates differ by as much, the other way round.
     """
-    one = first if isinstance(first, Results) else Results(first)
-    other = one if second is None else second if isinstance(second, Results) else Results(second)
+    first_results = first if isinstance(first, Results) else Results(first)
+    second_results = first_results if second is None else second if isinstance(second, Results) else Results(second)
     chosen = policies or ()
     if len(chosen) != 2 and (second is None or policies is not None):
         raise InputError(f"policies: got {excerpt(policies)}, want two policies, or another campaign to compare with")
-    for policy, results in zip(chosen, (one, other), strict=False):
+    for policy, results in zip(chosen, (first_results, second_results), strict=False):
         check_name("policies", policy, results.manifest["campaign"]["policies"])
     matches = (
         (cell, Cell(chosen[1] if chosen else cell.policy, cell.sweep, cell.strength))
-        for cell in one.cells
+        for cell in first_results.cells
         if not chosen or cell.policy == chosen[0]
     )
-    pairs = [pair for pair in matches if pair[1] in other.cells]
+    pairs = [pair for pair in matches if pair[1] in second_results.cells]
     if not pairs:
-        raise InputError(f"second: got cells from {other.cells[0]} to {other.cells[-1]}, want some of the first's")
-    campaigns = one.manifest["campaign"], other.manifest["campaign"]
+        raise InputError(
+            f"second: got cells from {second_results.cells[0]} to {second_results.cells[-1]}, want some of the first's"
+        )
+    campaigns = first_results.manifest["campaign"], second_results.manifest["campaign"]
     for sweep in dict.fromkeys(cell.sweep for cell, _ in pairs):
         if campaigns[0]["sweeps"][sweep] != campaigns[1]["sweeps"][sweep]:
             raise InputError(f"second: got other disturbances in the sweep {excerpt(sweep)}, want those of the first")
@@ -395,11 +397,11 @@ def compare(
     counts = [min(trials)] * 2 if paired else trials
     firsts, seconds = (
         {pair[side]: results.outcomes(pair[side]).first(counts[side]) for pair in pairs}
-        for side, results in enumerate((one, other))
+        for side, results in enumerate((first_results, second_results))
     )
     comparisons = analysis.compared(pairs, firsts, seconds, paired=paired)
     method = f"difference: first minus second; low, high: {100 * CONFIDENCE:g} % by {_METHOD[paired]}, adjusted (Holm)"
-    notes, fractions = [*_notes(one, other, chosen), method], fraction_format(max(counts))
+    notes, fractions = [*_notes(first_results, second_results, chosen), method], fraction_format(max(counts))
     return _table(comparisons, notes, paired=paired, fractions=fractions)
 
 
@@ -407,9 +409,9 @@ def _notes(first: Results, second: Results, policies: Sequence[str]) -> list[str
     """Lines that say what is compared, and in what else the two differ."""
     of = [f"{policy} of " for policy in policies] or ["", ""]
     notes = [f"first: {of[0]}{first.folder}; second: {of[1]}{second.folder}"]
-    one, other = first.manifest, second.manifest
-    differ = [name for name in _SETTINGS if one["campaign"][name] != other["campaign"][name]]
-    differ += [name for name in _FIELDS if one[name] != other[name]]
+    first_manifest, second_manifest = first.manifest, second.manifest
+    differ = [name for name in _SETTINGS if first_manifest["campaign"][name] != second_manifest["campaign"][name]]
+    differ += [name for name in _FIELDS if first_manifest[name] != second_manifest[name]]
     return [printable(note) for note in [*notes, *([f"they differ in {', '.join(differ)}"] if differ else [])]]
 
 

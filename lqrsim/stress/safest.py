@@ -95,9 +95,11 @@ def smooth_safest(
         plan = candidate.trajectory
         if not plan.finite:
             continue
-        one = first if candidate.status is not None and candidate.cost == first.cost else smooth(problem, start=plan)
-        if one.success and not any(_same(one, other) for _, other in plans):
-            plans.append((candidate.start, replace(one, candidates=first.candidates)))
+        solution = (
+            first if candidate.status is not None and candidate.cost == first.cost else smooth(problem, start=plan)
+        )
+        if solution.success and not any(_same(solution, other) for _, other in plans):
+            plans.append((candidate.start, replace(solution, candidates=first.candidates)))
     if not plans and first.success:
         plans.append(("the search's own", first))
     if not plans:
@@ -108,9 +110,9 @@ def smooth_safest(
             plant, solution, disturbances=disturbances, seed=seed, trials=trials, first_trial=begin, threads=threads,
             goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=False, contacts=False,
         )  # fmt: skip
-        return np.array([one == "reached" for one in run.outcome])
+        return np.array([outcome == "reached" for outcome in run.outcome])
 
-    compared = [ComparedPlan(start, one, reached(one, 0)) for start, one in plans]
+    compared = [ComparedPlan(start, solution, reached(solution, 0)) for start, solution in plans]
     compared.sort(key=lambda plan: (-int(plan.successes.sum()), plan.solution.cost))
     best = compared[0].solution
     fresh = int(reached(best, trials).sum())

@@ -56,10 +56,10 @@ def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
     """Compare two policies trial by trial; `first` and `second` (K,) say whether each trial succeeded."""
     from scipy import stats
 
-    one, other = _flags("first", first), _flags("second", second)
-    if one.shape != other.shape:
-        raise InputError(f"second: got {len(other)} trials, want {len(one)}, as first has")
-    only_first, only_second = int(np.sum(one & ~other)), int(np.sum(other & ~one))
+    first_flags, second_flags = _flags("first", first), _flags("second", second)
+    if first_flags.shape != second_flags.shape:
+        raise InputError(f"second: got {len(second_flags)} trials, want {len(first_flags)}, as first has")
+    only_first, only_second = int(np.sum(first_flags & ~second_flags)), int(np.sum(second_flags & ~first_flags))
     different = only_first + only_second
     p_value = float(stats.binomtest(only_first, different).pvalue) if different else 1.0
     return Pairs(only_first, only_second, p_value)
@@ -116,10 +116,10 @@ def independent_difference(first: tuple[int, int], second: tuple[int, int]) -> t
     """
     from scipy import stats
 
-    one, other = (rate(*counts, method="wilson") for counts in (first, second))
-    value = one.value - other.value
-    low = value - float(np.hypot(one.value - one.low, other.high - other.value))
-    high = value + float(np.hypot(one.high - one.value, other.value - other.low))
+    first_rate, second_rate = (rate(*counts, method="wilson") for counts in (first, second))
+    value = first_rate.value - second_rate.value
+    low = value - float(np.hypot(first_rate.value - first_rate.low, second_rate.high - second_rate.value))
+    high = value + float(np.hypot(first_rate.high - first_rate.value, second_rate.value - second_rate.low))
     test = stats.fisher_exact([[reached, trials - reached] for reached, trials in (first, second)])
     return Estimate(value, low, high), float(test.pvalue)  # pyright: ignore[reportAttributeAccessIssue]
 

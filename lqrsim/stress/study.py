@@ -242,11 +242,11 @@ class Campaign(Setup):
         policies = check_items("policies", policies, str, "a tuple of names of policies")
         scenario, design = setup.resolved, setup.design_disturbances
         impossible = impossible_policies(scenario, setup.given)
-        shared = {one.name: getattr(setup, one.name) for one in dataclasses.fields(Setup)}
+        shared = {field.name: getattr(setup, field.name) for field in dataclasses.fields(Setup)}
         named = {
             "design_disturbances": None if design is None else tuple(design_disturbances(scenario, design)),
             "sweeps": {name: disturbance_set(name, scenario) for name in sets},
-            "policies": policies or tuple(one for one in DEFAULT_POLICIES if one not in impossible),
+            "policies": policies or tuple(policy for policy in DEFAULT_POLICIES if policy not in impossible),
         }
         campaign = cls(**options | shared | named)
         keep(campaign, resolved=scenario, given=setup.given)
@@ -275,15 +275,15 @@ class Campaign(Setup):
 
     def _as_json(self, sweep: Disturbances) -> list[dict[str, Any]]:
         """As `disturbances_as_json`. The scenario's own may have formulas, which are no plain data: by their number."""
-        own = {id(one): number for number, one in enumerate(self.resolved.disturbances)}
+        numbers = {id(disturbance): number for number, disturbance in enumerate(self.resolved.disturbances)}
         plant, items = self.resolved.plant(), list[dict[str, Any]]()
-        for one in sweep:
+        for disturbance in sweep:
             try:
-                items += disturbances_as_json([one])
+                items += disturbances_as_json([disturbance])
             except InputError:
-                if id(one) not in own:
+                if id(disturbance) not in numbers:
                     raise
-                settings = {"number": own[id(one)], "text": one.describe(plant)}
+                settings = {"number": numbers[id(disturbance)], "text": disturbance.describe(plant)}
                 items.append({"kind": OF_SCENARIO, "settings": settings})
         return items
 
@@ -309,7 +309,7 @@ class Campaign(Setup):
         return campaign
 
 
-CAMPAIGN_FIELDS = tuple(one.name for one in dataclasses.fields(Campaign) if one.name != "solution")
+CAMPAIGN_FIELDS = tuple(field.name for field in dataclasses.fields(Campaign) if field.name != "solution")
 
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:
@@ -347,7 +347,7 @@ def disturbances_from_json(items: Iterable[Mapping[str, Any]], scenario: Scenari
 
 
 def _with_tuples(value: Any) -> Any:
-    return tuple(_with_tuples(one) for one in value) if isinstance(value, list) else value
+    return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def _kinds(base: type[Disturbance]) -> Iterator[type[Disturbance]]:

@@ -86,7 +86,7 @@ class PrescribedDraws:
 
 def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
     """The shape of the numbers that NumPy's generators draw with these arguments."""
-    return size if size is not None else (np.broadcast_shapes(*(np.shape(one) for one in arguments)) or None)
+    return size if size is not None else (np.broadcast_shapes(*(np.shape(argument) for argument in arguments)) or None)
 
 
 class _CountedDraws(PrescribedDraws):
@@ -183,7 +183,7 @@ class TrialScore:
     def __post_init__(self) -> None:
         draws = [_CountedDraws() for _ in self.disturbances]
         usual = self._simulate(1, lambda trial, stream: draws[stream], frames=False)
-        self.sizes = tuple(one.used for one in draws)
+        self.sizes = tuple(stream.used for stream in draws)
         self.first = self._first(_departure(usual.clearance[0])) if self.failure in (collision_score, miss_score) else 0
 
     def _first(self, departure: int) -> int:
