@@ -44,7 +44,7 @@ def of_solution(solution: "ls.Solution") -> Object:
     if solution.clearance is not None:
         knot = int(solution.clearance.argmin())
         clearance = {"least": solution.clearance[knot], "time": plan.times[knot]}
-    away = target.distance(plan.states[-1])
+    distance = target.distance(plan.states[-1])
     names = (
         "scenario solver options status success detail remedy cost gap optimality violation certificate iterations"
         " problem_digest versions"
@@ -53,7 +53,7 @@ def of_solution(solution: "ls.Solution") -> Object:
         **_fields(solution, names),
         **_fields(plan, "steps dt"),
         "clearance": clearance,
-        "goal": {"is": target.name, "distance": away, "radius": solution.goal_radius, "unit": target.unit},
+        "goal": {"is": target.name, "distance": distance, "radius": solution.goal_radius, "unit": target.unit},
         "candidates": [_fields(candidate, "start cost iterations status") for candidate in solution.candidates],
     }
 

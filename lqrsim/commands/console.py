@@ -106,9 +106,9 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
         with contextlib.suppress(FileNotFoundError):
             os.lstat(folder / name)  # fails for invalid names
     except (OSError, ValueError) as error:
-        reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
+        reason, kind = getattr(error, "strerror", None) or error, "file" if name else "folder"
         place = excerpt_of(folder / name)
-        raise ls.InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
+        raise ls.InputError(f"{field}: got {place}, want a {kind} that can be written ({reason})") from None
 
 
 @contextlib.contextmanager

@@ -109,11 +109,11 @@ TABLE = (
 
 def _row(reference: str, run: str, solution: "ls.Solution", rollout: "ls.Rollout") -> str:
     error = rollout.tracking_error[0, rollout.counts[0]]
-    final, away = (math.nan, math.nan) if not rollout.counts[0, -1] else (error[-1], rollout.goal_distance[0])
+    final, distance = (math.nan, math.nan) if not rollout.counts[0, -1] else (error[-1], rollout.goal_distance[0])
     return (
         f"{reference:<20} {run:<12} {len(solution.iterations):>10} {solution.cost:>10.4f} {solution.gap:>9.1e}"
         f" {rollout.least_clearance()[0]:>12.3f} {math.sqrt((error**2).mean()):>9.2e} {error.max():>9.2e} {final:>9.2e}"
-        f" {away if rollout.target.unit == 'm' else math.nan:>9.2e} {rollout.outcome[0]:>9}"
+        f" {distance if rollout.target.unit == 'm' else math.nan:>9.2e} {rollout.outcome[0]:>9}"
     )
 
 
@@ -143,8 +143,8 @@ class Cache:
                 raise ls.InputError(f"--clear: got {disk_cache.folder()}, want removable files ({error})") from None
             return 0
         items = disk_cache.items()
-        together = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)
-        for kind, alike in sorted(((kind, list(some)) for kind, some in together), key=lambda one: -one[1][0].used):
+        groups = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)
+        for kind, alike in sorted(((kind, list(group)) for kind, group in groups), key=lambda one: -one[1][0].used):
             used = time.strftime("%Y-%m-%d %H:%M", time.localtime(alike[0].used))
             count = f" ({len(alike)} items)" if len(alike) > 1 else ""
             console.say(f"{sum(item.size for item in alike) / 1e6:8.2f} MB  last used {used}  {kind}{count}")

@@ -123,8 +123,8 @@ class Solve:
             from lqrsim.problem.belief import Belief
             from lqrsim.simulation.uncertainty_of import tube_under
 
-            ran = scenario.settled(solution)
-            tube, remark = tube_under(ran.problem, solution, ran.plant(), ran.disturbances)
+            settled = scenario.settled(solution)
+            tube, remark = tube_under(settled.problem, solution, settled.plant(), settled.disturbances)
             if remark:
                 console.say(remark)
             world, robot = scenario.scene.world, scenario.robot
@@ -326,7 +326,7 @@ def _violations(problem: "ls.Problem", rollout: "ls.Rollout") -> list[dict[str, 
     listed = list[dict[str, Any]]()
     for name, excesses in problem.violations(rollout).items():
         worst, count = int(excesses[:, 0].argmax()), int((excesses[:, 0] > 0).sum())
-        by, when = excesses[worst].tolist()
-        where = {"trial": rollout.first_trial + worst, "time": when} if count else {"trial": None, "time": None}
-        listed.append({"constraint": name, "trials": count, "most": by, **where})
+        excess, time = excesses[worst].tolist()
+        where = {"trial": rollout.first_trial + worst, "time": time} if count else {"trial": None, "time": None}
+        listed.append({"constraint": name, "trials": count, "most": excess, **where})
     return listed

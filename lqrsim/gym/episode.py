@@ -258,7 +258,7 @@ class Episode:
 
     def advance(self, controls: Array) -> tuple[Array, Array, Flags, Flags]:
         """Run a control period with controls (K, m): observations (K, n+1), rewards, terminations, truncations."""
-        loop, step, before = self._loop, self._loop.step, self.states
+        loop, step, states = self._loop, self._loop.step, self.states
         self._commanded.commands = controls
         with unlogged():
             loop.period()
@@ -271,18 +271,18 @@ class Episode:
         self._ended_at[0, running] = (lost | collided)[running]
         self._ended_at[1, running] = over & ~(lost | collided)[running]
         rewards = np.zeros(len(running))
-        rewards[running] = -self._costs.stage(step, before, loop.records.applied[:, step])[running]
-        now = self._ended_at.any(axis=0) & running
-        if now.any():
+        rewards[running] = -self._costs.stage(step, states, loop.records.applied[:, step])[running]
+        ending = self._ended_at.any(axis=0) & running
+        if ending.any():
             # A trial that has become unstable has no valid state; use the previous state.
-            last = np.where(lost[:, None], before, self.states)
-            rewards[now] -= self._costs.final(last, loop.records.applied[:, step])[now]
+            last = np.where(lost[:, None], states, self.states)
+            rewards[ending] -= self._costs.final(last, loop.records.applied[:, step])[ending]
         self._last[running] = self._observe(lost)[running]
-        self.ended |= now
-        if now.any():
+        self.ended |= ending
+        if ending.any():
             first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
             early = np.where(collided & first, "collided", "diverged").astype(object)
-            self.outcomes[now] = (np.array(self.rollout().outcome, dtype=object) if over else early)[now]
+            self.outcomes[ending] = (np.array(self.rollout().outcome, dtype=object) if over else early)[ending]
         return self.observations, rewards, self._ended_at[0].copy(), self._ended_at[1].copy()
 
     def rollout(self) -> Rollout:

@@ -56,7 +56,7 @@ def plot_errors(curves: Curves, path: Path, *, label: str) -> Path:
     known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
     decades = len(known) > 0 and known.max() > 100 * known.min()
     if decades:  # undisturbed errors are tiny, and would take up most of a logarithmic axis
-        curves = {name: {at: band for at, band in of.items() if at > 0} for name, of in curves.items()}
+        curves = {name: {at: band for at, band in curve.items() if at > 0} for name, curve in curves.items()}
     with _over_strength(curves, path, label) as axes:
         if decades:
             axes.set_yscale("log")
@@ -283,7 +283,7 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
 
     def told(curves: Curves, spec: str, unit: str = "") -> str:
         """The middles of curves, in words."""
-        texts = {name: [f"{of[at][1]:{spec}}{unit} at {at:g}" for at in of] for name, of in curves.items()}
+        texts = {name: [f"{curve[at][1]:{spec}}{unit} at {at:g}" for at in curve] for name, curve in curves.items()}
         return "; ".join(f"{name}: {', '.join(middles)}" for name, middles in texts.items())
 
     return {

@@ -42,8 +42,8 @@ class Crazyflow(Simulator):
 
     @property
     def weight(self) -> float:
-        of = numbers_of(self.drone)
-        return float(of["mass"] * -of["gravity_vec"][2])
+        parameters = numbers_of(self.drone)
+        return float(parameters["mass"] * -parameters["gravity_vec"][2])
 
     @property
     def versions(self) -> dict[str, str]:
@@ -55,21 +55,21 @@ class Crazyflow(Simulator):
         The inertia about the level axes is their mean. The drag is the drag along them, and the drag torque of a rotor
         is the torque at hover.
         """
-        of, hover = numbers_of(self.drone), self.weight / 4
-        inertia = np.diag(of["J"])
-        torque = np.polyval(of["rpm2torque"][::-1], speed_of(self.drone, np.array(hover)))
+        parameters, hover = numbers_of(self.drone), self.weight / 4
+        inertia = np.diag(parameters["J"])
+        torque = np.polyval(parameters["rpm2torque"][::-1], speed_of(self.drone, np.array(hover)))
         numbers = {
-            "mass": float(of["mass"]), "inertia": float(inertia[:2].mean()), "yaw_inertia": float(inertia[2]),
-            "arm": frame_of(self.drone).arm, "torque_ratio": float(torque / hover), "gravity": self.weight / of["mass"],
-            "drag": float(-np.diag(of["drag_matrix"])[:2].mean()), "max_force": float(of["thrust_max"]),
-            "min_force": float(of["thrust_min"]),
+            "mass": float(parameters["mass"]), "inertia": float(inertia[:2].mean()), "yaw_inertia": float(inertia[2]),
+            "arm": frame_of(self.drone).arm, "torque_ratio": float(torque / hover),
+            "gravity": self.weight / parameters["mass"], "drag": float(-np.diag(parameters["drag_matrix"])[:2].mean()),
+            "max_force": float(parameters["thrust_max"]), "min_force": float(parameters["thrust_min"]),
         }  # fmt: skip
         return Quadrotor(**numbers | changes)
 
     def check(self, robot: Robot) -> None:
         check_kind("crazyflow: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
-        limits, of = robot.dynamics.control_coordinates, numbers_of(self.drone)
-        low, high = of["thrust_min"], of["thrust_max"]
+        limits, parameters = robot.dynamics.control_coordinates, numbers_of(self.drone)
+        low, high = parameters["thrust_min"], parameters["thrust_max"]
         if min(limits.low) < low - 1e-12 or max(limits.high) > high + 1e-12:
             raise InputError(
                 f"crazyflow: got a robot with rotors of {min(limits.low):g} to {max(limits.high):g} N, want at most"
@@ -83,8 +83,8 @@ class Crazyflow(Simulator):
         simulations.step(controls, wrench, steps)
 
     def states(self, simulations: "_Drones") -> Array:
-        of = simulations.states
-        return frame_of(self.drone).ours(of[:, :3], of[:, 7:10], of[:, 3:7], of[:, 10:13])
+        states = simulations.states
+        return frame_of(self.drone).ours(states[:, :3], states[:, 7:10], states[:, 3:7], states[:, 10:13])
 
     def place(self, simulations: "_Drones", states: Array) -> None:
         simulations.place(states)
@@ -128,8 +128,8 @@ def numbers_of(drone: str) -> dict[str, Any]:
 @cache
 def frame_of(drone: str) -> Frame:
     """Our body axes in the drone's body axes, where torques are sums of y_i f_i about x, and of -x_i f_i about y."""
-    of = numbers_of(drone)
-    mixed, arm = of["mixing_matrix"], of["L"]
+    parameters = numbers_of(drone)
+    mixed, arm = parameters["mixing_matrix"], parameters["L"]
     return Frame.of("crazyflow", np.stack([-mixed[1] * arm, mixed[0] * arm], axis=1), mixed[2])
 
 
@@ -168,8 +168,10 @@ def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
             data = template.replace(
                 states=moved, params=changed, controls=template.controls.replace(rotor_vel=at(17, 4))
             )
-            of = advance(data, n_steps=steps).states
-            return jax.numpy.concatenate([part.ravel() for part in (of.pos, of.quat, of.vel, of.ang_vel, of.rotor_vel)])
+            states = advance(data, n_steps=steps).states
+            return jax.numpy.concatenate(
+                [part.ravel() for part in (states.pos, states.quat, states.vel, states.ang_vel, states.rotor_vel)]
+            )
 
     def run(given: Array) -> Array:
         with jax.enable_x64(True):

@@ -101,12 +101,14 @@ class RotorPy(Simulator):
         The drag is the drag of the rotors at hover speed, across their axes. The inertia about the level axes is their
         mean.
         """
-        of = self._numbers
+        parameters = self._numbers
         numbers = {
-            "mass": of["mass"], "inertia": (of["Ixx"] + of["Iyy"]) / 2, "yaw_inertia": of["Izz"],
-            "arm": self._frame.arm, "torque_ratio": of["k_m"] / of["k_eta"], "gravity": GRAVITY,
-            "drag": 4 * self.hover_speed * of.get("k_d", 0.0), "max_force": of["k_eta"] * of["rotor_speed_max"] ** 2,
-            "min_force": of["k_eta"] * of.get("rotor_speed_min", 0.0) ** 2,
+            "mass": parameters["mass"], "inertia": (parameters["Ixx"] + parameters["Iyy"]) / 2,
+            "yaw_inertia": parameters["Izz"], "arm": self._frame.arm,
+            "torque_ratio": parameters["k_m"] / parameters["k_eta"], "gravity": GRAVITY,
+            "drag": 4 * self.hover_speed * parameters.get("k_d", 0.0),
+            "max_force": parameters["k_eta"] * parameters["rotor_speed_max"] ** 2,
+            "min_force": parameters["k_eta"] * parameters.get("rotor_speed_min", 0.0) ** 2,
         }  # fmt: skip
         return Quadrotor(**numbers | changes)
 
@@ -120,8 +122,8 @@ class RotorPy(Simulator):
         simulations.step(controls, wrench, wind, steps)
 
     def states(self, simulations: "_Vehicles") -> Array:
-        of = simulations.states
-        return self._frame.ours(*(np.array([state[key] for state in of]) for key in ("x", "v", "q", "w")))
+        states = simulations.states
+        return self._frame.ours(*(np.array([state[key] for state in states]) for key in ("x", "v", "q", "w")))
 
     def place(self, simulations: "_Vehicles", states: Array) -> None:
         simulations.place(states)

@@ -241,10 +241,10 @@ def _digest_of_runs(scenario: Scenario) -> str:
     dynamics = robot.dynamics
     states, controls = dynamics.state_coordinates, dynamics.control_coordinates
     # Maps are code: their values at zero and at each unit vector stand for them.
-    apart = [[*np.zeros((1, len(space))), *np.eye(len(space))] for space in (states, controls)]
-    maps = [np.concatenate(robot.configuration(row)) for row in apart[0]], [robot.actuation(row) for row in apart[1]]
+    probes = [[*np.zeros((1, len(space))), *np.eye(len(space))] for space in (states, controls)]
+    maps = [np.concatenate(robot.configuration(row)) for row in probes[0]], [robot.actuation(row) for row in probes[1]]
     balls = (
-        [] if robot.balls is None else [robot.balls.radii, *(robot.balls.centres(dynamics, row) for row in apart[0])]
+        [] if robot.balls is None else [robot.balls.radii, *(robot.balls.centres(dynamics, row) for row in probes[0])]
     )
     names = robot.name, robot.body, robot.joints, robot.actuators, robot.wheels, dynamics.fixed
     numbers = robot.drag, robot.radius, plant.timestep, robot.activations, scene.geoms, dynamics.parameters

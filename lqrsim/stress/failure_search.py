@@ -321,20 +321,20 @@ def certify(
       seed: another seed, for fresh random numbers: then intervals are compared. By default the certificate's.
       scenario: reference to the scenario if it is your own function: files never choose code to run.
     """
-    every = len(certificate.repetitions)
-    count = every if repetitions is None else repetitions
-    if count > every:
-        raise InputError(f"repetitions: got {count}, want at most the certificate's {every}")
+    certified = len(certificate.repetitions)
+    count = certified if repetitions is None else repetitions
+    if count > certified:
+        raise InputError(f"repetitions: got {count}, want at most the certificate's {certified}")
     if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     stated: dict[str, Any] = {field.name: getattr(certificate, field.name) for field in fields(ReliabilityProblem)}
     if scenario is not None:
         stated["scenario"] = scenario
     problem = ReliabilityProblem(**stated)
-    now = problem.facts
+    facts = problem.facts
     differences = [
         f"{name}: got {value}, want {was}"
-        for name, value in now.items()
+        for name, value in facts.items()
         if value != (was := getattr(certificate, name))
     ]
     measured = problem.rare_failures(
@@ -342,8 +342,8 @@ def certify(
         progress=progress,
     )  # fmt: skip
     fresh = f"seed {seed} (was {certificate.seed})" if seed not in (None, certificate.seed) else ""
-    others, estimate = fresh or changed(certificate.versions), measured.probability
-    if others:
+    changes, estimate = fresh or changed(certificate.versions), measured.probability
+    if changes:
         if estimate.low > certificate.high or certificate.low > estimate.high:
             differences.append(f"probability: got {estimate:.2g}, want an interval that overlaps")
     else:
@@ -355,9 +355,9 @@ def certify(
             (estimate.value, estimate.low, estimate.high),
             (certificate.probability, certificate.low, certificate.high),
         )
-        if count == every and ends[0] != ends[1]:
+        if count == certified and ends[0] != ends[1]:
             differences.append(f"probability with its interval: got {ends[0]}, want {ends[1]}")
-    return Recheck(certificate, measured, tuple(differences), others)
+    return Recheck(certificate, measured, tuple(differences), changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,10 +389,10 @@ class SmallestFailure:
             left = "an unknown share" if np.isnan(point.remaining) else f"about {100 * point.remaining:.1f} %"
             why, then = (f"stopped {self.stopped}", "") if self.stopped else ("not converged", "; use more --rounds")
             lines.append(f"{why}: {left} of the distance may be left to gain{then}")
-        likely = point.first_order_probability
+        probability = point.first_order_probability
         lines.append(
-            f"first-order estimate: one trial in {rounded(1 / max(likely, 1e-300))} fails"
-            f" (reliability {1 - likely:.6g}); `lqrsim rare` measures the probability"
+            f"first-order estimate: one trial in {rounded(1 / max(probability, 1e-300))} fails"
+            f" (reliability {1 - probability:.6g}); `lqrsim rare` measures the probability"
         )
         parts = zip(self.shares, self.problem.score.sizes, self.disturbances, strict=True)
         lines += [f"{100 * share:6.1f} % of the squared distance: {words} ({count:,} numbers)"

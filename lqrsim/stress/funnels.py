@@ -178,8 +178,8 @@ class _Pilot:
         """
         test = self.test
         few = min(FEW, test.trials)
-        some = max(int(np.ceil(2 * test.aim * few / test.trials)), 2 if few < test.trials else test.aim)
-        high = self._last(lambda level: self.failures(level, few) <= some, guess, largest, factor=2.0)
+        allowed = max(int(np.ceil(2 * test.aim * few / test.trials)), 2 if few < test.trials else test.aim)
+        high = self._last(lambda level: self.failures(level, few) <= allowed, guess, largest, factor=2.0)
         if high == 0:
             return 0.0
         return self._last(lambda level: self.failures(level, test.trials) <= test.aim, high, largest, factor=1.2)

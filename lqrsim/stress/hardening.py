@@ -228,8 +228,8 @@ class _Search:
             raise InputError(f"problem: got {problem.scenario}, whose duration is free, want a fixed one")
         self.asked, self.chance, self.options = problem, chance, options
         self.scenario, self.stated, design = scenario, scenario.problem, problem.design_disturbances
-        met = uncertainty_of(scenario.plant(), problem.disturbances)  # also refuses sets that there are not
-        self.uncertainty = met if design is None else design_uncertainty(scenario, design)
+        uncertainty = uncertainty_of(scenario.plant(), problem.disturbances)  # also refuses sets that there are not
+        self.uncertainty = uncertainty if design is None else design_uncertainty(scenario, design)
         self.surroundings = Surroundings.of(self.stated, self.uncertainty.obstacles)
         self.names = [obstacle.name for shape in self.surroundings.shapes for obstacle in shape.world.obstacles]
         self.rounds: list[HardeningRound] = []
@@ -314,9 +314,9 @@ class _Search:
         hit, strays = dict[str, float](), 0.0
         if rare is not None:
             run = rare.problem.score.rollout(rare.typical(SHOWN), frames=False)
-            away = np.linalg.norm((run.states[:, -1] - plan.states[-1])[:, place], axis=1)
+            distances = np.linalg.norm((run.states[:, -1] - plan.states[-1])[:, place], axis=1)
             widest = np.sqrt(np.linalg.eigvalsh(tube.position_covariance).max()) if place else np.inf
-            hits = np.array(run.obstacles)[(away <= STRAY * widest) & (np.array(run.outcome) == "collided")]
+            hits = np.array(run.obstacles)[(distances <= STRAY * widest) & (np.array(run.outcome) == "collided")]
             hit = {str(name): float(np.sum(hits == name)) / run.trials for name in np.unique(hits)}
             strays = 1 - len(hits) / run.trials
         self.rounds.append(

@@ -422,13 +422,16 @@ def _table(pairs: Sequence[analysis.Comparison], notes: Sequence[str], *, paired
         first, second = pair.rates
         tested = not np.isnan(pair.p_value)
         trials: dict[str, Entry] = {"first trials": first.trials, "second trials": second.trials}
-        apart: dict[str, Entry] = {}
+        disagreements: dict[str, Entry] = {}
         if paired:
-            trials, apart = {"trials": first.trials}, {"only first": pair.only_first, "only second": pair.only_second}
+            trials, disagreements = (
+                {"trials": first.trials},
+                {"only first": pair.only_first, "only second": pair.only_second},
+            )
         rows.append({
             "sweep": pair.first.sweep, "strength": pair.first.strength,
             "policy": " against ".join(dict.fromkeys((pair.first.policy, pair.second.policy))), **trials,
-            "first success": first.exact.value, "second success": second.exact.value, **apart,
+            "first success": first.exact.value, "second success": second.exact.value, **disagreements,
             "difference": pair.success.value, "low": pair.success.low if tested else None,
             "high": pair.success.high if tested else None, "p": pair.adjusted if tested else None,
         })  # fmt: skip

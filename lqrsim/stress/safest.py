@@ -121,6 +121,6 @@ def smooth_safest(
 
 def _same(one: Solution, other: Solution) -> bool:
     """Whether two plans are the same within SAME."""
-    apart = one.policy.state_coordinates.difference(one.trajectory.states, other.trajectory.states)
+    deviation = one.policy.state_coordinates.difference(one.trajectory.states, other.trajectory.states)
     scale = np.maximum(np.ptp(other.trajectory.states, axis=0), 1e-9)
-    return bool((np.abs(apart) <= SAME * scale).all())
+    return bool((np.abs(deviation) <= SAME * scale).all())

@@ -87,15 +87,15 @@ def paired_difference(
     """
     from scipy import stats
 
-    apart = only_first + only_second
-    if apart > trials:
-        raise InputError(f"trials: got {trials}, want at least the {apart} in which only one succeeded")
+    different = only_first + only_second
+    if different > trials:
+        raise InputError(f"trials: got {trials}, want at least the {different} in which only one succeeded")
     surplus, z = only_first - only_second, float(stats.norm.ppf(0.5 + confidence / 2))
 
     def accepted(difference: float) -> bool:
         # The likeliest fraction of trials in which only the second succeeds, given the difference, is the root of a
         # quadratic.
-        linear = (2 * trials - surplus) * difference - apart
+        linear = (2 * trials - surplus) * difference - different
         constant = -only_second * difference * (1 - difference)
         share = (np.sqrt(max(linear**2 - 8 * trials * constant, 0.0)) - linear) / (4 * trials)
         variance = trials * max(2 * share + difference * (1 - difference), 0.0)
