@@ -136,8 +136,8 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
     @cache  # at the first call, for annotations may name what is defined further down
     def wanted() -> tuple[list[tuple[str, int, Declared]], bool]:
         said = sorted((item for item in declare().items() if _is_known(item[1])), key=_order)
-        places = [(name, positions.get(name, sys.maxsize), one) for name, one in said]
-        return places, any(one.letters for _, one in said)
+        places = [(name, positions.get(name, sys.maxsize), declaration) for name, declaration in said]
+        return places, any(declaration.letters for _, declaration in said)
 
     @functools.wraps(function)
     def call(*given: Any, **named: Any) -> Any:
@@ -163,9 +163,9 @@ def _of_parameters(function: Any) -> dict[str, Declared]:
     hints = get_type_hints(function, include_extras=True)
     said = {name: declared(hint) for name, hint in hints.items() if name != "return"}
     return {
-        name: one
-        for name, one in said.items()
-        if not (one.plain and (get_origin(one.kinds[0]) or one.kinds[0]) in _PLAIN)
+        name: declaration
+        for name, declaration in said.items()
+        if not (declaration.plain and (get_origin(declaration.kinds[0]) or declaration.kinds[0]) in _PLAIN)
     }
 
 
@@ -179,11 +179,11 @@ def declarations(kind: type) -> dict[str, Declared]:
 @cache
 def _of_fields(kind: type) -> dict[str, Declared]:
     """The declarations of fields alone: what else a class is annotated with may be imported for type checkers only."""
-    own = SimpleNamespace(__annotations__={field.name: field.type for field in fields(kind)})
+    annotated = SimpleNamespace(__annotations__={field.name: field.type for field in fields(kind)})
     names: dict[str, Any] = {}
     for base in reversed(kind.__mro__):
         names |= vars(sys.modules[base.__module__])
-    return {name: declared(hint) for name, hint in get_type_hints(own, names, include_extras=True).items()}
+    return {name: declared(hint) for name, hint in get_type_hints(annotated, names, include_extras=True).items()}
 
 
 @cache
@@ -198,11 +198,11 @@ def declared(annotation: Any) -> Declared:
             said += inside[1:]
             kinds = inside[:1]
         else:
-            kinds = tuple(one for one in inside if one is not NoneType)
+            kinds = tuple(kind for kind in inside if kind is not NoneType)
             optional = optional or len(kinds) < len(inside)
 
     def first(kind: type) -> Any:
-        return next((one for one in said if isinstance(one, kind)), None)
+        return next((item for item in said if isinstance(item, kind)), None)
 
     dtype = None
     if get_origin(kinds[0]) in (np.ndarray, npt.NDArray):  # the latter from NumPy 2.5 on, with Python 3.12
@@ -221,7 +221,7 @@ def _is_known(said: Declared) -> bool:
         return bool(said.letters)
     if len(said.kinds) > 1:
         # One of several classes of the package; of others only where the message says more than their names.
-        return all(_is_class(one) and (said.want or one.__module__.startswith("lqrsim")) for one in said.kinds)
+        return all(_is_class(choice) and (said.want or choice.__module__.startswith("lqrsim")) for choice in said.kinds)
     if origin in _COLLECTIONS:
         return origin is tuple or bool(said.want)
     if origin is Callable:
@@ -289,15 +289,15 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any
 
 def _owned(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any:
     """As `_checked`; an array is a copy, for the caller may write into the given one later."""
-    found = _checked(field, value, said, sizes)
-    return found.copy() if found is value and isinstance(found, np.ndarray) else found
+    valid = _checked(field, value, said, sizes)
+    return valid.copy() if valid is value and isinstance(valid, np.ndarray) else valid
 
 
 def _names(said: Declared) -> str:
     """The end of a message about classes: `_want` of each, with how to get an object, or its name."""
     names = {kind: f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}" for kind in said.kinds}
-    told = [getattr(kind, "_want", name) for kind, name in names.items()]
-    want = (", or " if told != [*names.values()] else " or ").join(told)
+    wants = [getattr(kind, "_want", name) for kind, name in names.items()]
+    want = (", or " if wants != [*names.values()] else " or ").join(wants)
     if issubclass(kind := said.kinds[0], enum.Enum):
         return f"{want}, one of {', '.join(kind.__members__)}"
     return f"{want}, or None" if said.optional else want
@@ -313,11 +313,14 @@ def _items(field: str, value: Any, said: Declared, sizes: Sizes | None) -> tuple
     items = check_items(field, value, object, said.want or "a tuple")
     if said.letters and sizes is not None:
         _check_length(field, len(items), said.letters, sizes)
-    each = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
-    if len(each) != len(items):
-        raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
-    pairs = enumerate(zip(items, map(declared, each), strict=True))
-    return tuple(_checked(f"{field}[{i}]", item, one, sizes) if _is_known(one) else item for i, (item, one) in pairs)
+    kinds = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
+    if len(kinds) != len(items):
+        raise InputError(f"{field}: got {len(items)} entries, want {len(kinds)}")
+    pairs = enumerate(zip(items, map(declared, kinds), strict=True))
+    return tuple(
+        _checked(f"{field}[{i}]", item, declaration, sizes) if _is_known(declaration) else item
+        for i, (item, declaration) in pairs
+    )
 
 
 def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:

@@ -211,15 +211,15 @@ class SimulatedRobot:
         if node is None or inlet is None:
             raise InputError("SimulatedRobot: got a state after its end, want it within `with SimulatedRobot(...)`")
         if not self._met:
-            everyone = [inlet.writers, *(one.get_matched_subscriptions for one in self._outlets.values())]
-            _wait(lambda: all(one() for one in everyone), self._patience, lambda: "got no controller")
+            everyone = [inlet.writers, *(outlet.get_matched_subscriptions for outlet in self._outlets.values())]
+            _wait(lambda: all(matched() for matched in everyone), self._patience, lambda: "got no controller")
             self._met = True
         values = dict(zip(self._names, vectors_of("state", state, len(self._names)).tolist(), strict=True))
         pose = functools.partial(node.odometry, turns_about=self._turns_about)
         messages = [(out, (pose if kind == "Odometry" else node.joints)) for kind, out in self._outlets.items()]
         begun = time.monotonic()
-        for outlet, made in messages:
-            outlet.write(made(values, t))
+        for outlet, compose in messages:
+            outlet.write(compose(values, t))
         _wait(lambda: inlet.wait(SLICE), self._patience, lambda: "got no command")
         self.round_trips.append(time.monotonic() - begun)
         (message,) = inlet.take()
@@ -266,17 +266,17 @@ def _checked_topic(topic: object) -> str:
 
 
 def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
-    found = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
-    if not found:
+    topics = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
+    if not topics:
         raise InputError("odometry: got none, want a topic of states in odometry=, in joints=, or in both")
-    return found
+    return topics
 
 
 def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str, ...]:
-    given = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
-    if unknown := set(given) - set(states.names):
+    message_names = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
+    if unknown := set(message_names) - set(states.names):
         raise InputError(f"names: got {excerpt(sorted(unknown))}, want some of {', '.join(states.names)}")
-    return tuple(given.get(name, name) for name in states.names)
+    return tuple(message_names.get(name, name) for name in states.names)
 
 
 def _turns_about(states: Coordinates, names: Sequence[str]) -> str | None:
@@ -371,13 +371,13 @@ def _of_odometry(message: Any, turns_about: str | None = None) -> dict[str, floa
 
 def _of_joints(message: Any) -> dict[str, float]:
     """The states in the message, for the joints that it lists. Raises ValueError if they are invalid."""
-    found: dict[str, float] = {}
+    states: dict[str, float] = {}
     for field, suffix in (("position", ""), ("velocity", "_velocity")):
         numbers = getattr(message, field)
         if len(numbers) not in (0, len(message.name)):
             raise ValueError(f"{len(message.name)} joints with {len(numbers)} numbers as their {field}")
-        found |= {name + suffix: number for name, number in zip(message.name, numbers, strict=False)}
-    return found
+        states |= {name + suffix: number for name, number in zip(message.name, numbers, strict=False)}
+    return states
 
 
 class _Node:
@@ -386,10 +386,10 @@ class _Node:
     def __init__(self, domain: int | None) -> None:
         self._ros = _ros()
         if domain is None:
-            given = os.environ.get("ROS_DOMAIN_ID") or "0"
-            if not given.isdecimal():
-                raise InputError(f"ROS_DOMAIN_ID: got {excerpt(given)}, want a number")
-            domain = int(given)
+            setting = os.environ.get("ROS_DOMAIN_ID") or "0"
+            if not setting.isdecimal():
+                raise InputError(f"ROS_DOMAIN_ID: got {excerpt(setting)}, want a number")
+            domain = int(setting)
         self._participant = self._ros.DomainParticipant(check_count("domain", domain, at_least=0, at_most=232))
         self.second = self._ros.duration(seconds=1)
 
@@ -409,14 +409,14 @@ class _Node:
         The representation is the first version of CDR, as in ROS 2.
         """
         ros, policy = self._ros, self._ros.Policy
-        kept = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
+        history = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
         sure = policy.Reliability.Reliable(self.second) if reliable else policy.Reliability.BestEffort
-        return ros.Qos(sure, kept, policy.DataRepresentation(use_cdrv0_representation=True))
+        return ros.Qos(sure, history, policy.DataRepresentation(use_cdrv0_representation=True))
 
     def numbers(self, numbers: Array) -> Any:
         make = self._ros.messages
         layout = make["MultiArrayLayout"](dim=[], data_offset=0)
-        return make["Float64MultiArray"](layout=layout, data=[float(one) for one in numbers])
+        return make["Float64MultiArray"](layout=layout, data=[float(number) for number in numbers])
 
     def odometry(self, values: Mapping[str, float], t: float, turns_about: str | None = None) -> Any:
         make, of = self._ros.messages, {name: values.get(name, 0.0) for name in ODOMETRY}
@@ -445,8 +445,8 @@ class _Node:
         )
 
     def _header(self, t: float, frame: str) -> Any:
-        whole = math.floor(t)
-        stamp = self._ros.messages["Time"](sec=whole, nanosec=min(round((t - whole) * 1e9), 999_999_999))
+        seconds = math.floor(t)
+        stamp = self._ros.messages["Time"](sec=seconds, nanosec=min(round((t - seconds) * 1e9), 999_999_999))
         return self._ros.messages["Header"](stamp=stamp, frame_id=frame)
 
 
@@ -484,11 +484,11 @@ def _ros() -> SimpleNamespace:
         from cyclonedds.util import duration
     except ImportError as error:
         raise InputError(f"lqrsim.bridge: got no cyclonedds ({error}), want pip install 'lqrsim[ros]'") from None
-    made: dict[str, Any] = {}
+    messages: dict[str, Any] = {}
 
     def message(package: str, name: str, /, **fields: Any) -> Any:
-        made[name] = make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
-        return made[name]
+        messages[name] = make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
+        return messages[name]
 
     three = dict.fromkeys(AXES, float64)
     stamp = message("builtin_interfaces", "Time", sec=int32, nanosec=uint32)
@@ -509,5 +509,5 @@ def _ros() -> SimpleNamespace:
     return SimpleNamespace(
         Policy=Policy, Qos=Qos, DomainParticipant=DomainParticipant, DataWriter=DataWriter,
         DataReader=DataReader, ReadCondition=ReadCondition, WaitSet=WaitSet, Topic=Topic, duration=duration,
-        NEW=SampleState.NotRead | ViewState.Any | InstanceState.Any, messages=made,
+        NEW=SampleState.NotRead | ViewState.Any | InstanceState.Any, messages=messages,
     )  # fmt: skip

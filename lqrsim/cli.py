@@ -46,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
       The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or standard output cannot be written;
       130 stopped by Ctrl-C, 143 by SIGTERM; 141 standard output was closed.
     """
-    own = arguments is None
-    if own:
+    as_command = arguments is None
+    if as_command:
         process.handle_signals("lqrsim: stopped")
     try:
         try:
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         for note in getattr(stop, "__notes__", ()):
             process.print_error(f"lqrsim: {note}")
-        if own:
+        if as_command:
             process.end_stopped()
         process.print_error("lqrsim: stopped")
         return 130
@@ -200,7 +200,7 @@ def _given_twice(command: Any, arguments: list[str]) -> str:
     words = itertools.takewhile(lambda word: word != "--", arguments)
     # No value begins with "--": tyro takes it as a wrong option.
     options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
-    for option, count in collections.Counter(f"--{one[2:].removeprefix('no-')}" for one in options).items():
+    for option, count in collections.Counter(f"--{option[2:].removeprefix('no-')}" for option in options).items():
         if count > 1:
             several = isinstance(getattr(command, option[2:].replace("-", "_"), None), tuple)
             return f"{option}: got it {count} times, want it once" + (", with all its values" if several else "")

@@ -87,16 +87,16 @@ def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...],
 def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
     """`value` as a new C-ordered float64 array of any shape, NaN included. Raises InputError if it is not numbers."""
     try:
-        given = np.asarray(value)
-        if given.size > _LARGE:
-            check_memory(field, given.size, 32, "arrays made from it")
-        if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
+        array = np.asarray(value)
+        if array.size > _LARGE:
+            check_memory(field, array.size, 32, "arrays made from it")
+        if array.dtype.kind not in "biufO":  # text, complex numbers, dates, records
             raise TypeError
         if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # masked entries are no numbers
             raise TypeError
-        if given.dtype.kind == "O" and any(isinstance(entry, (str, bytes)) for entry in given.flat):
+        if array.dtype.kind == "O" and any(isinstance(entry, (str, bytes)) for entry in array.flat):
             raise TypeError
-        return np.array(given, dtype=np.float64, order="C")
+        return np.array(array, dtype=np.float64, order="C")
     except InputError:
         raise
     except MemoryError:
@@ -107,9 +107,9 @@ def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
 
 def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ...]) -> None:
     """Raises InputError unless the array has that shape (None matches any length)."""
-    found = array.shape
-    if len(found) != len(shape) or any(w is not None and g != w for g, w in zip(found, shape, strict=True)):
-        raise InputError(f"{field}: got shape {_shape(found)}, want {_shape(shape)}")
+    actual = array.shape
+    if len(actual) != len(shape) or any(w is not None and g != w for g, w in zip(actual, shape, strict=True)):
+        raise InputError(f"{field}: got shape {_shape(actual)}, want {_shape(shape)}")
 
 
 def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
@@ -191,8 +191,8 @@ def _short(bound: float) -> str:
 
 def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = LARGEST_COUNT) -> int:
     """`value` as an int from `at_least` to `at_most`. Raises InputError otherwise."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
-    if not whole or value < at_least:  # pyright: ignore[reportOperatorIssue]
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
+    if not is_integer or value < at_least:  # pyright: ignore[reportOperatorIssue]
         raise InputError(f"{field}: got {excerpt(value)}, want a whole number >= {at_least}")
     if value > at_most:  # pyright: ignore[reportOperatorIssue]
         raise InputError(f"{field}: got {excerpt(value)}, want a whole number from {at_least} to {at_most}")
@@ -206,10 +206,10 @@ def check_seed(field: str, value: object) -> int:
 
 def check_memory(field: str, count: int, each: int, what: str = "whose arrays") -> None:
     """Raises InputError if `count` items of `each` bytes do not fit into this machine's memory."""
-    if count * each > (there := memory()):
+    if count * each > (available := memory()):
         raise InputError(
-            f"{field}: got {excerpt(count)}, {what} would take {_bytes(count * each)}, want at most {there // each}"
-            f" for the {_bytes(there)} of this machine"
+            f"{field}: got {excerpt(count)}, {what} would take {_bytes(count * each)}, want at most {available // each}"
+            f" for the {_bytes(available)} of this machine"
         )
 
 
@@ -284,17 +284,17 @@ def check_items(
     try:
         if isinstance(value, (str, bytes, dict)):
             raise TypeError
-        found = tuple(itertools.islice(iter(value), at_most + 1))  # pyright: ignore[reportCallIssue, reportArgumentType]
+        items = tuple(itertools.islice(iter(value), at_most + 1))  # pyright: ignore[reportCallIssue, reportArgumentType]
     except InputError:
         raise
     except Exception:  # not a collection, or one that raises anything
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
-    if len(found) > at_most:
+    if len(items) > at_most:
         raise InputError(f"{field}: got more than {at_most} items, want {want}")
-    for place, one in enumerate(found):
-        if not isinstance(one, kind):
-            raise InputError(f"{field}: got {excerpt(one)} at {place}, want {want}")
-    return found
+    for place, item in enumerate(items):
+        if not isinstance(item, kind):
+            raise InputError(f"{field}: got {excerpt(item)} at {place}, want {want}")
+    return items
 
 
 def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) -> Array:
@@ -304,9 +304,9 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
     """
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 3 and len(raw):
-        found = np.array([check_weight(f"{field}: row {k}", one, definite=definite) for k, one in enumerate(raw)])
-        found.setflags(write=False)
-        return found
+        weights = np.array([check_weight(f"{field}: row {k}", row, definite=definite) for k, row in enumerate(raw)])
+        weights.setflags(write=False)
+        return weights
     if raw.ndim == 1:
         check_memory(field, len(raw), 16 * len(raw), "whose square matrix")
     matrix = np.diag(raw) if raw.ndim == 1 else raw
@@ -340,9 +340,9 @@ def check_symmetric(field: str, matrices: Array) -> Array:
         *first, _, _ = (int(k) for k in np.argwhere(wrong)[0])
         worst = np.argmax(skew[(*first,)])
         i, j = (int(k) for k in np.unravel_index(worst, skew.shape[-2:]))
-        one, other = [*first, i, j], [*first, j, i]
+        place, mirror = [*first, i, j], [*first, j, i]
         raise InputError(
-            f"{field}: got {matrices[tuple(one)]:g} at {one} and {matrices[tuple(other)]:g} at {other}, want a"
+            f"{field}: got {matrices[tuple(place)]:g} at {place} and {matrices[tuple(mirror)]:g} at {mirror}, want a"
             " symmetric matrix"
         )
     symmetric = np.ascontiguousarray(0.5 * (matrices + across))
@@ -415,9 +415,9 @@ def brief(value: object) -> str:
             return f"diag({brief(np.diag(value).tolist())})"
         return brief(value.tolist()) if value.ndim <= 1 and value.size <= 12 else f"array {value.shape}"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{name}: {brief(one)}" for name, one in value.items()) + "}"
+        return "{" + ", ".join(f"{name}: {brief(entry)}" for name, entry in value.items()) + "}"
     if isinstance(value, (list, tuple)):
-        listed = [brief(one) for one in value]
+        listed = [brief(item) for item in value]
         text = (
             f"{listed[0]}, ... {len(listed)} times" if len(listed) > 3 and len(set(listed)) == 1 else ", ".join(listed)
         )

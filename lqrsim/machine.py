@@ -18,36 +18,36 @@ def processors() -> int:
 def description() -> str:
     """Number and name of the processors, and the system, as text."""
     try:
-        found = re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+        match = re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
     except OSError:  # not on macOS and Windows
-        found = None
-    processor = found[1].strip() if found else platform.processor() or platform.machine()
+        match = None
+    processor = match[1].strip() if match else platform.processor() or platform.machine()
     return f"{processors()} x {processor}, {platform.system()}"
 
 
 def memory() -> int:
     """Bytes of memory that this process may use: the machine's memory, or less under a limit."""
-    there = [_physical()]
+    limits = [_physical()]
     with contextlib.suppress(ImportError, OSError, ValueError):  # not on Windows
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
             pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-            there.append(max(limit - pages * resource.getpagesize(), 0))
-    return min(there)
+            limits.append(max(limit - pages * resource.getpagesize(), 0))
+    return min(limits)
 
 
 @functools.cache
 def _physical() -> int:
     """Memory of the machine or its container in bytes; 16 GiB on Windows, where it is not determined."""
-    there = [1 << 34]
+    limits = [1 << 34]
     with contextlib.suppress(AttributeError, OSError, ValueError):
-        there = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+        limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     for place in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
-            there.append(int(Path(place).read_text(encoding="ascii")))
-    return min(there)
+            limits.append(int(Path(place).read_text(encoding="ascii")))
+    return min(limits)
 
 
 @functools.cache

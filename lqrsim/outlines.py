@@ -91,20 +91,20 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
           `count` lists with the same number of coordinates.
         """
         try:
-            first, last = (list(itertools.islice(iter(one), 4)) for one in (start, end))
+            first, last = (list(itertools.islice(iter(point), 4)) for point in (start, end))
         except TypeError:
             first, last = [], [0]
         if len(first) != len(last) or len(first) not in (2, 3):
-            given = f"{excerpt(start)} and {excerpt(end)}"
-            raise InputError(f"between: got {given}, want two points of 2 or 3 coordinates")
+            got = f"{excerpt(start)} and {excerpt(end)}"
+            raise InputError(f"between: got {got}, want two points of 2 or 3 coordinates")
         most = max(self.count - 1, 1)
         try:
             return [
                 [((most - k) * a + k * b) / most for a, b in zip(first, last, strict=True)] for k in range(self.count)
             ]
         except Exception as error:  # entries that are not numbers
-            given = f"{excerpt(start)} and {excerpt(end)}"
-            raise InputError(f"between: got {given} ({type(error).__name__}), want points of expressions") from None
+            got = f"{excerpt(start)} and {excerpt(end)}"
+            raise InputError(f"between: got {got} ({type(error).__name__}), want points of expressions") from None
 
 
 class Box(namedtuple("Box", ("length", "width", "height"))):
@@ -120,7 +120,7 @@ class Box(namedtuple("Box", ("length", "width", "height"))):
 
     def __new__(cls, length: float, width: float, height: float | None = None) -> "Box":
         sizes = {"length": length, "width": width} | ({} if height is None else {"height": height})
-        checked = [check_number(f"Box: {name}", one, above=0.0) for name, one in sizes.items()]
+        checked = [check_number(f"Box: {name}", size, above=0.0) for name, size in sizes.items()]
         return super().__new__(cls, *checked, *[None] * (3 - len(checked)))
 
     def corners(self, center: Sequence[Any], turn: Any) -> list[list[Any]]:
@@ -143,6 +143,6 @@ class Box(namedtuple("Box", ("length", "width", "height"))):
             ends = [(a * self.length, b * self.width) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             return [[x + a * c - b * s, y + a * s + b * c] for a, b in ends]
         except Exception as error:  # entries that are not numbers
-            given = f"{excerpt(center)} and {excerpt(turn)} ({type(error).__name__})"
+            got = f"{excerpt(center)} and {excerpt(turn)} ({type(error).__name__})"
             wanted = "2 coordinates and an angle" if self.height is None else "3 coordinates and a rotation vector"
-            raise InputError(f"corners: got {given}, want {wanted}") from None
+            raise InputError(f"corners: got {got}, want {wanted}") from None

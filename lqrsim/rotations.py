@@ -106,9 +106,9 @@ def rotation_vector(quaternion: npt.ArrayLike, *, turns_about: str | None = None
         along = _index(turns_about)
         sign = np.copysign(1.0, rows[..., 0])
         half = np.arctan2(sign * rows[..., 1 + along], sign * rows[..., 0])
-        found = rotation_vector(_turned(rows, along, -half))
-        found[..., along] = 2 * half
-        return found
+        vector = rotation_vector(_turned(rows, along, -half))
+        vector[..., along] = 2 * half
+        return vector
     # q and -q are the same rotation; with a scalar part >= 0 it is at most half a turn.
     scalar, x, y, z = (rows[..., i] for i in range(4))
     sine = np.sqrt(x * x + y * y + z * z)
@@ -143,21 +143,21 @@ def _turned(quaternion: Array, along: int, half: Array) -> Array:
 
 def _three(field: str, vector: Vector) -> tuple[Any, ...]:
     """The three entries of a vector: numbers, arrays or expressions. Raises InputError for anything else."""
-    found = check_items(field, vector, object, "three expressions or numbers", at_most=3)
-    too_large = any(isinstance(one, int) and abs(one) > sys.float_info.max for one in found)
-    if len(found) != 3 or too_large or any(isinstance(one, str) for one in found):
+    parts = check_items(field, vector, object, "three expressions or numbers", at_most=3)
+    too_large = any(isinstance(part, int) and abs(part) > sys.float_info.max for part in parts)
+    if len(parts) != 3 or too_large or any(isinstance(part, str) for part in parts):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
-    if all(_numeric(one) for one in found):
-        for one in found:
-            check_memory(field, np.size(one), 32, "arrays made from it")  # a broadcast array takes little memory itself
-        return found
+    if all(_numeric(part) for part in parts):
+        for raw in parts:
+            check_memory(field, np.size(raw), 32, "arrays made from it")  # a broadcast array takes little memory itself
+        return parts
     import sympy
 
     try:
-        expressions = [sympy.sympify(one, strict=True) for one in found]
+        expressions = [sympy.sympify(part, strict=True) for part in parts]
     except Exception:  # SympifyError, or anything that an object raises
         expressions = [None]
-    if not all(isinstance(one, sympy.Expr) for one in expressions):
+    if not all(isinstance(part, sympy.Expr) for part in expressions):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
     return tuple(expressions)
 

@@ -33,8 +33,8 @@ def other_lqrsim(was: Mapping[str, str]) -> str:
 
     The hashes of the same problem or robot may then differ.
     """
-    made = was.get("lqrsim", "")
-    return f"lqrsim {made}" if made and made != versions()["lqrsim"] else ""
+    made_by = was.get("lqrsim", "")
+    return f"lqrsim {made_by}" if made_by and made_by != versions()["lqrsim"] else ""
 
 
 @cache
@@ -51,13 +51,13 @@ def outdated(extra: str = "") -> str:
     bounds = [re.fullmatch(rf"([\w.-]+)>=([\d.]+){of}", need) for need in needs]
     least = {bound[1]: bound[2] for bound in bounds if bound}
     older = {
-        name: found for name, found in versions_of(*least).items()
-        if found != "not installed" and _numbers(found) < _numbers(least[name])
+        name: present for name, present in versions_of(*least).items()
+        if present != "not installed" and _numbers(present) < _numbers(least[name])
     }  # fmt: skip
     if not older:
         return ""
     wanted = " ".join(f"'{name}>={least[name]}'" for name in older)
-    return f"got {', '.join(f'{name} {found}' for name, found in older.items())}, want newer: pip install {wanted}"
+    return f"got {', '.join(f'{name} {present}' for name, present in older.items())}, want newer: pip install {wanted}"
 
 
 def _numbers(version: str) -> tuple[int, ...]:
@@ -68,10 +68,10 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 def versions_of(*names: str) -> dict[str, str]:
     """Name -> version of installed distributions, or "not installed"."""
-    found = {}
+    installed = {}
     for name in names:
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            installed[name] = "not installed"
+    return installed

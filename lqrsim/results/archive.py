@@ -83,19 +83,19 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Mapping):
-        return {str(name): plain(one) for name, one in value.items()}
+        return {str(name): plain(entry) for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     return value
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         raise ValueError("a name twice in one object")
-    return found
+    return members
 
 
 def anything(field: str, value: Any, depth: int = _DEPTH) -> Any:
@@ -106,10 +106,10 @@ def anything(field: str, value: Any, depth: int = _DEPTH) -> Any:
         if depth == 0:
             raise InputError(f"{field}: got more nested lists or objects, want at most {_DEPTH}")
         if isinstance(value, list):
-            return [anything(f"{field}[{i}]", one, depth - 1) for i, one in enumerate(value)]
+            return [anything(f"{field}[{i}]", item, depth - 1) for i, item in enumerate(value)]
         return {
-            check_string(f"{field}: a name", name): anything(f"{field}.{name}", one, depth - 1)
-            for name, one in value.items()
+            check_string(f"{field}: a name", name): anything(f"{field}.{name}", entry, depth - 1)
+            for name, entry in value.items()
         }
     return value
 
@@ -139,13 +139,13 @@ def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str,
     text = np.array(canonical({**meta, DIGEST: digest(arrays, meta)}))
     if text.nbytes > _LARGEST_TEXT:
         raise InputError(f"output: got {text.nbytes:,} bytes of text for {path}, want at most {_LARGEST_TEXT:,}")
-    whole: dict[str, Any] = {META: text, **{name: np.ascontiguousarray(array) for name, array in arrays.items()}}
+    entries: dict[str, Any] = {META: text, **{name: np.ascontiguousarray(array) for name, array in arrays.items()}}
     with replacing(path) as unfinished:
         for save in (np.savez_compressed, np.savez):
             # Through a file object: given a name, NumPy appends .npz to it.
             with unfinished.open("wb") as file:
-                save(file, allow_pickle=False, **whole)
-            if sum(array.nbytes for array in whole.values()) < _limit(unfinished.stat().st_size):
+                save(file, allow_pickle=False, **entries)
+            if sum(array.nbytes for array in entries.values()) < _limit(unfinished.stat().st_size):
                 break  # otherwise the file is compressed so well that reading would refuse it as a zip bomb
 
 
@@ -173,10 +173,10 @@ class Archive:
 
     def arrays(self) -> Arrays:
         """All arrays. Raises InputError unless the hash of the content is the hash in the file."""
-        found = {name: self._array(name) for name in self.headers}
-        if self.meta.get(DIGEST) != digest(found, self.meta):
+        arrays = {name: self._array(name) for name in self.headers}
+        if self.meta.get(DIGEST) != digest(arrays, self.meta):
             raise InputError(f"{DIGEST}: got another hash than that of the content, want an unchanged file")
-        return found
+        return arrays
 
     def _header(self, name: str) -> Header:
         with self._archive.open(self._members[name]) as file:
@@ -218,16 +218,16 @@ def opened(path: Path, kind: str | None, versions: Mapping[str, tuple[int, ...]]
     """
     field = kind or "path"
     with blamed(path, field), path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        found = Archive(archive, os.fstat(file.fileno()).st_size)
-        said = found.meta.get("format")
-        wanted = [f"lqrsim {one}" for one in versions if kind in (None, one)]
+        reader = Archive(archive, os.fstat(file.fileno()).st_size)
+        said = reader.meta.get("format")
+        wanted = [f"lqrsim {name}" for name in versions if kind in (None, name)]
         if said not in wanted:
-            names = " or ".join(repr(one) for one in wanted)
+            names = " or ".join(repr(label) for label in wanted)
             raise Other(f"{field}: got {path}, which holds a {excerpt(said)}, want a {names}")
         known = versions[str(said).removeprefix("lqrsim ")]
-        if (version := found.meta.get("version")) not in known:
+        if (version := reader.meta.get("version")) not in known:
             raise of_other_version(path, field, version, known)
-        yield found
+        yield reader
 
 
 def of_other_version(path: Path, field: str, version: object, known: tuple[int, ...]) -> Other:
@@ -276,8 +276,8 @@ def replacing(path: Path) -> Iterator[Path]:
         ) from None
     looped = target.is_symlink()  # after all links have been followed
     if looped or (target.exists() and not target.is_file()):
-        what = "a folder" if target.is_dir() else "a link to itself" if looped else "neither a file nor a folder"
-        raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a regular file")
+        existing = "a folder" if target.is_dir() else "a link to itself" if looped else "neither a file nor a folder"
+        raise InputError(f"output: got {excerpt_of(path)}, which is {existing}, want the name of a regular file")
     # A random name, so that two writers do not collide. It is known before the file exists, so that Ctrl-C at any
     # moment removes the file. The suffix stays, because writers choose the format by it.
     unfinished = target.parent / f"{UNFINISHED}{secrets.token_hex(8)}{path.suffix}"

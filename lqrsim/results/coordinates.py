@@ -206,8 +206,8 @@ class Coordinates:
         for i in self.angles:
             out[..., i] -= 2 * np.pi * np.round((out[..., i] - near[..., i]) / (2 * np.pi))
         for first, turn in zip(self.rotation_vectors, self.turns, strict=True):
-            own = slice(first, first + 3) if turn < 0 else [first + i for i in range(3) if i != turn]
-            out[..., own] = _nearest_rotation_vector(out[..., own], near[..., own])
+            entries = slice(first, first + 3) if turn < 0 else [first + i for i in range(3) if i != turn]
+            out[..., entries] = _nearest_rotation_vector(out[..., entries], near[..., entries])
         return out
 
     def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
@@ -218,13 +218,13 @@ class Coordinates:
         self, field: str, given: Mapping[str, object], check: Callable[[str, object], _Value]
     ) -> dict[int, _Value]:
         """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit."""
-        units, found = set(self.units) - {""} - set(self.names), {}
+        units, values = set(self.units) - {""} - set(self.names), {}
         for key in sorted(given, key=lambda key: key not in units):  # units first, so that names take precedence
             check_name(field, key, [*self.names, *sorted(units)])
             value = check(f"{field}: {excerpt(key)}", given[key])
-            told = self.units if key in units else self.names
-            found |= {i: value for i, one in enumerate(told) if one == key}
-        return found
+            labels = self.units if key in units else self.names
+            values |= {i: value for i, label in enumerate(labels) if label == key}
+        return values
 
     def _numbers(self, field: str, given: Mapping[str, float]) -> Array:
         """Numbers by name or by unit as an array (n,), with 0 for entries without a number."""
@@ -302,10 +302,10 @@ def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose
       field: field in messages. what: description of the given object, such as "a policy". got, want: its coordinates,
         and the required ones. whose: name of the owner of the required coordinates.
     """
-    for kind, one, other in zip(("states", "controls"), got, want, strict=True):
-        if one.names != other.names:
+    for kind, space, wanted in zip(("states", "controls"), got, want, strict=True):
+        if space.names != wanted.names:
             raise InputError(
-                f"{field}: got {what} with the {kind} {', '.join(one.names)}, want {', '.join(other.names)}, as"
+                f"{field}: got {what} with the {kind} {', '.join(space.names)}, want {', '.join(wanted.names)}, as"
                 f" {whose} has them"
             )
 

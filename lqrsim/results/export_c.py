@@ -123,7 +123,7 @@ def export_c(
         "nearest": _nearest(law, number), "share": f"{share:g}", "tolerance": _list(map(repr, tolerance.tolist())),
         "rows": rows,
     }  # fmt: skip
-    files, templates = [], {f"{name}.h": "my_policy.h", f"{name}.c": kind["source"]} | {one: one for one in STATIC}
+    files, templates = [], {f"{name}.h": "my_policy.h", f"{name}.c": kind["source"]} | {file: file for file in STATIC}
     for file, template in templates.items():
         text = (TEMPLATES / template).read_text(encoding="utf-8")
         text = re.sub("@([A-Za-z0-9]+)@", lambda match: parts[match[1]], text)
@@ -220,10 +220,10 @@ class _Tables:
 
     def _rounded(self, name: str, array: Array) -> Array:
         with np.errstate(over="ignore"):
-            found = array.astype(DTYPES[self._number]).astype(np.float64)
-        if not np.isfinite(found).all():
+            rounded = array.astype(DTYPES[self._number]).astype(np.float64)
+        if not np.isfinite(rounded).all():
             raise InputError(f"policy: {name}: got {np.abs(array).max():g} in it, want numbers that a float holds")
-        return found
+        return rounded
 
     def _write(self, name: str, array: Array, kind: str) -> None:
         self.bytes += array.size * (2 if kind == "short" else np.dtype(DTYPES[self._number]).itemsize)
@@ -234,8 +234,8 @@ class _Tables:
 
         def inner(part: Array) -> str:
             if part.ndim == 1:
-                return _list(as_text(one) for one in part)
-            return "{" + (",\n" if part.ndim < 3 else ",\n\n").join(inner(one) for one in part) + "}"
+                return _list(as_text(number) for number in part)
+            return "{" + (",\n" if part.ndim < 3 else ",\n\n").join(inner(row) for row in part) + "}"
 
         self._lines.append(f"static const {kind} {name}{sizes} = {inner(array)};")
 

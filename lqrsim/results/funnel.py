@@ -121,9 +121,9 @@ class Funnel:
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
         """
         knot, size = self._knot(t), len(self.state_coordinates)
-        given = vectors_of("x", x, size)
+        states = vectors_of("x", x, size)
         middle = self.plan.states[knot] if about is None else shaped("about", about, (size,))
-        off = self.state_coordinates.difference(given, middle)[..., self.chosen]
+        off = self.state_coordinates.difference(states, middle)[..., self.chosen]
         curve = self._inverse[knot]
         with np.errstate(over="ignore", invalid="ignore"):
             level = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", off, curve, off), 0.0))

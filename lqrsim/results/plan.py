@@ -90,7 +90,9 @@ class Plan:
             "policy": self.policy.shifted(steps, horizon=horizon),
             "trajectory": Trajectory(moved(plan.states), moved(plan.controls), plan.dt),
             "cost_to_go": value,
-            "multipliers": tuple(replace(one, values=moved(one.values)) for one in self.multipliers),
+            "multipliers": tuple(
+                replace(multiplier, values=moved(multiplier.values)) for multiplier in self.multipliers
+            ),
         }
         return replace(self, **parts, **self._shifted_parts(steps, moved))
 

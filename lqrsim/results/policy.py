@@ -155,7 +155,7 @@ class OutputFeedbackPolicy:
         recursions = (value for value in vars(self).values() if isinstance(value, np.ndarray))
         spaces = self.state_coordinates, self.control_coordinates, self.measured_coordinates
         # The names say which states are measured.
-        rules = (f"{one.names} {one.rules}" for one in spaces)
+        rules = (f"{space.names} {space.rules}" for space in spaces)
         return sha256(*recursions, np.float64(self.dt), *rules)[:16]
 
     def start(self) -> Array:

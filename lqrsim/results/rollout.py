@@ -353,8 +353,8 @@ class Rollout:
         """Disturbances, the end of the plan, and the number of each outcome; then for each of the first trials outcome,
         tracking error, clearance and saturation.
         """
-        what = "; ".join(self.disturbances) or "undisturbed"
-        lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
+        disturbances = "; ".join(self.disturbances) or "undisturbed"
+        lines = [f"{self.robot} in {self.scene}, {disturbances}, seed {self.seed}"]
         if MOVED in self.disturbances:
             lines.append("  trials are to reach the goal where it was last; the plan was made for another")
         else:
@@ -365,8 +365,8 @@ class Rollout:
             lines.append(f"  MuJoCo warned {warned}")
         if self.trials > 1:
             counted = Counter(self.outcome)
-            each = ", ".join(f"{counted[one]} {one}" for one in OUTCOMES if counted[one])
-            lines.append(f"  {self.trials} trials: {each}")
+            outcomes = ", ".join(f"{counted[outcome]} {outcome}" for outcome in OUTCOMES if counted[outcome])
+            lines.append(f"  {self.trials} trials: {outcomes}")
         lines += [f"  {self._line(k)}" for k in range(min(self.trials, LISTED))]
         return "\n".join([*lines, f"  and {self.trials - LISTED} more"] if self.trials > LISTED else lines)
 
@@ -383,10 +383,10 @@ class Rollout:
         """How often MuJoCo warned, in how many trials and of what, as text; empty if it did not."""
         if self.warnings is None or not self.warnings.any():
             return ""
-        each = [f"{what} ({n})" for what, n in zip(WARNINGS, self.warnings.sum(axis=0), strict=True) if n]
+        listed = [f"{warning} ({n})" for warning, n in zip(WARNINGS, self.warnings.sum(axis=0), strict=True) if n]
         trials = f" in {(self.warnings > 0).any(axis=1).sum()} of {self.trials} trials" if self.trials > 1 else ""
         count = int(self.warnings.sum())
-        return f"{count} time{'s' if count > 1 else ''}{trials}: {', '.join(each)}"
+        return f"{count} time{'s' if count > 1 else ''}{trials}: {', '.join(listed)}"
 
     def _line(self, k: int) -> str:
         outcome, counts, name = self.outcome[k], self.counts[k], f"trial {self.first_trial + k}"
@@ -396,8 +396,8 @@ class Rollout:
         if not counts.any():
             return f"{name}: {outcome} {when}"
         if outcome in ("collided", "diverged"):
-            what = f" with {self.obstacles[k]}" if outcome == "collided" else ""
-            how, final = f"{outcome}{what} {when}", ""
+            struck = f" with {self.obstacles[k]}" if outcome == "collided" else ""
+            how, final = f"{outcome}{struck} {when}", ""
         else:
             worst = self.target.worst(self.states[k, -1], self.goal_radius)
             how = f"{outcome}, {self.target.describe(float(self.goal_distance[k]))}{f' ({worst})' if worst else ''}"

@@ -98,7 +98,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         `ls.types.Funnel` or `ls.stress.FailureCertificate`. By default, any.
     """
     if kind is not None and kind not in FORMATS:
-        names = (f"ls.{'stress.' if one is FailureCertificate else ''}{one.__name__}" for one in FORMATS)
+        names = (f"ls.{'stress.' if allowed is FailureCertificate else ''}{allowed.__name__}" for allowed in FORMATS)
         raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(names)}")
     wanted = None if kind is None else FORMATS[kind][0]
     path = check_path(wanted or "path", path)
@@ -106,16 +106,16 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         known = "; the folder of a campaign is opened with ls.stress.Results(folder)"
         raise InputError(f"{wanted or 'path'}: got {path}, a folder, want a file{known}")
     with archive.opened(path, wanted, VERSIONS) as file:
-        found = str(file.meta["format"]).removeprefix("lqrsim ")
-        kind = next(kind for kind, (name, _) in FORMATS.items() if name == found)
+        format_name = str(file.meta["format"]).removeprefix("lqrsim ")
+        kind = next(kind for kind, (name, _) in FORMATS.items() if name == format_name)
         _check_arrays(kind, file.headers)
         outside = ("format", "version", "sha256")
-        arrays, tree = file.arrays(), {name: one for name, one in file.meta.items() if name not in outside}
+        arrays, tree = file.arrays(), {name: entry for name, entry in file.meta.items() if name not in outside}
         record = record_from(kind, tree, "", arrays)
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want it mentioned there")
-        if (version := file.meta["version"]) != (own := VERSIONS[found][_has_turns(record)]):
-            raise archive.of_other_version(path, found, version, (own,))
+        if (version := file.meta["version"]) != (expected := VERSIONS[format_name][_has_turns(record)]):
+            raise archive.of_other_version(path, format_name, version, (expected,))
         return record
 
 
@@ -139,7 +139,7 @@ def tree_of(value: Any, path: str, arrays: archive.Arrays) -> Any:
                 tree[name] = tree_of(inner, field, arrays)
         return tree
     if isinstance(value, tuple):
-        return [tree_of(one, _join(path, i), arrays) for i, one in enumerate(value)]
+        return [tree_of(item, _join(path, i), arrays) for i, item in enumerate(value)]
     return dict(value) if isinstance(value, Mapping) else value
 
 
@@ -157,15 +157,17 @@ def _check_arrays(kind: type, headers: Mapping[str, archive.Header]) -> None:
 
 def _declared_at(kind: type, path: str) -> Declared | None:
     """The declaration at a path of fields of a record; None if there is none."""
-    found, kinds = None, (kind,)
+    declaration, kinds = None, (kind,)
     for name in path.split("."):
         if name.isascii() and name.isdigit():
-            inside = [declared(get_args(one)[0]) for one in kinds if get_origin(one) is tuple]
+            inside = [declared(get_args(choice)[0]) for choice in kinds if get_origin(choice) is tuple]
         else:
-            inside = [declarations(one)[name] for one in kinds if is_dataclass(one) and name in declarations(one)]
-        found = inside[0] if inside else None
-        kinds = found.kinds if found else ()
-    return found
+            inside = [
+                declarations(choice)[name] for choice in kinds if is_dataclass(choice) and name in declarations(choice)
+            ]
+        declaration = inside[0] if inside else None
+        kinds = declaration.kinds if declaration else ()
+    return declaration
 
 
 def record_from(kind: Any, tree: Any, path: str, arrays: archive.Arrays) -> Any:
@@ -175,19 +177,19 @@ def record_from(kind: Any, tree: Any, path: str, arrays: archive.Arrays) -> Any:
     known = declarations(kind)
     if unknown := sorted(tree.keys() - known.keys()):
         raise InputError(f"{path or 'meta'}: got {excerpt(unknown[0])}, want only {', '.join(known)}")
-    found = {}
+    values = {}
     for name, said in known.items():
         field = _join(path, name)
         if name in tree:
-            found[name] = _value(said, tree[name], field, arrays)
+            values[name] = _value(said, tree[name], field, arrays)
         elif said.dtype is not None and field in arrays:
-            found[name] = arrays.pop(field)
+            values[name] = arrays.pop(field)
         elif (kind, name) not in LATER:
             raise InputError(f"{field}: got nothing, want this field")
-    if kind is AffinePolicy and not (np.isfinite(found["gain"]).all() and np.isfinite(found["offset"]).all()):
+    if kind is AffinePolicy and not (np.isfinite(values["gain"]).all() and np.isfinite(values["offset"]).all()):
         raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")
     try:
-        return kind(**found)
+        return kind(**values)
     except InputError as error:
         raise InputError(f"{path}: {error}" if path else f"{error}") from None
 
@@ -198,16 +200,18 @@ def _value(said: Declared, tree: Any, path: str, arrays: archive.Arrays) -> Any:
         return None
     kind = said.kinds[0]
     if len(said.kinds) > 1:  # records that are told apart by their arrays
-        kind = next((one for one in said.kinds if _join(path, next(iter(declarations(one)))) in arrays), kind)
+        kind = next((choice for choice in said.kinds if _join(path, next(iter(declarations(choice)))) in arrays), kind)
     if is_dataclass(kind):
         return record_from(kind, tree, path, arrays)
     if get_origin(kind) is tuple:
         if not isinstance(tree, list):
             raise InputError(f"{path}: got {excerpt(tree)}, want a list")
         inner = declared(get_args(kind)[0])
-        return tuple(_value(inner, one, _join(path, i), arrays) for i, one in enumerate(tree))
+        return tuple(_value(inner, item, _join(path, i), arrays) for i, item in enumerate(tree))
     if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return kind(check_name(path, tree[:100] if isinstance(tree, str) else tree, [str(one.value) for one in kind]))
+        return kind(
+            check_name(path, tree[:100] if isinstance(tree, str) else tree, [str(member.value) for member in kind])
+        )
     if said.dtype is not None:
         raise InputError(f"{path}: got {excerpt(tree)} in meta, want an array")
     return archive.anything(path, tree)

@@ -74,7 +74,7 @@ class Solution(Plan):
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with all parts made."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        return {part.name: getattr(self, part.name) for part in fields(self)}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,7 +83,7 @@ class Solution(Plan):
         if come is not None:
             mean = come.gradient if isinstance(come, Quadratic) else come.mean
             check_shape("Solution: cost_to_come", mean, self.trajectory.states.shape)
-        if self.candidates and all(one.status is None for one in self.candidates):
+        if self.candidates and all(candidate.status is None for candidate in self.candidates):
             raise InputError("Solution: candidates: got none that ended, want at least one, or no candidates")
 
     @property
@@ -205,10 +205,10 @@ class Solution(Plan):
         """What is wrong between the knots, with the remedy; nothing for a plan that failed, or from a file."""
         if not self.success or "_look" not in vars(self):
             return []
-        found = self.between_knots()._told(1e-6)  # the default tolerance
+        faults = self.between_knots()._told(1e-6)  # the default tolerance
         remedies = {"accuracy": "accuracy=1e-6", "between_knots": "between_knots=True"}
-        use = ", ".join(remedies[name] for name in found)
-        return [f"{'; '.join(found.values())}; use Problem({use})"] if found else []
+        use = ", ".join(remedies[name] for name in faults)
+        return [f"{'; '.join(faults.values())}; use Problem({use})"] if faults else []
 
     def _search(self) -> list[str]:
         """The start of the plan, and the results of other starts, if there were several."""
@@ -225,10 +225,10 @@ class Solution(Plan):
             lines[0] += f"; {len(dropped)} {'was' if len(dropped) == 1 else 'were'} dropped, {why}"
         if (total := sum(candidate.iterations for candidate in self.candidates)) > len(self.iterations):
             lines[0] += f"; {total} iterations in all"
-        others = [one for one in ended if one.start != best]
-        costs = [f" at a cost of {one.cost:.6g}" if np.isfinite(one.cost) else "" for one in others]
+        others = [other for other in ended if other.start != best]
+        costs = [f" at a cost of {other.cost:.6g}" if np.isfinite(other.cost) else "" for other in others]
         ends = zip(others, costs, strict=True)
-        return lines + [f"{one.start} ended {one.status and one.status.name}{cost}" for one, cost in ends]
+        return lines + [f"{other.start} ended {other.status and other.status.name}{cost}" for other, cost in ends]
 
     __str__ = summary
 

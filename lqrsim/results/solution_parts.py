@@ -20,8 +20,8 @@ COARSE = 1e-4  # error of a step that a solution mentions: over a hundred steps 
 def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
     """An array (T, ...) without its first steps; with `filled` the last entry is repeated to keep the length."""
     array = np.asarray(array)
-    rest = array[steps:]
-    return np.concatenate([rest, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else rest
+    remaining = array[steps:]
+    return np.concatenate([remaining, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else remaining
 
 
 @checked
@@ -325,11 +325,11 @@ class BetweenKnots:
 
     def _told(self, tolerance: float, accuracy: float = COARSE) -> dict[str, str]:
         """What exceeds a tolerance of constraints or an accuracy of steps, in words, by the argument that helps."""
-        found = {}
+        faults = {}
         if self.step_error > accuracy:
-            found["accuracy"] = f"steps are off by up to {self.step_error:.1e}, the end by {self.end_error:.1e}"
+            faults["accuracy"] = f"steps are off by up to {self.step_error:.1e}, the end by {self.end_error:.1e}"
         worst = max(self.violations, key=lambda name: self.violations[name][0], default="")
         if worst and self.violations[worst][0] > tolerance:
             by, time = self.violations[worst]
-            found["between_knots"] = f"{worst} is violated by {by:.2g} between knots, at {time:.3g} s"
-        return found
+            faults["between_knots"] = f"{worst} is violated by {by:.2g} between knots, at {time:.3g} s"
+        return faults

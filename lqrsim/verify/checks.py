@@ -81,15 +81,15 @@ def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
 
 def ran_policy_of(solution: Solution, rollout: Rollout) -> bool:
     """Whether the solution's policy was run, with or without its gains."""
-    policies = [one.policy for one in (solution, solution.open_loop())]
-    if rollout.policy_digest in [one.digest for one in policies]:
+    policies = [plan.policy for plan in (solution, solution.open_loop())]
+    if rollout.policy_digest in [policy.digest for policy in policies]:
         return True
     # Hashes of earlier rollouts leave out limits and what wraps; the rollout itself has these.
     rules = [space.rules for space in spaces_of(rollout)]
     return any(
-        rules == [space.rules for space in spaces_of(one)]
-        and rollout.policy_digest == sha256(one.gain, one.offset, one.nominal, np.float64(one.dt))[:16]
-        for one in policies
+        rules == [space.rules for space in spaces_of(policy)]
+        and rollout.policy_digest == sha256(policy.gain, policy.offset, policy.nominal, np.float64(policy.dt))[:16]
+        for policy in policies
     )
 
 
@@ -177,15 +177,15 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
     carriers, above = [body], body
     while above := int(model.body_parentid[above]):
         carriers.append(above)
-    nearness = {int(model.body_weldid[one]): level for level, one in reversed([*enumerate(carriers)])}
+    nearness = {int(model.body_weldid[carrier]): level for level, carrier in reversed([*enumerate(carriers)])}
     best: tuple[tuple[bool, int, bool, float], int] | None = None
     for geom in np.flatnonzero(np.isin(model.geom_type, [kind.value for kind in SYMMETRIC_KINDS])).tolist():
-        own, welded = int(model.geom_bodyid[geom]), int(model.body_weldid[model.geom_bodyid[geom]])
-        if own != body and (welded == 0 or model.body_rootid[own] != model.body_rootid[body]):
+        owner, welded = int(model.geom_bodyid[geom]), int(model.body_weldid[model.geom_bodyid[geom]])
+        if owner != body and (welded == 0 or model.body_rootid[owner] != model.body_rootid[body]):
             continue
-        followed = place is not None and own == body and np.allclose(model.geom_pos[geom], place, rtol=0, atol=1e-9)
+        followed = place is not None and owner == body and np.allclose(model.geom_pos[geom], place, rtol=0, atol=1e-9)
         collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
-        level = 0 if own == body else 1 + nearness.get(welded, len(carriers))
+        level = 0 if owner == body else 1 + nearness.get(welded, len(carriers))
         rank = (not followed, level, not collides, -float(model.geom_rbound[geom]))
         if best is None or (rank, geom) < best:
             best = rank, geom
@@ -328,10 +328,10 @@ RECORD_BOUND = 1 / 350  # largest distance between frames and states, in radii o
 def run_beside(path: str | os.PathLike[str]) -> Path:
     """The file, in the folder of a video, of the rollout that it shows. Raises InputError if there is none."""
     metadata, folder = video_metadata.read(path), Path(path).parent
-    for found in sorted(folder.glob("*.npz")):
+    for file in sorted(folder.glob("*.npz")):
         with contextlib.suppress(InputError):  # the file is a solution, or damaged
-            if video_metadata.digest(save_load.load(found, Rollout)) in metadata.runs:
-                return found
+            if video_metadata.digest(save_load.load(file, Rollout)) in metadata.runs:
+                return file
     raise InputError(f"run: no file in {folder} has the run that {Path(path).name} shows, want its file, --run RUN.npz")
 
 

@@ -48,8 +48,8 @@ def diagnose(
         said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(ahead, interval)}"
         candidates.append((where - shown, said))
     if candidates:
-        rest, said = min(candidates, key=lambda candidate: _quantile_95(candidate[0]))
-        if _quantile_95(rest) <= 2 * bound:
+        residual, said = min(candidates, key=lambda candidate: _quantile_95(candidate[0]))
+        if _quantile_95(residual) <= 2 * bound:
             return said
     if _quantile_95(error) <= 2 * bound:
         return "the pictures are too small or too coarse"
@@ -65,7 +65,7 @@ def _single_frames(
         crossed = seen[[first, second]] - actual[[second, first]]
         if _lengths(crossed).max() <= near:
             return f"frames {numbers[first]} and {numbers[second]} are swapped"
-    return f"frames that do not show their time: {', '.join(str(numbers[one]) for one in wrong)}"
+    return f"frames that do not show their time: {', '.join(str(numbers[index]) for index in wrong)}"
 
 
 def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
@@ -189,8 +189,8 @@ def compare(
       interval: seconds between two frames; the shift must be less than a quarter of it.
     """
     good = np.asarray(np.isfinite(seen).all(axis=1))
-    told = f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them"
-    tests = [*others, Criterion("seen", bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2, told)]
+    detail = f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them"
+    tests = [*others, Criterion("seen", bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2, detail)]
     rms, worst, shift, scale, likely = np.nan, np.nan, np.nan, np.nan, "the robot is not in the pictures, or too small"
     if good.sum() > 2:
         error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
@@ -199,13 +199,13 @@ def compare(
         # A robot that hardly moves determines neither shift nor scale; the bound is then the uncertainty of the fit.
         late, wide = max(interval / 4, 4 * shift_error), max(SCALE, 4 * stretch_error)
         rms, worst, scale, when = _rms(distance), float(distance.max()), 1 + stretch, times[good][distance.argmax()]
-        told = f"at worst {1e3 * worst:.1f} mm off, at {when:.2f} s, want {1e3 * bound:.1f} at most"
-        tests.append(Criterion("position", worst <= bound, told))
+        detail = f"at worst {1e3 * worst:.1f} mm off, at {when:.2f} s, want {1e3 * bound:.1f} at most"
+        tests.append(Criterion("position", worst <= bound, detail))
         if (most := float(apart[good].max())) > 0:  # a single view cannot disagree
-            told = f"at worst {1e3 * most:.1f} mm apart, want {1e3 * bound:.1f} at most"
-            tests.append(Criterion("views agree", most <= bound, told))
-        told = f"{1e3 * shift:+.1f} ms ahead, want {1e3 * late:.1f} at most either way"
-        tests.append(Criterion("time", abs(shift) <= late, told))
+            detail = f"at worst {1e3 * most:.1f} mm apart, want {1e3 * bound:.1f} at most"
+            tests.append(Criterion("views agree", most <= bound, detail))
+        detail = f"{1e3 * shift:+.1f} ms ahead, want {1e3 * late:.1f} at most either way"
+        tests.append(Criterion("time", abs(shift) <= late, detail))
         tests.append(Criterion("scale", abs(stretch) <= wide, f"{scale:.4f}, want 1 within {wide:.4f}"))
         likely = _likely_cause(tests, times, seen, actual, bound, interval)
     return Verification(
@@ -240,11 +240,11 @@ def _fit(error: Array, velocity: Array, actual: Array) -> tuple[tuple[float, flo
     error = offset + shift * velocity + stretch * (actual - mean of actual), by least squares with a free offset.
     """
     columns = [(part - part.mean(axis=0)).ravel() for part in (velocity, actual)]
-    inverse, rest = np.linalg.pinv(np.stack(columns, axis=1)), (error - error.mean(axis=0)).ravel()
-    found = inverse @ rest
-    noise = float(np.linalg.norm(rest - np.stack(columns, axis=1) @ found)) / max(np.sqrt(len(rest) - 4), 1)
+    inverse, centred = np.linalg.pinv(np.stack(columns, axis=1)), (error - error.mean(axis=0)).ravel()
+    fit = inverse @ centred
+    noise = float(np.linalg.norm(centred - np.stack(columns, axis=1) @ fit)) / max(np.sqrt(len(centred) - 4), 1)
     uncertain = noise * np.linalg.norm(inverse, axis=1)
-    return (float(found[0]), float(uncertain[0])), (float(found[1]), float(uncertain[1]))
+    return (float(fit[0]), float(uncertain[0])), (float(fit[1]), float(uncertain[1]))
 
 
 def _rms(values: Array) -> float:

@@ -108,11 +108,11 @@ def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array
     margin = rollout.radius + beyond
     corners = np.vstack([low - margin, high + margin, *([] if around is None else [around])])
     if rollout.balls is not None:  # they may reach farther than the radius
-        each, radii = (
+        centres, radii = (
             np.vstack([rollout.balls.planned[None], rollout.balls.driven]),
             beyond + rollout.balls.radii[:, None],
         )
-        corners = np.vstack([corners, *(part.reshape(-1, 3) for part in (each - radii, each + radii))])
+        corners = np.vstack([corners, *(part.reshape(-1, 3) for part in (centres - radii, centres + radii))])
     return np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
 
 

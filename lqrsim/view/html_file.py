@@ -136,8 +136,8 @@ class _Arrays:
         """The length of the JSON as a number of 32 bits, the JSON, and the arrays; compressed, in base64."""
         words = json.dumps(described, separators=(",", ":"), allow_nan=False).encode("ascii")
         words += b" " * (-len(words) % 4)
-        whole = b"".join([len(words).to_bytes(4, "little"), words, *self._parts])
-        return b64encode(gzip.compress(whole, mtime=0)).decode("ascii")
+        content = b"".join([len(words).to_bytes(4, "little"), words, *self._parts])
+        return b64encode(gzip.compress(content, mtime=0)).decode("ascii")
 
 
 def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:

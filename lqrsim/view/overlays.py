@@ -295,8 +295,8 @@ class Overlays:
         apart = np.linalg.norm(np.diff(part.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)
         overlap = 2 * float(part.axes()[0][chosen].mean()) / apart if apart > 0 else 1.0
         # Ellipsoids that hardly overlap must not be too opaque: they would show as stripes on the lines within.
-        each = 1 - (1 - opacity[self.recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
-        return DrawnTube(name, (*colour, float(each)), label, *self._in_world(ellipsoids, among[chosen], height))
+        alpha = 1 - (1 - opacity[self.recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
+        return DrawnTube(name, (*colour, float(alpha)), label, *self._in_world(ellipsoids, among[chosen], height))
 
     def _in_world(
         self, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], height: float

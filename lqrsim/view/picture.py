@@ -101,8 +101,8 @@ class SceneRenderer:
                 bottom = self.pixels.shape[0] - box.top - box.height
                 mujoco.mjr_render(mujoco.MjrRect(box.left, bottom, box.width, box.height), scene, self.context)
                 scene.ngeom = of_all_views
-        whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
-        mujoco.mjr_readPixels(self.pixels, None, whole, self.context)
+        viewport = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
+        mujoco.mjr_readPixels(self.pixels, None, viewport, self.context)
         return self.pixels[::-1]
 
     def _occluders(self) -> npt.NDArray[np.bool_]:

@@ -90,12 +90,12 @@ def plot_run(
         of_time = [*curves, Panel(CURVE), strips] if strips.wide else [*curves, strips, Panel(CURVE)]
         parts = arrange(figure, [*views.panels(style), *of_time], style)
         drawn = views.draw(figure, parts[: len(views.planes)])
-        *rest, commands, costs = parts[len(views.planes) :]
+        *error_and_chances, commands, costs = parts[len(views.planes) :]
         if strips.wide:
             commands, costs = costs, commands
-        _tracking_error(figure.add_subplot(rest[0]), rollouts, trial)
+        _tracking_error(figure.add_subplot(error_and_chances[0]), rollouts, trial)
         if chances:
-            figure_parts.draw_chances(figure.add_subplot(rest[1]), chances)
+            figure_parts.draw_chances(figure.add_subplot(error_and_chances[1]), chances)
         controls = _controls(_grid(figure, commands, len(first.control_coordinates), across), solution, rollouts, trial)
         _convergence(figure.add_subplot(costs), solution)
         legend_below(figure, _entries(drawn[0]) | controls)

@@ -42,11 +42,11 @@ class RecordedTrial:
         """Raises InputError if there is no such trial, or it cannot be drawn."""
         self.rollout, self.trial = rollout, trial
         self.model = model_of(rollout, trial)
-        whole = np.isfinite(rollout.frames[trial]).all(axis=1)
+        finite = np.isfinite(rollout.frames[trial]).all(axis=1)
         alive = np.isfinite(rollout.states[trial]).all(axis=1)
-        if not (whole.any() and alive.any()):
+        if not (finite.any() and alive.any()):
             raise InputError(f"rollout: got trial {trial} without a finite state, want one that can be drawn")
-        self.frame_times, self.frames = rollout.frame_times[whole], rollout.frames[trial][whole]
+        self.frame_times, self.frames = rollout.frame_times[finite], rollout.frames[trial][finite]
         # Of the k finite states, as what follows.
         self.times, self.states = rollout.times[alive], rollout.states[trial, alive]
         self.measured = rollout.measured[trial, alive]

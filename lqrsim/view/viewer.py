@@ -137,16 +137,16 @@ class _ViewedRun(ControllerRun):
 def caption(live: LiveReplanner, t: float) -> str:
     """The plan in force and its age, and statistics of the solves, as lines."""
     begun, log = live.active.first * live.problem.dt, live.log
-    took, kept = [1e3 * record.seconds for record in log.records[-RECENT:]], log.kept
+    took, missed = [1e3 * record.seconds for record in log.records[-RECENT:]], log.kept
     if not took:
         solves = "no solve yet"
     else:
         solves = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {log.solved} used"
-    if kept:
-        reasons = "; ".join(f"{count} {why}" for why, count in kept.most_common())
+    if missed:
+        reasons = "; ".join(f"{count} {why}" for why, count in missed.most_common())
         for status in Status:
             reasons = reasons.replace(status.name, status.value)  # in words
-        solves += f"\n{kept.total()} missed: {reasons}"
+        solves += f"\n{missed.total()} missed: {reasons}"
     name = f"plan of {begun:.1f} s" if live.active.first else "first plan"
     return f"in force: {name}, {t - begun:.1f} s old\n{solves}"
 
@@ -276,8 +276,8 @@ class _UserForces(Disturbance):
 
 def play(rollout: Rollout, viewer: Viewer, *, trial: int = 0, loop: bool = True) -> None:
     """Show the frames of one trial in time, once or in a loop, until the viewer is closed."""
-    whole = np.isfinite(rollout.frames[trial]).all(axis=1)
-    frames = list(zip(rollout.frame_times[whole].tolist(), rollout.frames[trial][whole], strict=True))
+    finite = np.isfinite(rollout.frames[trial]).all(axis=1)
+    frames = list(zip(rollout.frame_times[finite].tolist(), rollout.frames[trial][finite], strict=True))
     with contextlib.suppress(ViewerClosed):
         while True:
             with contextlib.suppress(RestartRequested):
