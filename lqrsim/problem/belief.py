@@ -125,9 +125,9 @@ class Belief(Dynamics):
     ) -> None:  # fmt: skip
         check_kind("Belief: noise", noise, Noise, "a Noise")
         check_kind("Belief: sensors", sensors, NoisySensors, "NoisySensors(...)")
-        for what, level in (("dynamics", dynamics.level), ("noise", noise.level)):
+        for field, level in (("dynamics", dynamics.level), ("noise", noise.level)):
             if level != "symbolic" or dynamics.by_mujoco:
-                raise InputError(f"Belief: {what}: got a function of arrays, want a formula")
+                raise InputError(f"Belief: {field}: got a function of arrays, want a formula")
         dynamics.check_period(dt)
         noise.bind(dynamics)  # raises an exception if it does not fit
         self.robot, self.process, self.sensors, self.averaged = dynamics, noise, sensors, averaged
@@ -255,8 +255,8 @@ class Belief(Dynamics):
 
     def read(self, states: Array) -> tuple[Array, Array]:
         """The exact readings (K, Y) in states (K, n) of the robot, and the standard deviations of their noise."""
-        found = self._each("read", 2 * self.readings, shaped("states", states, (None, self.size)))
-        return found[:, ::2], found[:, 1::2]
+        entries = self._each("read", 2 * self.readings, shaped("states", states, (None, self.size)))
+        return entries[:, ::2], entries[:, 1::2]
 
     @functools.cached_property
     def readings(self) -> int:
@@ -275,29 +275,29 @@ class Belief(Dynamics):
         return symbolic.kept(self.f, details, self._trace_filter, filter=str, readings=int)
 
     def _trace(self) -> str:
-        made = self._step()
-        n, of = len(made.x), f"{self.name}(x, u, p)"
-        values = {f"out[{i}]": entry for i, entry in enumerate(made.after)}
-        value = _written("rate", "x, u, p, out", values, made, of)
+        step = self._step()
+        n, of = len(step.x), f"{self.name}(x, u, p)"
+        values = {f"out[{i}]": entry for i, entry in enumerate(step.after)}
+        value = _written("rate", "x, u, p, out", values, step, of)
         slopes = {
             (f"fx[{i}, {j}]" if j < n else f"fu[{i}, {j - n}]"): slope
-            for (i, j), slope in jacobian_of(made.operations, made.after, [*made.x, *made.u]).items()
+            for (i, j), slope in jacobian_of(step.operations, step.after, [*step.x, *step.u]).items()
         }
-        return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values | slopes, made, of)}"
+        return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values | slopes, step, of)}"
 
     def _weighted_hessian(self) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
-        made = self._step()
-        weights = symbolic.weights(len(made.after))
-        found = hessian_of(made.operations, made.after, weights, [*made.x, *made.u], most=MOST_STEPS)
-        return None if found is None else (_needed(made, found[1].values()), found[1])
+        step = self._step()
+        weights = symbolic.weights(len(step.after))
+        hessian = hessian_of(step.operations, step.after, weights, [*step.x, *step.u], most=MOST_STEPS)
+        return None if hessian is None else (_needed(step, hessian[1].values()), hessian[1])
 
     def _trace_filter(self) -> dict[str, Any]:
-        made, of = self._step(read=True), f"{self.name}(x, u, p)"
-        values = {f"out[{i}]": entry for i, entry in enumerate(made.after)}
+        step, of = self._step(read=True), f"{self.name}(x, u, p)"
+        values = {f"out[{i}]": entry for i, entry in enumerate(step.after)}
         pairs, _, _ = self._sensing()
         sense = {f"out[{i}]": entry for i, entry in enumerate(pairs)}
         parts = [
-            _written("correct", "x, u, p, w, out", values, made, of),
+            _written("correct", "x, u, p, w, out", values, step, of),
             symbolic.write_function("sense", "x, p, out", "p", sense, of=of),
         ]
         return {"filter": "\n\n".join([*(f"@outline\n{part}" for part in parts), _LOOPS]), "readings": len(pairs) // 2}
@@ -315,10 +315,10 @@ class Belief(Dynamics):
                 raise InputError(f"got {returned}, want {wanted}, at least one")
             return [entry for pair in pairs for entry in pair]
 
-        found, x, u = self._formulas(listed)
-        if set().union(*(entry.free_symbols for entry in found)) & set(u):
+        entries, x, u = self._formulas(listed)
+        if set().union(*(entry.free_symbols for entry in entries)) & set(u):
             raise InputError(f"{name_of(function)}(x, u, p): got a reading that depends on u, want one of the state")
-        return found, x, u
+        return entries, x, u
 
     def _formulas(self, function: Callable[..., Any]) -> tuple[list[Any], list[Any], list[Any]]:
         """The formulas of a function of the robot's state and control, and their symbols."""
@@ -337,9 +337,11 @@ class Belief(Dynamics):
         if process.matrix is None:
             entries, _, _ = self._formulas(lambda x, u, p: [*chain(*process._rows(process.function(x, u, p), size))])
         else:
-            entries = [sympy.Float(one) if one else sympy.Integer(0) for one in process.matrix.ravel().tolist()]
+            entries = [
+                sympy.Float(number) if number else sympy.Integer(0) for number in process.matrix.ravel().tolist()
+            ]
         strength = sympy.Float(process.strength) if process.strength != 1 else sympy.Integer(1)
-        shaken = [[name(strength * one) for one in entries[i * process.size :][: process.size]] for i in rows]
+        shaken = [[name(strength * entry) for entry in entries[i * process.size :][: process.size]] for i in rows]
         mean, slopes = _moved(operations, rates, means, rows, self.robot, float(self.period or 0))
         root = _lower(x[size:], n)
         turned = [[name(sum(slopes[i][k] * root[k][j] for k in range(j, n))) for j in range(n)] for i in range(n)]
@@ -353,20 +355,20 @@ class Belief(Dynamics):
             arrived = sympy.Symbol(f"w{len(pairs) // 2 + row}", real=True) if read else sympy.Integer(1)
             seen = [name(arrived * sum(slope[i] * root[i][j] for i in range(j, n))) for j in range(n)]
             sums = [variance]  # of the squares from the last to each
-            for one in reversed(seen):
-                sums.insert(0, name(sums[0] + one**2))
+            for entry in reversed(seen):
+                sums.insert(0, name(sums[0] + entry**2))
             column = [name(sum(root[i][j] * seen[j] for j in range(i + 1))) for i in range(n)]
-            columns.append([name(one / sympy.sqrt(sums[0])) for one in column])
+            columns.append([name(entry / sympy.sqrt(sums[0])) for entry in column])
             if read:
                 off = sum(
                     (s * (now[i] - mean[i]) for s, i in zip(slope, rows, strict=True)), name(reading.xreplace(at))
                 )
                 share = name((sympy.Symbol(f"w{row}", real=True) - off) / sums[0])
                 now = list(now)
-                for i, one in zip(rows, column, strict=True):
-                    now[i] = name(now[i] + one * share)
+                for i, entry in zip(rows, column, strict=True):
+                    now[i] = name(now[i] + entry * share)
             root = _informed(operations, root, seen, sums)
-        return _Step(operations, x, u, [*now, *(one for row in root for one in row)], columns)
+        return _Step(operations, x, u, [*now, *(entry for row in root for entry in row)], columns)
 
     def _variance(
         self, operations: Operations, deviation: Any, means: list[Any], mean: list[Any], root: list[list[Any]]
@@ -402,12 +404,12 @@ class _Innovations(Noise):
     def _trace(self, states: Any, controls: Any) -> dict[str, Any]:
         import sympy
 
-        made, belief = self._belief._step(), self._belief
+        step, belief = self._belief._step(), self._belief
         strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)
         rows = belief.rows
-        name = made.operations.name
-        flat = [name(strength * one) for column in made.columns for one in column]
-        slopes = jacobian_of(made.operations, flat, [*made.x, *made.u])
+        name = step.operations.name
+        flat = [name(strength * entry) for column in step.columns for entry in column]
+        slopes = jacobian_of(step.operations, flat, [*step.x, *step.u])
         active = sorted({j for _, j in slopes})
         values = {f"out[{i}, {k}]": flat[k * len(rows) + i] for i in range(len(rows)) for k in range(self.size)}
         changes = {
@@ -416,8 +418,8 @@ class _Innovations(Noise):
         }  # fmt: skip
         of = f"innovations of {belief.name}"
         source = [
-            _written("noise_values", "x, u, data, out", values, made, of, data="data"),
-            _written("noise_slopes", "x, u, data, out, slopes", values | changes, made, of, data="data"),
+            _written("noise_values", "x, u, data, out", values, step, of, data="data"),
+            _written("noise_slopes", "x, u, data, out, slopes", values | changes, step, of, data="data"),
         ]
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
@@ -440,12 +442,14 @@ def _key(
 
 def _together(*given: Mapping[str, float]) -> dict[str, float]:
     """The parameters of all. Raises InputError if two have one name and not one value."""
-    found: dict[str, float] = {}
-    for one in given:
-        for name, value in one.items():
-            if found.setdefault(name, value) != value:
-                raise InputError(f"Belief: parameters: got {name!r} twice, {found[name]:g} and {value:g}, want one")
-    return found
+    parameters: dict[str, float] = {}
+    for mapping in given:
+        for name, value in mapping.items():
+            if parameters.setdefault(name, value) != value:
+                raise InputError(
+                    f"Belief: parameters: got {name!r} twice, {parameters[name]:g} and {value:g}, want one"
+                )
+    return parameters
 
 
 def _written(name: str, arguments: str, values: dict[str, Any], made: _Step, of: str, data: str = "p") -> str:
@@ -455,7 +459,7 @@ def _written(name: str, arguments: str, values: dict[str, Any], made: _Step, of:
 
 def _needed(made: _Step, values: Iterable[Any]) -> list[tuple[Any, Any]]:
     """The operations that these values need, in order."""
-    needed, steps = {symbol for one in values for symbol in one.free_symbols}, []
+    needed, steps = {symbol for value in values for symbol in value.free_symbols}, []
     for symbol, operation in reversed(made.operations.steps):
         if symbol in needed:
             needed |= operation.free_symbols
@@ -475,7 +479,7 @@ def _moved(
     import sympy
 
     name, moved = operations.name, {*rows}  # with those that they move in turn
-    while more := {i for i, one in enumerate(rates) if i not in moved and one.free_symbols & {x[j] for j in moved}}:
+    while more := {i for i, rate in enumerate(rates) if i not in moved and rate.free_symbols & {x[j] for j in moved}}:
         moved |= more
     jacobian = {i: {k: slope for k in moved if (slope := sympy.sympify(rates[i].diff(x[k]))) != 0} for i in moved}
     identity = {i: [sympy.Integer(int(i == row)) for row in rows] for i in moved}
@@ -483,9 +487,10 @@ def _moved(
 
     def at(state: list[Any], slopes: dict[int, list[Any]]) -> tuple[list[Any], dict[int, list[Any]]]:
         place = dict(zip(x, state, strict=True))
-        own = {i: {k: name(one.xreplace(place)) for k, one in row.items()} for i, row in jacobian.items()}
+        partials = {i: {k: name(slope.xreplace(place)) for k, slope in row.items()} for i, row in jacobian.items()}
         changes = {
-            i: [name(sum(one * slopes[k][j] for k, one in row.items())) for j in columns] for i, row in own.items()
+            i: [name(sum(slope * slopes[k][j] for k, slope in row.items())) for j in columns]
+            for i, row in partials.items()
         }
         return [name(rate.xreplace(place)) for rate in rates], changes
 
@@ -496,12 +501,12 @@ def _moved(
     for _ in range(robot.substeps):
         stages: list[tuple[list[Any], dict[int, list[Any]]]] = []
         for share in (0, h / 2, h / 2, h):
-            there, slopes_there = state, slopes
+            shifted, slopes_shifted = state, slopes
             if share:
                 k, K = stages[-1]
-                there = [name(a + share * b) for a, b in zip(state, k, strict=True)]
-                slopes_there = {i: [name(slopes[i][j] + share * K[i][j]) for j in columns] for i in moved}
-            stages.append(at(there, slopes_there))
+                shifted = [name(a + share * b) for a, b in zip(state, k, strict=True)]
+                slopes_shifted = {i: [name(slopes[i][j] + share * K[i][j]) for j in columns] for i in moved}
+            stages.append(at(shifted, slopes_shifted))
         weights = (h / 6, h / 3, h / 3, h / 6)
         weighed = list(zip(weights, stages, strict=True))
         state = [name(state[i] + sum(w * k[i] for w, (k, _) in weighed)) for i in states]
@@ -518,8 +523,8 @@ def _cholesky(operations: Operations, B: list[list[Any]], n: int) -> list[list[A
         row: list[Any] = []
         for j in range(i + 1):
             product = sum(a * b for a, b in zip(B[i], B[j], strict=True))
-            rest = name(product - sum(row[k] * (L[j][k] if j < i else row[k]) for k in range(j)))
-            row.append(name(rest / L[j][j]) if j < i else name(sympy.sqrt(rest)))
+            remainder = name(product - sum(row[k] * (L[j][k] if j < i else row[k]) for k in range(j)))
+            row.append(name(remainder / L[j][j]) if j < i else name(sympy.sqrt(remainder)))
         L.append(row)
     return L
 

@@ -81,11 +81,11 @@ class Clearance(KeepsClear, Constraint):
 
         def describe(row: int) -> str:
             part, number = rows[row]
-            own, who = margins[:, number % margins.shape[1]], f" of {part!r}" if part else ""
-            low, high = f"{own.min():g}", f"{own.max():g}"
-            said = low if low == high else f"{low} to {high}"
+            row_margins, who = margins[:, number % margins.shape[1]], f" of {part!r}" if part else ""
+            low, high = f"{row_margins.min():g}", f"{row_margins.max():g}"
+            amount = low if low == high else f"{low} to {high}"
             where = f"obstacle {world.names[number]!r}" if number >= 0 else "all obstacles"
-            return f"a clearance of {said} m{who} to {where}"
+            return f"a clearance of {amount} m{who} to {where}"
 
         distances = shape.distances(float(margins.max()) + 2 * float(shape.radii.max()))
         if distances is not None:
@@ -96,8 +96,8 @@ class Clearance(KeepsClear, Constraint):
             columns = [max(number, 0) % margins.shape[1] for number in distances.obstacles]
             return ConstraintTerm.of_residual(distances, margins, columns, describe)
         (tables, count), shared = world.tables(times), 0 if shape.centers is None else 3 * shape.balls
-        own = np.concatenate([[*margins.shape, len(world), count], shape.parts, margins.ravel(), tables])
-        source, data, functions = shape.placed(__name__, own)
+        numbers = np.concatenate([[*margins.shape, len(world), count], shape.parts, margins.ravel(), tables])
+        source, data, functions = shape.placed(__name__, numbers)
         return ConstraintTerm(source, data, len(rows), describe, shared=shared, functions=functions)
 
 

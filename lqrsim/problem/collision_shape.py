@@ -160,8 +160,8 @@ class ShapeInWorld:
         if displaced is None:
             return (signed_distance(self.world, places) - self.radii).min(axis=-1)
         flat = places.reshape(len(places), -1, places.shape[-1])
-        found = signed_distance_displaced(self.world, flat, displaced).reshape(places.shape[:-1])
-        return (found - self.radii).min(axis=-1)
+        signed = signed_distance_displaced(self.world, flat, displaced).reshape(places.shape[:-1])
+        return (signed - self.radii).min(axis=-1)
 
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
         """Clearance of each obstacle at states (K, n), (K, O) in m, and its derivatives in some states, (K, O, p).
@@ -201,10 +201,10 @@ class ShapeInWorld:
             place = corners.mean(axis=0)
             distances = hull_distances(self.world, corners[None], [len(corners)])[0][0, 0] - radius
             if distances.min() < 0:
-                what, whose = (f"with {name!r} ", "its radius") if name else ("", "the robot's radius")
+                which, whose = (f"with {name!r} ", "its radius") if name else ("", "the robot's radius")
                 at, deep = ", ".join(f"{value:g}" for value in place), -distances.min()
                 obstacle = self.world.names[int(distances.argmin())]
-                where = f"{what}at ({at}) m, {deep:.3g} m inside obstacle {obstacle!r}"
+                where = f"{which}at ({at}) m, {deep:.3g} m inside obstacle {obstacle!r}"
                 return where, f" of obstacles by {whose} of {radius:g} m" if radius else " of obstacles"
         return None
 
@@ -244,8 +244,8 @@ class GeomsInWorld(ShapeInWorld):
         if not len(self.world):
             return np.full(known.shape, np.inf)
         states = np.where(known[..., None], states, 0.0)
-        found = self.geoms.clearances(self.dynamics, self.world, states, displaced).min(axis=-1)
-        return found if known.all() else np.where(known, found, np.nan)
+        distances = self.geoms.clearances(self.dynamics, self.world, states, displaced).min(axis=-1)
+        return distances if known.all() else np.where(known, distances, np.nan)
 
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
         distances, slopes = self.geoms.slopes(self.dynamics, self.world, states)
@@ -287,10 +287,10 @@ def shape_in(
             return ShapeInWorld(dynamics, seen, balls.radii, balls.names, centers, hulls)
         radii = balls.radii[np.cumsum([0, *balls.hulls[:-1]])]
         seen = seen.upright() if centers.in_plane else seen
-        for one in seen.obstacles:
-            if one.kind == "box" and np.isinf(one.size).sum() > 1:
+        for obstacle in seen.obstacles:
+            if obstacle.kind == "box" and np.isinf(obstacle.size).sum() > 1:
                 raise InputError(
-                    f"obstacle {one.name!r}: got a box that is infinite in two directions, want one of them"
+                    f"obstacle {obstacle.name!r}: got a box that is infinite in two directions, want one of them"
                 )
         return ShapeInWorld(dynamics, seen, radii, balls.names, centers, balls.hulls)
     seen = world.seen_by(space.plane, space.offset) if space.position else World()
@@ -312,7 +312,7 @@ class KeepsClear:
         self, world: World, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None
     ) -> None:
         shape: dict[str, Any] = {"radius": radius, "balls": balls, "geoms": geoms}
-        self.shape = {name: one for name, one in shape.items() if one is not None}
+        self.shape = {name: stated for name, stated in shape.items() if stated is not None}
         if len(self.shape) != 1:
             got = " and ".join(self.shape) or "none of radius, balls and geoms"
             wanted = "one of them: radius=robot.radius, balls=robot.balls or geoms=robot.geoms"
@@ -346,11 +346,11 @@ class KeepsClear:
 
 def each_once(kept: Sequence[KeepsClear]) -> list[KeepsClear]:
     """The first of each kind: those with other obstacles, or another shape, than all before."""
-    found: list[KeepsClear] = []
-    for one in kept:
-        if not any(one.shape == other.shape and _same(one.world, other.world) for other in found):
-            found.append(one)
-    return found
+    distinct: list[KeepsClear] = []
+    for term in kept:
+        if not any(term.shape == other.shape and _same(term.world, other.world) for other in distinct):
+            distinct.append(term)
+    return distinct
 
 
 def _same(one: World, other: World) -> bool:

@@ -173,7 +173,7 @@ class CollisionSpheres:
         self.hulls = None
         if hulls is not None:
             given = check_items("CollisionSpheres: hulls", hulls, (int, np.integer), "the number of balls of each hull")
-            self.hulls = tuple(check_count("CollisionSpheres: hulls", one, at_most=MOST_CORNERS) for one in given)
+            self.hulls = tuple(check_count("CollisionSpheres: hulls", size, at_most=MOST_CORNERS) for size in given)
             if np.ndim(radii) == 0:  # pyright: ignore[reportArgumentType]
                 radius = check_number("CollisionSpheres: radii", radii, at_least=0.0)
                 radii = np.full(sum(self.hulls), radius)
@@ -187,9 +187,11 @@ class CollisionSpheres:
         if self.hulls is not None:
             if sum(self.hulls) != count:
                 raise InputError(f"CollisionSpheres: hulls: got {sum(self.hulls)} balls in all, want {count}, as radii")
-            for k, own in enumerate(np.split(self.radii, np.cumsum(self.hulls)[:-1])):
-                if np.ptp(own):
-                    raise InputError(f"CollisionSpheres: radii: got {own.tolist()} in hull {k}, want one for all of it")
+            for k, hull_radii in enumerate(np.split(self.radii, np.cumsum(self.hulls)[:-1])):
+                if np.ptp(hull_radii):
+                    raise InputError(
+                        f"CollisionSpheres: radii: got {hull_radii.tolist()} in hull {k}, want one for all of it"
+                    )
         part, parts = ("ball", count) if self.hulls is None else ("hull", len(self.hulls))
         wanted = f"{parts} different texts, one per {part}"
         self.names = tuple(f"{part} {k}" for k in range(parts))
@@ -227,12 +229,12 @@ class CollisionSpheres:
         own = dynamics.calling
         states, constants = dynamics.state_coordinates.names, own.constants
         details = ("balls", states, len(self), tuple(own.parameters), *constants.items())
-        made = symbolic.kept(
+        traced = symbolic.kept(
             self.function, details, lambda: self._trace(states, own.parameters, constants),
             source=str, size=int, depends_on=list,
         )  # fmt: skip
-        self._check_plane(made["size"], dynamics.state_coordinates)
-        return SphereCenters(made["source"], own.data, tuple(made["depends_on"]), made["size"] == 2)
+        self._check_plane(traced["size"], dynamics.state_coordinates)
+        return SphereCenters(traced["source"], own.data, tuple(traced["depends_on"]), traced["size"] == 2)
 
     def _trace(
         self, states: Sequence[str], parameters: Mapping[str, float], constants: Mapping[str, float]
@@ -286,8 +288,8 @@ class CollisionSpheres:
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # any exception of a user's function becomes one line
-            said = f"{type(error).__name__} ({error})"
-            raise InputError(f"{self.name}: got {said}, want it to work at x = (0, ..., 0)") from error
+            failure = f"{type(error).__name__} ({error})"
+            raise InputError(f"{self.name}: got {failure}, want it to work at x = (0, ..., 0)") from error
         self._check_plane(size, dynamics.state_coordinates)
         return size
 
@@ -304,9 +306,9 @@ class CollisionSpheres:
         """
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         places = self.bind(dynamics)
-        found = evaluate(places, len(self), states)
+        centers = evaluate(places, len(self), states)
         space = dynamics.state_coordinates
-        return space.in_world(found[..., :2]) if places.in_plane and space.plane else found
+        return space.in_world(centers[..., :2]) if places.in_plane and space.plane else centers
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:

@@ -154,7 +154,7 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
 def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array) -> tuple[ConstraintTerm, ...]:
     """The constraints for a system and the times (T+1,) in s of the knots."""
     goals, terms = goals_of(constraints, dynamics), []
-    _check_bounds([one.state_bounds(dynamics) for one in constraints], dynamics, len(times))
+    _check_bounds([constraint.state_bounds(dynamics) for constraint in constraints], dynamics, len(times))
     for constraint in constraints:
         term = constraint._bind_beside(dynamics, times, goals)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
@@ -164,19 +164,19 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
 def _check_bounds(found: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
     """Raises InputError if a bound does not have a number for each knot, or those of a state leave nothing between."""
     names = dynamics.state_coordinates.names
-    for i, sides in (item for one in found for item in one.items()):
+    for i, sides in (item for bounds in found for item in bounds.items()):
         for side in sides:
             if isinstance(side, np.ndarray) and len(side) != knots:
                 want = f"one, or one for each of {knots} knots"
                 raise InputError(f"StateBounds: {names[i]}: got {len(side)} numbers, want {want}")
-    for i in {i for one in found for i in one}:
-        lows, highs = zip(*(one[i] for one in found if i in one), strict=True)
+    for i in {i for bounds in found for i in bounds}:
+        lows, highs = zip(*(bounds[i] for bounds in found if i in bounds), strict=True)
         sides = functools.reduce(np.maximum, lows), functools.reduce(np.minimum, highs)
         low, high = (np.broadcast_to(side, knots) for side in sides)
         if crossed := np.flatnonzero(~(low < high)).tolist():
-            t, each = crossed[0], "" if len(crossed) == knots else f" at knot {crossed[0]}"
+            t, where = crossed[0], "" if len(crossed) == knots else f" at knot {crossed[0]}"
             raise InputError(
-                f"constraints: got {names[i]} of at least {low[t]:g} and at most {high[t]:g}{each}, want bounds with"
+                f"constraints: got {names[i]} of at least {low[t]:g} and at most {high[t]:g}{where}, want bounds with"
                 " room between them"
             )
 

@@ -66,12 +66,12 @@ class ControlRate:
 
     def _in(self, dynamics: Dynamics) -> "ControlRate":
         """The same with an array (m,) for all that is given. Raises InputError if it does not fit the controls."""
-        space, found = dynamics.control_coordinates, dict[str, Any]()
+        space, fields = dynamics.control_coordinates, dict[str, Any]()
         for name in ("weight", "previous"):
             given = getattr(self, name)
             if isinstance(given, Mapping):
                 given = space._numbers(f"ControlRate: {name}", given)
-            found[name] = None if given is None else _each(f"ControlRate: {name}", given, space)
+            fields[name] = None if given is None else _each(f"ControlRate: {name}", given, space)
         limits: Any = self.limits
         if isinstance(limits, Mapping):
             sides = np.tile([[-inf], [inf]], len(space))
@@ -80,7 +80,7 @@ class ControlRate:
             limits = sides[0], sides[1]
         if limits is not None:
             limits = tuple(_each("ControlRate: limits", side, space) for side in limits)
-        return ControlRate(weight=found["weight"], limits=limits, previous=found["previous"])
+        return ControlRate(weight=fields["weight"], limits=limits, previous=fields["previous"])
 
     def _numbers(self, dt: float, dynamics: Dynamics) -> Array:
         """What both kernels begin with."""

@@ -239,13 +239,13 @@ def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
 def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
     """The cost with numbers by name in the order of a system; the same object if it has no numbers by name."""
     terms = terms_of(cost, field)
-    found = tuple(term._in(dynamics) for term in terms)
-    for term in found:
+    ordered = tuple(term._in(dynamics) for term in terms)
+    for term in ordered:
         if field in ("initial", "final_cost") and term.by_knot:
             raise InputError(f"{field}: got a {term.name} with a row for each knot, want one row, such as rows[-1]")
-    return cost if all(map(operator.is_, terms, found)) else CostSum(found)
+    return cost if all(map(operator.is_, terms, ordered)) else CostSum(ordered)
 
 
 def weighing_obstacles(cost: Cost, times: float) -> CostSum:
     """The cost with the weights of its obstacles multiplied."""
-    return CostSum(tuple(one if one.kept_clear is None else one.times(times) for one in terms_of(cost)))
+    return CostSum(tuple(term if term.kept_clear is None else term.times(times) for term in terms_of(cost)))

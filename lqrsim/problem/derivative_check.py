@@ -59,20 +59,20 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
                 raise InputError(f"{called}: got {moved:g} as entry {i} ({names[i]}) {where}, want a finite number")
         columns = names, dynamics.control_coordinates.names
         slopes_of = dynamics.linearize(x, u, problem.dt)[:2] if dynamics.discrete else dynamics.rate_jacobian(x, u)
-        for what, slopes, column in zip(("df/dx", "df/du"), slopes_of, columns, strict=True):
+        for label, slopes, column in zip(("df/dx", "df/du"), slopes_of, columns, strict=True):
             for i, j in np.argwhere(~np.isfinite(slopes)):
                 raise InputError(
-                    f"{called}: got {slopes[i, j]:g} in {what}, row {names[i]}, column"
+                    f"{called}: got {slopes[i, j]:g} in {label}, row {names[i]}, column"
                     f" {column[j]}, {where}, want finite derivatives"
                 )
         for cost, term in _terms(problem):
             value, gradient, hessian = evaluate(term, x, u)
-            for what, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
+            for label, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
                 if not np.isfinite(array).all():
                     entry = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
                     place = f" at {entry}" if entry else ""
                     raise InputError(
-                        f"{cost}: got {array[tuple(entry)]:g} as its {what}{place} {where}, want finite numbers"
+                        f"{cost}: got {array[tuple(entry)]:g} as its {label}{place} {where}, want finite numbers"
                     )
 
 
@@ -159,15 +159,16 @@ def check_derivatives(
         x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
     rng = np.random.default_rng(seed)
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
-    found: dict[str, list[DerivativeCheck]] = {}
+    checks_by_name: dict[str, list[DerivativeCheck]] = {}
     checks = [_of_dynamics(dynamics, points, tolerance)]
     if isinstance(subject, Problem):
         checks += [_of_costs(subject, points, tolerance), _of_constraints(subject, points, tolerance)]
     with np.errstate(all="ignore"):
         for check in itertools.chain(*checks):
-            found.setdefault(check.what, []).append(check)
+            checks_by_name.setdefault(check.what, []).append(check)
     return [
-        max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
+        max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error)
+        for checks in checks_by_name.values()
     ]
 
 
@@ -179,9 +180,14 @@ def _of_dynamics(dynamics: Dynamics, points: _Points, tolerance: float) -> Itera
     for x, u in points:
         fx, fu = dynamics.rate_jacobian(x, u)
         joint, noise = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]))
-        for what, names, slopes, own in (("df/dx", states, fx, np.s_[:n]), ("df/du", controls, fu, np.s_[n:])):
-            differences = joint[:, own], noise[:, own]
-            yield _worst_entry(f"{what} of {dynamics.name}", states, names, slopes, differences, (x, u), tolerance)
+        for derivative, names, slopes, columns in (
+            ("df/dx", states, fx, np.s_[:n]),
+            ("df/du", controls, fu, np.s_[n:]),
+        ):
+            differences = joint[:, columns], noise[:, columns]
+            yield _worst_entry(
+                f"{derivative} of {dynamics.name}", states, names, slopes, differences, (x, u), tolerance
+            )
 
 
 def _of_costs(problem: Problem, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
@@ -209,8 +215,8 @@ def _of_constraints(problem: Problem, points: _Points, tolerance: float) -> Iter
         for row, (x, u) in itertools.product(range(term.rows), points):
             z = np.concatenate([x, u])
             differences = _differences(lambda z, of=plain, row=row: np.array([of.value(z, row)]), z)
-            what, slope = f"slope of {term.describe(row)}", plain.slope(z, row)[None]
-            yield _worst_entry(what, ("value",), names, slope, differences, (x, u), tolerance)
+            label, slope = f"slope of {term.describe(row)}", plain.slope(z, row)[None]
+            yield _worst_entry(label, ("value",), names, slope, differences, (x, u), tolerance)
 
 
 def _worst_entry(

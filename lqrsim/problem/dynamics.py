@@ -275,8 +275,8 @@ class Dynamics:
             return given if len(self.functions) > 1 else source_of(differences).filled(rate=given)
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names, *self.constants.items())
-        made = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
-        return text_source(made["source"], f"{self.name}(x, u, p)")
+        traced = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
+        return text_source(traced["source"], f"{self.name}(x, u, p)")
 
     def touches(self, states: Array) -> bool:
         """Whether a contact or a limit acts in one of some states (k, n)."""
@@ -364,14 +364,14 @@ class Dynamics:
             return by_jacobians
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("second derivatives", MOST_STEPS, *names, *self.constants.items())
-        made = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
-        support = tuple(made["support"])
-        if not made["source"]:  # the formula would be too long
+        traced = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
+        support = tuple(traced["support"])
+        if not traced["source"]:  # the formula would be too long
             return by_jacobians
         if not support:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)
-        curved = text_source(made["source"], f"second derivatives of {self.name}(x, u, p)")
+        curved = text_source(traced["source"], f"second derivatives of {self.name}(x, u, p)")
         open_source = (
             source_of(discrete_map, SUPPORT=support, K=len(support))
             if self.discrete
@@ -417,10 +417,10 @@ class Dynamics:
 
         There is no source if it would take more than MOST_STEPS.
         """
-        found = self._weighted_hessian()
-        if found is None:
+        hessian = self._weighted_hessian()
+        if hessian is None:
             return {"source": "", "support": []}
-        steps, curves = found
+        steps, curves = hessian
         support = sorted({i for pair in curves for i in pair})
         place = {i: k for k, i in enumerate(support)}
         values = {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in curves.items()}
@@ -520,7 +520,7 @@ class Dynamics:
         """What is compiled, as plain Python."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         names = ("rate", "rate_jacobian", "advance", "step_jacobian")
-        calls = [one.plain_call(self.parameters) for one in self.functions]
+        calls = [function.plain_call(self.parameters) for function in self.functions]
         return plain_functions(self.step_source, {"N": n, "M": m}, names, calls)
 
     def _numbers(self) -> Array:

@@ -105,14 +105,14 @@ class SymbolicCost(OfFormula, Cost):
     def bind(self, dynamics: Dynamics) -> CostTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
         details = ("cost", *names, tuple(self.parameters))
-        made = symbolic.kept(
+        traced = symbolic.kept(
             self.function, details, lambda: self._trace(*names), source=str, nonconvex_in=list, uses_control=bool
         )
         return CostTerm(
-            made["source"],
+            traced["source"],
             self._data,
-            nonconvex_in=None if self.convex or not made["nonconvex_in"] else tuple(made["nonconvex_in"]),
-            uses_control=made["uses_control"],
+            nonconvex_in=None if self.convex or not traced["nonconvex_in"] else tuple(traced["nonconvex_in"]),
+            uses_control=traced["uses_control"],
         )
 
     def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
@@ -185,11 +185,13 @@ class SymbolicConstraint(OfFormula, Constraint):
                 raise InputError("SymbolicConstraint: equality: got True at some knots, want False, or at='all'")
             check_kind("parameters", parameters, (Mapping, type(None)), "a dictionary of name: value")
             want = "a number, or one for each of its knots"
-            columns = {key: numbers_of(f"parameters: {key}", one, want) for key, one in (parameters or {}).items()}
+            columns = {key: numbers_of(f"parameters: {key}", entry, want) for key, entry in (parameters or {}).items()}
             for key, column in columns.items():
                 check_shape(f"parameters: {key}", column, (len(self.at),) if column.ndim else ())
-            self._set_formula(function, {key: float(one.ravel()[0]) for key, one in columns.items()}, name, WANTED)
-            rows = [np.broadcast_to(one, len(self.at)) for one in columns.values()]
+            self._set_formula(
+                function, {key: float(column.ravel()[0]) for key, column in columns.items()}, name, WANTED
+            )
+            rows = [np.broadcast_to(column, len(self.at)) for column in columns.values()]
             self._table = np.array(rows, dtype=np.float64).reshape(len(rows), len(self.at)).T
         else:
             self._set_formula(function, parameters, name, WANTED)
@@ -207,20 +209,20 @@ class SymbolicConstraint(OfFormula, Constraint):
         assert not isinstance(self.at, str)
         rows = np.full(max(self.at, default=-1) + 2, -1.0)  # a row that is repeated says that none does
         rows[list(self.at)] = np.arange(len(self.at))
-        found = cut(rows)
+        row_at = cut(rows)
         other = copy.copy(self)
-        other.at = tuple(np.flatnonzero(found >= 0).tolist())
-        other._table = self._table[found[found >= 0].astype(int)]
+        other.at = tuple(np.flatnonzero(row_at >= 0).tolist())
+        other._table = self._table[row_at[row_at >= 0].astype(int)]
         return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
         details = ("constraint", *names, tuple(self.parameters))
-        made = symbolic.kept(
+        traced = symbolic.kept(
             self.function, details, lambda: self._trace(*names),
             source=str, rows=int, with_control=list, texts=list,
         )  # fmt: skip
-        with_control, rows = made["with_control"], made["rows"]
+        with_control, rows = traced["with_control"], traced["rows"]
         if self.at == "final" and with_control:
             raise InputError(
                 f"{self.name}: got an entry that depends on u, want none at the final step, which has no u"
@@ -233,11 +235,11 @@ class SymbolicConstraint(OfFormula, Constraint):
         kind = "=" if self.equality else ">="
         parts = [f"[{row}]" for row in range(rows)] if rows > 1 else [""]
         name = self._name or getattr(self.function, "__name__", type(self.function).__name__)
-        names, texts = ([f"{one}{part}" for part in parts] for one in (name, self.name))
+        names, texts = ([f"{prefix}{part}" for part in parts] for prefix in (name, self.name))
         if name == "<lambda>":
-            names = texts = made["texts"]
+            names = texts = traced["texts"]
         term = ConstraintTerm(
-            source=made["source"],
+            source=traced["source"],
             data=self._data,
             rows=rows,
             describe=lambda row: f"{texts[row]} {kind} 0",

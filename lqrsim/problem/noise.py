@@ -167,9 +167,9 @@ class Noise:
             source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
             return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
         details = ("noise", *names, self.size, tuple(self.parameters))
-        made = symbolic.kept(self.function, details, lambda: self._trace(*names), source=str, rows=list, active=list)
-        source = text_source(made["source"], self.name)
-        return NoiseTerm(source, numbers, tuple(made["rows"]), self.size, tuple(made["active"]))
+        traced = symbolic.kept(self.function, details, lambda: self._trace(*names), source=str, rows=list, active=list)
+        source = text_source(traced["source"], self.name)
+        return NoiseTerm(source, numbers, tuple(traced["rows"]), self.size, tuple(traced["active"]))
 
     def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
         n = len(states)
@@ -221,6 +221,6 @@ class Noise:
         module = module_of(term.code, "noise", N=n, M=m)
         module.matrices_of(len(x), in_c_order(x), in_c_order(u), numbers_of(term), compact)
         raise_again(term.functions)
-        found = np.zeros((len(x), n, self.size))
-        found[:, list(term.rows)] = compact
-        return found
+        full = np.zeros((len(x), n, self.size))
+        full[:, list(term.rows)] = compact
+        return full

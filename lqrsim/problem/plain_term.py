@@ -21,9 +21,9 @@ class PlainTerm:
         first = term.functions[:1]
         parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
         wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
-        sizes, calls = {"N": states, "M": controls}, [one.plain_call(parameters) for one in term.functions]
+        sizes, calls = {"N": states, "M": controls}, [function.plain_call(parameters) for function in term.functions]
         self._functions = plain_functions(term.code, sizes, wanted, calls)
-        places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
+        places = [address_of(function) if function.is_memory else float(i) for i, function in enumerate(term.functions)]
         self._data = np.concatenate([places, term.data])
 
     def cost(self, z: Array) -> tuple[float, Array, Array]:
@@ -64,11 +64,11 @@ def violated(
     plain = PlainTerm(term, n, m)
     knots = range(steps) if term.uses_control else range(steps if term.final_only else 1, steps + 1)
     for row in range(term.rows):
-        found, when = np.zeros(len(states)), np.zeros(len(states), dtype=np.intp)
+        largest, when = np.zeros(len(states)), np.zeros(len(states), dtype=np.intp)
         for k, knot in zip(*np.nonzero(counts[:, knots.start : knots.stop]), strict=True):
             t = int(knot) + knots.start
             value = plain.value(np.concatenate([states[k, t], controls[k, min(t, steps - 1)]]), row, t)
             missed = abs(value) if term.equality else -value
-            if missed > max(tolerance, found[k]):
-                found[k], when[k] = missed, t
-        yield found, when
+            if missed > max(tolerance, largest[k]):
+                largest[k], when[k] = missed, t
+        yield largest, when

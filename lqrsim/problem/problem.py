@@ -70,12 +70,12 @@ class FixedState:
             want = "one at least, as FixedState(x=0.0), or one per state, as FixedState([0.0, 0.0])"
             raise InputError(f"FixedState: got no numbers, want {want}")
         if state is None or named or isinstance(state, Mapping):
-            found = by_name("FixedState", state, named, "a number", check_number)
+            numbers = by_name("FixedState", state, named, "a number", check_number)
         else:
-            found = check_array("FixedState: state", state, (None,))
-            if not len(found):
+            numbers = check_array("FixedState: state", state, (None,))
+            if not len(numbers):
                 raise InputError("FixedState: state: got no numbers, want one per state")
-        keep(self, state=found)
+        keep(self, state=numbers)
 
     def __repr__(self) -> str:
         return f"FixedState({brief(self.state)})"
@@ -200,8 +200,8 @@ class Problem(OneVersion):
         else:
             keep(self, _controls=(controls, controls))
         start, kept = self.start, [cost.kept_clear for cost in self.obstacle_costs]
-        if start is not None and (found := self._inside(kept, start, self.begin)) is not None:
-            where, advice = found
+        if start is not None and (collision := self._inside(kept, start, self.begin)) is not None:
+            where, advice = collision
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
 
     @property
@@ -212,7 +212,7 @@ class Problem(OneVersion):
     @property
     def moving(self) -> bool:
         """Whether the problem depends on the time at which it begins, as with obstacles that move or a reference."""
-        return any(one.moving or one.by_knot for one in (*terms_of(self.stage_cost), *self.constraints))
+        return any(term.moving or term.by_knot for term in (*terms_of(self.stage_cost), *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
@@ -247,7 +247,7 @@ class Problem(OneVersion):
         if not after:
             return other
         segments = tuple(knot - after for knot in self.segments if knot > after)
-        left, begin = tuple(one.ahead(after) for one in self.constraints), self.begin + after * self.dt
+        left, begin = tuple(constraint.ahead(after) for constraint in self.constraints), self.begin + after * self.dt
         stage = self.stage_cost.ahead(after)
         left_over = {"constraints": left, "stage_cost": stage, "segments": segments}
         return other._with(steps=self.steps - after, begin=begin, **left_over)._bound_anew()
@@ -261,7 +261,7 @@ class Problem(OneVersion):
 
     def _refined(self, plan: Trajectory) -> "Problem | None":
         """The problem with constraints as they are to be along a plan that misses some within its periods, or None."""
-        refined = [one._refined(self.dynamics, plan) for one in self.constraints]
+        refined = [constraint._refined(self.dynamics, plan) for constraint in self.constraints]
         if not any(refined):
             return None
         return self.with_constraints([new or old for new, old in zip(refined, self.constraints, strict=True)])
@@ -280,12 +280,12 @@ class Problem(OneVersion):
           seconds: the delay in seconds; with such costs or constraints, a multiple of dt.
         """
         other = self._with(begin=self.begin + seconds)
-        if any(one.by_knot for one in (*terms_of(self.stage_cost), *self.constraints)):
+        if any(term.by_knot for term in (*terms_of(self.stage_cost), *self.constraints)):
             steps = round(seconds / self.dt)
             if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
                 want = f"a multiple of dt, {self.dt:g} s, not negative: a cost or a constraint has a row for each knot"
                 raise InputError(f"seconds: got {seconds:g}, want {want}")
-            later = tuple(one.ahead(steps, horizon="moving") for one in self.constraints)
+            later = tuple(constraint.ahead(steps, horizon="moving") for constraint in self.constraints)
             other = other._with(stage_cost=self.stage_cost.ahead(steps, horizon="moving"), constraints=later)
         return other._bound_anew() if self.moving else other
 
@@ -309,7 +309,7 @@ class Problem(OneVersion):
 
         A row of a knot at which a segment ends stays that of such a knot; those between are the nearest.
         """
-        old, new = (np.array([0, *one, self.steps]) for one in (self.segments, knots))
+        old, new = (np.array([0, *interior, self.steps]) for interior in (self.segments, knots))
         rows = np.rint(np.interp(np.arange(self.steps + 1), new, old)).astype(int)
         segment = np.clip(np.searchsorted(new, np.arange(self.steps + 1), side="right") - 1, 0, len(knots))
         inside = ~np.isin(np.arange(self.steps + 1), new)
@@ -322,8 +322,8 @@ class Problem(OneVersion):
             return one._with_rows(cut) if one.by_knot else one
 
         return replace(
-            self, segments=tuple(knots), constraints=[moved(one) for one in self.constraints],
-            stage_cost=CostSum(tuple(moved(one) for one in terms_of(self.stage_cost))),
+            self, segments=tuple(knots), constraints=[moved(constraint) for constraint in self.constraints],
+            stage_cost=CostSum(tuple(moved(cost_term) for cost_term in terms_of(self.stage_cost))),
         )  # fmt: skip
 
     def _bound_anew(self) -> "Problem":
@@ -374,8 +374,8 @@ class Problem(OneVersion):
 
     def _only_reference(self, cost: Cost) -> QuadraticCost | None:
         """The reference of the only term of a cost that has one; None if none has, or several."""
-        found = references_of(cost, self.dynamics)
-        return found[0][1] if len(found) == 1 else None
+        references = references_of(cost, self.dynamics)
+        return references[0][1] if len(references) == 1 else None
 
     def _with_goal_states(self, goal: Array | None) -> Array | None:
         """The goal, completed by the GoalStates; None if some entries are still unknown."""
@@ -408,7 +408,7 @@ class Problem(OneVersion):
     @property
     def nominal_controls(self) -> Array:
         """u*, (m,); or (T, m) if the control cost has one for each step."""
-        costs = [one for cost in terms_of(self.stage_cost) if (one := cost.control_reference) is not None]
+        costs = [reference for cost in terms_of(self.stage_cost) if (reference := cost.control_reference) is not None]
         if not costs:
             return np.zeros(len(self.dynamics.control_coordinates))
         if len(costs) == 1:
@@ -498,7 +498,7 @@ class Problem(OneVersion):
         if self.duration is not None:
             parts.append(repr((self.duration, self.time_weight, *((self.segments,) if self.segments else ()))))
         if (rate := self.control_rate) is not None:
-            parts.append(repr([None if one is None else np.asarray(one).tolist() for one in vars(rate).values()]))
+            parts.append(repr([None if entry is None else np.asarray(entry).tolist() for entry in vars(rate).values()]))
         if self.accuracy is not None or self.between_knots:
             parts.append(repr((self.accuracy, self.between_knots)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
@@ -529,7 +529,7 @@ class Problem(OneVersion):
             why = "dynamics that are not a formula of rates"
         elif self.noise is not None:
             why = "noise"
-        elif any(one.world.moving for one in self.kept_clear):
+        elif any(term.world.moving for term in self.kept_clear):
             why = "obstacles that move"
         if why:
             raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
@@ -539,9 +539,9 @@ class Problem(OneVersion):
         if self.control_rate is None:
             return
         others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
-        for what, stated in (*others.items(), ("between_knots", self.between_knots or None)):
+        for feature, stated in (*others.items(), ("between_knots", self.between_knots or None)):
             if stated is not None:
-                raise InputError(f"control_rate: got {self.control_rate!r} with {what}, want one of the two")
+                raise InputError(f"control_rate: got {self.control_rate!r} with {feature}, want one of the two")
         keep(self, control_rate=self.control_rate._in(self.dynamics))
 
     def _check_between_knots(self) -> None:
@@ -551,7 +551,7 @@ class Problem(OneVersion):
             raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
         if self.between_knots and not formula:
             raise InputError("between_knots: got True with dynamics that are not a formula, want False")
-        if self.between_knots and any(one.world.moving for one in self.kept_clear):
+        if self.between_knots and any(term.world.moving for term in self.kept_clear):
             raise InputError("between_knots: got True with obstacles that move, want False")
 
     @checked
@@ -569,11 +569,11 @@ class Problem(OneVersion):
           follows, and so on.
         """
         sizes = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates), self.steps
-        own = rollout.states.shape[2], rollout.applied.shape[2], rollout.plan.steps
-        if own != sizes:
-            got, want = ("{} states, {} controls, {} steps".format(*one) for one in (own, sizes))
+        rollout_sizes = rollout.states.shape[2], rollout.applied.shape[2], rollout.plan.steps
+        if rollout_sizes != sizes:
+            got, want = ("{} states, {} controls, {} steps".format(*counts) for counts in (rollout_sizes, sizes))
             raise InputError(f"rollout: got {got}, want the problem's: {want}")
-        found: dict[str, Array] = {}
+        worsts: dict[str, Array] = {}
         stated = [
             (rollout.states, rollout.applied, term, names_of(constraint, term))
             for constraint, term in zip(self.constraints, self.constraint_terms, strict=True)
@@ -585,15 +585,17 @@ class Problem(OneVersion):
             wide = np.concatenate([rollout.states, last], axis=2)
             stated.append((wide, rollout.commanded, term, [f"ControlRate: {name}" for name in term.names]))
         for states, controls, term, names in stated:
-            each: dict[str, Array] = {}
+            of_term: dict[str, Array] = {}
             rows = violated(term, states, controls, rollout.counts, EQUALITY_TOLERANCE)
             for name, (by, knots) in zip(names, rows, strict=True):
                 worst = np.stack([by, rollout.times[knots]], axis=1)
-                each[name] = np.where(by[:, None] > each[name][:, :1], worst, each[name]) if name in each else worst
-            for name, worst in each.items():
+                of_term[name] = (
+                    np.where(by[:, None] > of_term[name][:, :1], worst, of_term[name]) if name in of_term else worst
+                )
+            for name, worst in of_term.items():
                 unused = (f"{name} ({number})" for number in itertools.count(2))
-                found[name if name not in found else next(key for key in unused if key not in found)] = worst
-        return found
+                worsts[name if name not in worsts else next(key for key in unused if key not in worsts)] = worst
+        return worsts
 
     @property
     def goal_inside(self) -> str:
@@ -601,10 +603,10 @@ class Problem(OneVersion):
         clear, or is no position.
         """
         goal, end = self.weighed_goal, self.begin + self.steps * self.dt
-        found = None if goal is None else self._inside(self.kept_clear, goal, end)
-        return "" if found is None else found[0]
+        collision = None if goal is None else self._inside(self.kept_clear, goal, end)
+        return "" if collision is None else collision[0]
 
     def _inside(self, kept: Sequence[KeepsClear], state: Array, time: float) -> tuple[str, str] | None:
         """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
-        found = (one.in_world(self.dynamics, time).inside(state) for one in kept)
-        return next((one for one in found if one is not None), None)
+        collisions = (term.in_world(self.dynamics, time).inside(state) for term in kept)
+        return next((collision for collision in collisions if collision is not None), None)

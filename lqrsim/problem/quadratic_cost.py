@@ -47,8 +47,8 @@ class _SquareCost(Cost):
 
     def _brief(self, name: str, value: object) -> str:
         if isinstance(value, np.ndarray) and value.ndim == (2 if name == "about" else 3):
-            each = ("controls" if self.controls else "states") if name == "about" else "matrices"
-            return f"a trajectory of {len(value)} {each}"
+            kind = ("controls" if self.controls else "states") if name == "about" else "matrices"
+            return f"a trajectory of {len(value)} {kind}"
         return brief(value)
 
     def _checked(self, weight: Any, about: Any) -> tuple[Array, Array]:
@@ -108,13 +108,13 @@ class _SquareCost(Cost):
                     raise InputError(
                         f"{self.name}: weight: got none for {', '.join(missing)}, want one for each control"
                     )
-            found = {
+            fields = {
                 field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
                 for field, given in self._given.items()
             }
-            if isinstance(weight, Mapping) and np.ndim(found["weight"]) == 2:  # diagonals, one for each knot
-                found["weight"] = found["weight"][:, :, None] * np.eye(len(space))
-            return self._with(*self._checked(**found))._in(dynamics)
+            if isinstance(weight, Mapping) and np.ndim(fields["weight"]) == 2:  # diagonals, one for each knot
+                fields["weight"] = fields["weight"][:, :, None] * np.eye(len(space))
+            return self._with(*self._checked(**fields))._in(dynamics)
         size = self.weight.shape[-1]
         if size != len(space):
             kind = "controls" if self.controls else "states"
@@ -180,7 +180,7 @@ class QuadraticCost(_SquareCost):
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         pairs = (self.weight, 2), (self.about, 1)
-        return self._with(*(np.pad(one, [(0, 0)] * (one.ndim - axes) + [(0, 1)] * axes) for one, axes in pairs))
+        return self._with(*(np.pad(array, [(0, 0)] * (array.ndim - axes) + [(0, 1)] * axes) for array, axes in pairs))
 
 
 class ControlCost(_SquareCost):
@@ -219,22 +219,22 @@ def _number_or_column(field: str, given: object) -> float | Array:
 
 def _by_name(space: Coordinates, field: str, given: Mapping[str, object]) -> Array:
     """Numbers by name or unit as an array (n,), with 0 for the rest; (K, n) if some have one number for each knot."""
-    found = space._by_name(field, given, _number_or_column)
-    counts = {len(one) for one in found.values() if isinstance(one, np.ndarray)}
+    entries = space._by_name(field, given, _number_or_column)
+    counts = {len(entry) for entry in entries.values() if isinstance(entry, np.ndarray)}
     if len(counts) > 1 or 0 in counts:
         got = " and ".join(map(str, sorted(counts)))
         raise InputError(f"{field}: got columns of {got} numbers, want one number for each knot in all of them")
     check_memory(field, max(counts, default=1), 16 * len(space) ** 2, "whose matrices")
     out = np.zeros((*counts, len(space)))
-    for i, one in found.items():
-        out[..., i] = one
+    for i, entry in entries.items():
+        out[..., i] = entry
     return out
 
 
 def references_of(cost: Cost, dynamics: Dynamics) -> list[tuple[Cost, QuadraticCost]]:
     """The terms of a cost that draw to states, each with its reference, in the order of a system."""
-    found = [(term, term.state_reference) for term in terms_of(cost)]
-    return [(term, one._in(dynamics)) for term, one in found if one is not None]
+    references = [(term, term.state_reference) for term in terms_of(cost)]
+    return [(term, reference._in(dynamics)) for term, reference in references if reference is not None]
 
 
 def about_state(term: CostTerm, state: Array) -> CostTerm:

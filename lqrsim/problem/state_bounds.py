@@ -46,8 +46,8 @@ class GoalState(Constraint):
         if isinstance(goal, dict):
             return dynamics.state_coordinates._by_name("GoalState: states", goal, check_number)
         if len(goal) != len(names):
-            each = f"one for each of {', '.join(names)}"
-            raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {each}")
+            per_state = f"one for each of {', '.join(names)}"
+            raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {per_state}")
         return dict(enumerate(goal.tolist()))
 
     def _turning_states(self, dynamics: Dynamics) -> Set[int]:

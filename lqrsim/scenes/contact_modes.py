@@ -39,10 +39,10 @@ class Switches:
         numbers = self.values if numbers is None else numbers
         if np.array_equal(names, self.names):
             return numbers
-        found = np.full((len(names), *numbers.shape[1:]), np.nan)
-        _, here, there = np.intersect1d(names, self.names, assume_unique=True, return_indices=True)
-        found[here] = numbers[there]
-        return found
+        values = np.full((len(names), *numbers.shape[1:]), np.nan)
+        _, places, own_places = np.intersect1d(names, self.names, assume_unique=True, return_indices=True)
+        values[places] = numbers[own_places]
+        return values
 
     @property
     def forces(self) -> npt.NDArray[np.bool_]:
@@ -106,18 +106,21 @@ class ContactModes:
 
     def step(self, state: Array, control: Array) -> tuple[Array, Switches]:
         """The state (n,) after a control period, and its switches."""
-        data, found = self._data, list[tuple[Names, Array]]()
+        data, observed = self._data, list[tuple[Names, Array]]()
         data.qpos[:], data.qvel[:] = state[: self._nv], state[self._nv :]
         data.ctrl[:], data.qacc_warmstart[:], data.time = control, 0.0, 0.0
         for step in range(self._substeps):
             if self._four:
-                self._runge_kutta(4 * step, found)
+                self._runge_kutta(4 * step, observed)
             else:
                 before = data.qpos.copy()
                 mujoco.mj_step(self._model, data)
-                self._observe(step, before, found)
-        names = np.concatenate([np.zeros(0, np.int64), *(one for one, _ in found)])
-        values, order = np.concatenate([np.zeros(0), *(one for _, one in found)]), np.argsort(names)
+                self._observe(step, before, observed)
+        names = np.concatenate([np.zeros(0, np.int64), *(switch_names for switch_names, _ in observed)])
+        values, order = (
+            np.concatenate([np.zeros(0), *(switch_values for _, switch_values in observed)]),
+            np.argsort(names),
+        )
         return np.concatenate([data.qpos, data.qvel]), Switches(names[order], values[order])
 
     def _runge_kutta(self, stage: int, found: list[tuple[Names, Array]]) -> None:

@@ -50,17 +50,17 @@ class Approaches:
         model = self._model
         self._data, self._positions, self._moves = mujoco.MjData(model), states[:, : model.nv], moves
         root = int(model.body_weldid[model.dof_bodyid[np.argmax(np.abs(moves))]])
-        own: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)  # what the body carries, with it
-        for one in range(model.nbody):  # parents come first
-            own[one] = one == root or (one > 0 and own[model.body_parentid[one]])
+        carried: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)  # what the body carries, with it
+        for body in range(model.nbody):  # parents come first
+            carried[body] = body == root or (body > 0 and carried[model.body_parentid[body]])
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        self.thing = np.flatnonzero(own[model.geom_bodyid] & collides).tolist()
+        self.thing = np.flatnonzero(carried[model.geom_bodyid] & collides).tolist()
         self._place(self._positions[0])
         driven = np.unique(model.dof_treeid[self._data.moment_colind[: self._data.moment_rownnz.sum()]])
-        self._dofs = np.isin(model.dof_treeid, driven) & ~own[model.dof_bodyid]
+        self._dofs = np.isin(model.dof_treeid, driven) & ~carried[model.dof_bodyid]
         movers = touching_pairs(model, self.thing)[:, 0]
         bodies = model.geom_bodyid[movers]
-        tools = movers[np.isin(model.body_treeid[bodies], driven) & ~own[bodies]]
+        tools = movers[np.isin(model.body_treeid[bodies], driven) & ~carried[bodies]]
         self.tools = sorted(set(tools.tolist()), key=self._gap)
 
     def __iter__(self) -> Iterator[tuple[str, Array]]:
@@ -68,10 +68,10 @@ class Approaches:
             begin, end = (int(part * self._steps) for part in times)
             way = self._way(begin, end)
             if np.linalg.norm(way[end] - way[begin]) > _TOUCHING:
-                found = [one for tool in self.tools[:_TOOLS] for one in self._pushes(tool, way, begin, end)]
+                attempts = [push for tool in self.tools[:_TOOLS] for push in self._pushes(tool, way, begin, end)]
                 pairs = itertools.product(self._pairs()[:_PAIRS], _PRESSED)
-                found += [self._grasp(*one, way, begin, end) for one in pairs]
-                for words, positions in found:
+                attempts += [self._grasp(*grasp, way, begin, end) for grasp in pairs]
+                for words, positions in attempts:
                     drawn = np.where(self._dofs, positions, np.nan)
                     drawn[end + 1 :] = np.nan
                     yield words, drawn
@@ -82,7 +82,7 @@ class Approaches:
             mujoco.mj_fwdPosition(self._model, self._data)
 
     def _gap(self, tool: int) -> float:
-        return min(mujoco.mj_geomDistance(self._model, self._data, tool, one, 1e3, None) for one in self.thing)
+        return min(mujoco.mj_geomDistance(self._model, self._data, tool, geom, 1e3, None) for geom in self.thing)
 
     def _way(self, begin: int, end: int) -> Array:
         """Places (T+1, 3) of the body's centre: those of the plan, moved on from rest to rest between two knots."""
@@ -98,11 +98,11 @@ class Approaches:
         ahead, centre = _unit(way[end] - way[begin]), way[begin]
         self._place(self._positions[0])
         point = self._tip(tool, way[0])
-        there = self._spot(tool, point) - centre
+        offset = self._spot(tool, point) - centre
         touching = self._reach(tool, point, centre, -ahead)
-        radii = np.linspace(max(float(np.linalg.norm(there)), touching), touching, begin + 1)
+        radii = np.linspace(max(float(np.linalg.norm(offset)), touching), touching, begin + 1)
         radii[1:-1] = np.maximum(radii[1:-1], _ROUND * touching)
-        for words, directions in _paths(_unit(there), -ahead):
+        for words, directions in _paths(_unit(offset), -ahead):
             spots = way - touching * ahead
             knots = np.linspace(0, len(directions) - 1, begin + 1)
             parts = [np.interp(knots, range(len(directions)), part) for part in np.transpose(directions)]
@@ -116,7 +116,7 @@ class Approaches:
         """A grasp by two tools, from straight where they are, on both sides of the body's way."""
         self._place(self._positions[0])
         points = [self._tip(tool, way[0]) for tool in pair]
-        spots = np.array([self._spot(*one) for one in zip(pair, points, strict=True)])
+        spots = np.array([self._spot(*tip) for tip in zip(pair, points, strict=True)])
         ahead, line, sides = _unit(way[end] - way[begin]), spots[0] - spots[1], np.array([[1.0], [-1.0]])
         line = _unit(line - (line @ ahead) * ahead)
         touching = [
@@ -135,21 +135,21 @@ class Approaches:
 
     def _pairs(self) -> list[tuple[int, int]]:
         """Pairs of tools that can close along the line between them, the nearest first."""
-        model, found = self._model, list[tuple[float, tuple[int, int]]]()
+        model, pairs = self._model, list[tuple[float, tuple[int, int]]]()
         self._place(self._positions[0])
         place = self._data.geom_xpos[self.thing].mean(axis=0)
         spots = [self._spot(tool, self._tip(tool, place)) for tool in self.tools]
         slopes = np.zeros((len(self.tools), 3, model.nv))
         for slope, tool, spot in zip(slopes, self.tools, spots, strict=True):
             mujoco.mj_jac(model, self._data, slope, None, spot, int(model.geom_bodyid[tool]))
-        for i, one in enumerate(self.tools):
-            for j, other in enumerate(self.tools[:i]):
+        for i, first in enumerate(self.tools):
+            for j, second in enumerate(self.tools[:i]):
                 line, motion = spots[i] - spots[j], (slopes[i] - slopes[j])[:, self._dofs]
                 sizes = np.linalg.norm(motion, axis=0)
                 closes = (sizes > 0) & (np.abs(line @ motion) > _ACROSS * np.linalg.norm(line) * sizes)
                 if closes.any():
-                    found.append((self._gap(one) + self._gap(other), (one, other)))
-        return [pair for _, pair in sorted(found)]
+                    pairs.append((self._gap(first) + self._gap(second), (first, second)))
+        return [pair for _, pair in sorted(pairs)]
 
     def _tip(self, tool: int, place: Array) -> Array:
         """The point of a tool, in its own axes, that is to touch: on its long axis, nearest to a place."""
@@ -172,9 +172,9 @@ class Approaches:
         model, places = self._model, self._data.geom_xpos
         before, off = places[tool].copy(), self._spot(tool, point) - places[tool]
         bounds = float(model.geom_rbound[tool] + np.linalg.norm(point) + model.geom_rbound[self.thing].max())
-        here, far = places[self.thing].mean(axis=0), 2 * bounds
+        middle, far = places[self.thing].mean(axis=0), 2 * bounds
         for _ in range(_SEARCHES):
-            places[tool] = here + far * side - off
+            places[tool] = middle + far * side - off
             gap = self._gap(tool)
             if gap < _TOUCHING:
                 break
@@ -188,11 +188,11 @@ class Approaches:
         self._place(self._positions[0])
         limited = np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type >= mujoco.mjtJoint.mjJNT_SLIDE.value))
         places, ranges = model.jnt_qposadr[limited], model.jnt_range[limited].T
-        found, misses = np.empty((len(targets), model.nv)), np.empty(len(targets))
+        positions, misses = np.empty((len(targets), model.nv)), np.empty(len(targets))
         slopes, change = np.zeros((len(tools), 3, model.nv)), np.zeros(model.nv)
         for t, target in enumerate(targets):
             for _ in range(_OTHERS if t else _FIRST):
-                spots = np.array([self._spot(*one) for one in zip(tools, points, strict=True)])
+                spots = np.array([self._spot(*tip) for tip in zip(tools, points, strict=True)])
                 for slope, tool, spot in zip(slopes, tools, spots, strict=True):
                     mujoco.mj_jac(model, data, slope, None, spot, int(model.geom_bodyid[tool]))
                 slope = slopes[:, :, moving].reshape(-1, len(moving))
@@ -204,10 +204,10 @@ class Approaches:
                 data.qpos[places] = np.clip(data.qpos[places], *ranges)
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_comPos(model, data)
-            found[t] = self._mjcf.positions_of(data.qpos)
-            spots = np.array([self._spot(*one) for one in zip(tools, points, strict=True)])
+            positions[t] = self._mjcf.positions_of(data.qpos)
+            spots = np.array([self._spot(*tip) for tip in zip(tools, points, strict=True)])
             misses[t] = np.linalg.norm(target - spots, axis=1).max()
-        return found, misses
+        return positions, misses
 
 
 def _unit(vector: Array) -> Array:

@@ -90,9 +90,9 @@ class _AtRest:
         for number, entry, place in _integrals(model):
             if (most := model.actuator_dynprm[number, entry]) > 0:
                 act[0][place], act[1][place] = -most, most
-        self.low = np.array([*(one.low for one in mjcf.controls), *act[0]])
-        self.high = np.array([*(one.high for one in mjcf.controls), *act[1]])
-        inputs = [name for one in mjcf.actuators for name in one.inputs]
+        self.low = np.array([*(control.low for control in mjcf.controls), *act[0]])
+        self.high = np.array([*(control.high for control in mjcf.controls), *act[1]])
+        inputs = [name for actuator in mjcf.actuators for name in actuator.inputs]
         self.slow = np.array([*(name == "vel" for name in inputs), *np.zeros(model.na)], dtype=bool)
         self.neutral = np.clip(np.concatenate([self._targets(), np.zeros(model.na)]), self.low, self.high)
         self.neutral = np.clip(self.rested(self.neutral, np.arange(model.na)), self.low, self.high)
@@ -101,17 +101,17 @@ class _AtRest:
 
     def _targets(self) -> Array:
         """Controls (nu,) of 0, or for targets of position those of the actuators' lengths."""
-        found = np.zeros(self.model.nu)
-        for one in self._actuators:
-            own, lengths = found[one.controls], self.data.actuator_length[one.outputs]
-            if one.inputs == ("rx", "ry", "rz"):
-                own[:] = lengths
-            elif one.inputs == ("qw", "qx", "qy", "qz"):
+        controls = np.zeros(self.model.nu)
+        for actuator in self._actuators:
+            entries, lengths = controls[actuator.controls], self.data.actuator_length[actuator.outputs]
+            if actuator.inputs == ("rx", "ry", "rz"):
+                entries[:] = lengths
+            elif actuator.inputs == ("qw", "qx", "qy", "qz"):
                 turn = np.linalg.norm(lengths)
-                mujoco.mju_axisAngle2Quat(own, lengths / max(turn, 1e-300), turn)
-            elif "pos" in one.inputs:
-                own[one.inputs.index("pos")] = lengths[0]
-        return found
+                mujoco.mju_axisAngle2Quat(entries, lengths / max(turn, 1e-300), turn)
+            elif "pos" in actuator.inputs:
+                entries[actuator.inputs.index("pos")] = lengths[0]
+        return controls
 
     def rested(self, z: Array, which: npt.NDArray[np.intp]) -> Array:
         """The same controls with these activations (k,) where their rates are 0, if there is such a place."""
@@ -178,10 +178,10 @@ def holding(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> Holding:
     search = _Search(rest)
     # Targets of velocity are left at 0 if other controls can hold.
     low, high = (np.where(rest.slow, rest.neutral, side) for side in (rest.low, rest.high))
-    found = search.found(low, high)
-    if rest.slow.any() and not found.held:
-        found = search.found(rest.low, rest.high)
-    return found
+    solution = search.found(low, high)
+    if rest.slow.any() and not solution.held:
+        solution = search.found(rest.low, rest.high)
+    return solution
 
 
 class _Search:
@@ -271,16 +271,16 @@ class _Search:
         """
         rest, model, nu, count = self._rest, self._rest.model, self._rest.model.nu, len(z)
         width = count + len(self._limited) + len(self._limited_dofs)
-        whole = np.eye(width)
-        change, cut = whole[:count], whole[count:]
+        identity = np.eye(width)
+        change, cut = identity[:count], identity[count:]
         forces = linear.forces_by @ change
         forces[self._limited] -= cut[: len(self._limited)]
         joints, now = rest.moments.T @ forces, rest.compensated + rest.moments.T @ linear.forces
         joints[self._limited_dofs] -= cut[len(self._limited) :]
         # Where more is wanted than a joint takes, an actuator of several joints may push against its limit for others.
         limited = model.jnt_actfrclimited.astype(bool)
-        asked, joint_range = rest.wanted[self._limited_dofs], model.jnt_actfrcrange[limited].T
-        beyond = (asked > joint_range[1]).astype(float) - (asked < joint_range[0])
+        required, joint_range = rest.wanted[self._limited_dofs], model.jnt_actfrcrange[limited].T
+        beyond = (required > joint_range[1]).astype(float) - (required < joint_range[0])
         price = np.concatenate([np.ones(len(self._limited)), np.where(beyond != 0, _LIGHT / _HEAVY, 1.0)])
         price *= _HEAVY / self._size
         rows = self._carried @ joints / self._size, self._sparing[:, None] * change, price[:, None] * cut
@@ -305,8 +305,8 @@ class _Search:
             if least is None:
                 return None
             aims[2] = price * least[count:]
-        found = _least_squares(np.concatenate(rows), np.concatenate(aims), (met, met_at), sides)
-        return None if found is None else z + found[:count]
+        solution = _least_squares(np.concatenate(rows), np.concatenate(aims), (met, met_at), sides)
+        return None if solution is None else z + solution[:count]
 
     def _leave(self, z: Array, linear: _Linear) -> bool:
         """Let activations that cannot be at rest within their ranges go to the ends, or drift; whether there are any.
@@ -315,12 +315,12 @@ class _Search:
         """
         rest, nu, any_left = self._rest, self._rest.model.nu, False
         for number in np.unique(rest.of[nu:]):
-            own = np.flatnonzero(rest.of == number)
-            acts = own[own >= nu] - nu
+            entries = np.flatnonzero(rest.of == number)
+            acts = entries[entries >= nu] - nu
             acts = acts[(self._modes[acts] == 0) & ~self._idle[acts]]
             now = linear.rates[acts] / self._steepness[acts]
-            rates = linear.rates_by[np.ix_(acts, own)] / self._steepness[acts, None]
-            off, left_out = _unmet(rates, now, (self._low - z)[own], (self._high - z)[own])
+            rates = linear.rates_by[np.ix_(acts, entries)] / self._steepness[acts, None]
+            off, left_out = _unmet(rates, now, (self._low - z)[entries], (self._high - z)[entries])
             end = np.where(off > 0, self._high[nu + acts], self._low[nu + acts])
             modes = np.where(np.isfinite(end), np.where(off > 0, 1, -1), _DRIFTS)
             self._modes[acts[left_out]] = modes[left_out]
@@ -385,8 +385,8 @@ def _least_squares(
     ways = null_space(equal[0]) if len(equal[0]) else np.eye(rows.shape[1])
     turned, corner = np.linalg.qr(rows @ ways)
     nearest = turned.T @ (aims - rows @ start)
-    above = [(one[np.isfinite(least)], least[np.isfinite(least)]) for one, least, _ in sides]
-    below = [(-one[np.isfinite(most)], -most[np.isfinite(most)]) for one, _, most in sides]
+    above = [(block[np.isfinite(least)], least[np.isfinite(least)]) for block, least, _ in sides]
+    below = [(-block[np.isfinite(most)], -most[np.isfinite(most)]) for block, _, most in sides]
     bound, least = (np.concatenate(part) for part in zip(*above, *below, strict=True))
     least = least - bound @ start
     bound = solve_triangular(corner, (bound @ ways).T, trans=1).T
@@ -458,7 +458,7 @@ def settled(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
     moved = np.zeros(len(free))
     place, left = missing(moved)
     for _ in range(_NEWTON):
-        slopes = [missing(moved + one)[1] - missing(moved - one)[1] for one in _SMALL * np.eye(len(free))]
+        slopes = [missing(moved + change)[1] - missing(moved - change)[1] for change in _SMALL * np.eye(len(free))]
         step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), left, rcond=1e-6)[0]
         for share in 0.5 ** np.arange(_HALVES):
             tried, then = missing(moved + share * step)
@@ -474,17 +474,17 @@ def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
     """Positions (nq,) in which each free body that touches nothing is lower along gravity, if it touches something
     there, within the size of the model.
     """
-    data, found = mujoco.MjData(model), qpos.copy()
+    data, lowered = mujoco.MjData(model), qpos.copy()
     down, most = model.opt.gravity / max(float(np.linalg.norm(model.opt.gravity)), mujoco.mjMINVAL), model.stat.extent
 
     def touches(joint: int, fall: float) -> bool:
-        data.qpos[:] = found
+        data.qpos[:] = lowered
         data.joint(joint).qpos[:3] += fall * down
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
-        own = (roots == model.body_rootid[model.jnt_bodyid[joint]]).any(axis=1)
-        return bool((own & (data.contact.dist <= 0)).any())
+        of_body = (roots == model.body_rootid[model.jnt_bodyid[joint]]).any(axis=1)
+        return bool((of_body & (data.contact.dist <= 0)).any())
 
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist():
         falls = np.linspace(0, most, _FALLS)
@@ -495,8 +495,8 @@ def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if touches(joint, middle) else (middle, high)
             touches(joint, high)
-            found = data.qpos.copy()
-    return found
+            lowered = data.qpos.copy()
+    return lowered
 
 
 def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], Array]:
@@ -511,22 +511,24 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
     _, slopes = Equalities(model).at(qpos)
     _, corner, order = qr(slopes * np.where(driven, 1.0, _RATHER), mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
     rank = int((np.abs(np.diagonal(corner)) > _RANK * np.abs(slopes).max(initial=0.0)).sum())
-    follow, kept = (np.sort(one).astype(np.intp) for one in (order[:rank], order[rank:]))
-    moves = np.eye(model.nv)[:, kept]
-    moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, kept], rcond=None)[0]
-    return kept, moves.T
+    follow, free = (np.sort(dofs).astype(np.intp) for dofs in (order[:rank], order[rank:]))
+    moves = np.eye(model.nv)[:, free]
+    moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, free], rcond=None)[0]
+    return free, moves.T
 
 
 def efforts(mjcf: MjcfModel) -> Array:
     """The largest size of each control, (nu,): from its own limits, else from its force's; 1 without limits."""
-    joints, found = {one.name: one for one in mjcf.joints}, np.ones(len(mjcf.controls))
-    for one in mjcf.actuators:
+    joints, largest = {joint.name: joint for joint in mjcf.joints}, np.ones(len(mjcf.controls))
+    for actuator in mjcf.actuators:
         sides = []
-        if one.gain is not None and one.gain[0] and not any(one.bias or ()):  # else its control is no force
-            sides.append(np.abs(one.forces) / abs(one.gain[0]))
-            if one.joint is not None and one.gear:
-                sides.append(np.abs(joints[one.joint].forces) / abs(one.gain[0] * one.gear))
-        for k in range(one.controls.start, one.controls.stop):
-            own = np.abs([mjcf.controls[k].low, mjcf.controls[k].high])
-            found[k] = next((size for side in (own, *sides) if 0 < (size := float(side.max())) < np.inf), 1.0)
-    return found
+        if (
+            actuator.gain is not None and actuator.gain[0] and not any(actuator.bias or ())
+        ):  # else its control is no force
+            sides.append(np.abs(actuator.forces) / abs(actuator.gain[0]))
+            if actuator.joint is not None and actuator.gear:
+                sides.append(np.abs(joints[actuator.joint].forces) / abs(actuator.gain[0] * actuator.gear))
+        for k in range(actuator.controls.start, actuator.controls.stop):
+            limits = np.abs([mjcf.controls[k].low, mjcf.controls[k].high])
+            largest[k] = next((size for side in (limits, *sides) if 0 < (size := float(side.max())) < np.inf), 1.0)
+    return largest

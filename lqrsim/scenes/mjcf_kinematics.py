@@ -130,8 +130,8 @@ def position_of(mjcf: MjcfModel, body: int) -> Axes:
     """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
     model, data, rng = mjcf.model, mujoco.MjData(mjcf.model), np.random.default_rng(0)
     candidates = {
-        one.dof + i: one.qpos.start + i for one in mjcf.joints if one.kind in ("free", "slide")
-        for i in range(3 if one.kind == "free" else 1)
+        joint.dof + i: joint.qpos.start + i for joint in mjcf.joints if joint.kind in ("free", "slide")
+        for i in range(3 if joint.kind == "free" else 1)
     }  # fmt: skip
     origins, positions = np.zeros((5, 3)), np.zeros((5, model.nq))
     for trial in range(5):
@@ -192,8 +192,8 @@ def reach_of(model: mujoco.MjModel, body: int) -> float:
     reach = 0.0
     for geom in np.flatnonzero(collides).tolist() if collides.any() else range(model.ngeom):
         if (path := path_to(model, geom, body)) is not None:
-            offsets = [model.geom_pos[geom], *(model.body_pos[one] for one in path)]
-            reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(one) for one in offsets)))
+            offsets = [model.geom_pos[geom], *(model.body_pos[link] for link in path)]
+            reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(offset) for offset in offsets)))
     return reach
 
 

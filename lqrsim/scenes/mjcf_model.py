@@ -167,7 +167,7 @@ class MjcfModel:
 
     @cached_property
     def joints(self) -> tuple[Joint, ...]:
-        model, found = self.model, list[Joint]()
+        model, joints = self.model, list[Joint]()
         for number in range(model.njnt):
             kind, name = _KINDS[mujoco.mjtJoint(model.jnt_type[number])], _joint_name(model, number)
             firsts = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
@@ -175,7 +175,7 @@ class MjcfModel:
             single = kind in ("slide", "hinge")
             limited = model.jnt_limited[number] and single
             stated = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{name}{SPEED_LIMIT}") if single else -1
-            found.append(
+            joints.append(
                 Joint(
                     name=name, kind=kind, qpos=qpos, dofs=dofs,
                     limits=_side(limited, model.jnt_range[number]) if limited else None,
@@ -183,11 +183,11 @@ class MjcfModel:
                     speed=math.inf if stated < 0 else float(model.numeric(stated).data[0]),
                 )
             )  # fmt: skip
-        return tuple(found)
+        return tuple(joints)
 
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
-        model, found = self.model, list[Actuator]()
+        model, actuators = self.model, list[Actuator]()
         places = (
             (model.actuator_ctrladr, model.actuator_ctrlnum), (model.actuator_actadr, model.actuator_actnum),
             (model.actuator_outadr, model.actuator_outnum),
@@ -197,7 +197,7 @@ class MjcfModel:
             controls, activations, outputs = (slice(first, first + count) for first, count in starts)
             of_joint = mujoco.mjtTrn(model.actuator_trntype[number]) in _OF_JOINTS
             gain, bias = _affine(model, number)
-            found.append(
+            actuators.append(
                 Actuator(
                     name=model.actuator(number).name, controls=controls, activations=activations, outputs=outputs,
                     inputs=tuple(mujoco.mj_actuatorInputName(model, number, i) or "" for i in range(starts[0][1])),
@@ -206,29 +206,36 @@ class MjcfModel:
                     gear=float(model.actuator_gear[outputs.start, 0]), gain=gain, bias=bias,
                 )
             )  # fmt: skip
-        return tuple(found)
+        return tuple(actuators)
 
     @cached_property
     def controls(self) -> tuple[Control, ...]:
         """All controls, in MuJoCo's order: named as their actuator, `<actuator>_<input>` if it has several, or none."""
-        model, joints, found = self.model, {one.name: one for one in self.joints}, list[Control]()
+        model, joints, controls = self.model, {joint.name: joint for joint in self.joints}, list[Control]()
         low, high = ranges(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange)
-        for number, one in enumerate(self.actuators):
+        for number, actuator in enumerate(self.actuators):
             if model.actuator_dyntype[number] == mujoco.mjtDyn.mjDYN_MUSCLE.value:  # MuJoCo passes on what is in 0..1
-                low[one.controls], high[one.controls] = (side[one.controls].clip(0, 1) for side in (low, high))
-            for place, name in zip(range(one.controls.start, one.controls.stop), one.inputs, strict=True):
-                full, unit = f"{one.name}_{name}" if len(one.inputs) > 1 else one.name, _unit(one, joints, name)
-                found.append(Control(full, unit, float(low[place]), float(high[place])))
-        return tuple(found)
+                low[actuator.controls], high[actuator.controls] = (
+                    side[actuator.controls].clip(0, 1) for side in (low, high)
+                )
+            for place, name in zip(
+                range(actuator.controls.start, actuator.controls.stop), actuator.inputs, strict=True
+            ):
+                full, unit = (
+                    f"{actuator.name}_{name}" if len(actuator.inputs) > 1 else actuator.name,
+                    _unit(actuator, joints, name),
+                )
+                controls.append(Control(full, unit, float(low[place]), float(high[place])))
+        return tuple(controls)
 
     @cached_property
     def activations(self) -> tuple[str, ...]:
         """The names of the states of actuators, (na,): `<actuator>_activation`, numbered if an actuator has several."""
         names = [""] * int(self.model.na)
-        for one in self.actuators:
-            places = range(one.activations.start, one.activations.stop)
+        for actuator in self.actuators:
+            places = range(actuator.activations.start, actuator.activations.stop)
             for i, place in enumerate(places):
-                names[place] = f"{one.name}_activation" + (f"_{i}" if len(places) > 1 else "")
+                names[place] = f"{actuator.name}_activation" + (f"_{i}" if len(places) > 1 else "")
         return tuple(names)
 
     @cached_property
@@ -236,31 +243,31 @@ class MjcfModel:
         """The names and units of a robot's states: positions, velocities, states of actuators; as `MjcfRobot` says."""
         turned = [("rx", "rad"), ("ry", "rad"), ("rz", "rad")], [("wx", "rad/s"), ("wy", "rad/s"), ("wz", "rad/s")]
         moved = [(axis, "m") for axis in "xyz"], [(f"v{axis}", "m/s") for axis in "xyz"]
-        loose = [one for one in self.joints if one.kind == "free" and one.name.startswith(UNNAMED)]
-        found = list[tuple[str, str]]()
+        loose = [joint for joint in self.joints if joint.kind == "free" and joint.name.startswith(UNNAMED)]
+        states = list[tuple[str, str]]()
         for side in (0, 1):
-            for one in self.joints:
-                own = "" if [one] == loose else f"{one.name}_"
-                if one.kind in ("free", "ball"):
-                    entries = [*(moved[side] if one.kind == "free" else []), *turned[side]]
-                    found += [(own + name, unit) for name, unit in entries]
+            for joint in self.joints:
+                prefix = "" if [joint] == loose else f"{joint.name}_"
+                if joint.kind in ("free", "ball"):
+                    entries = [*(moved[side] if joint.kind == "free" else []), *turned[side]]
+                    states += [(prefix + name, unit) for name, unit in entries]
                 else:
-                    unit = "m" if one.kind == "slide" else "rad"
-                    found.append((one.name, unit) if side == 0 else (f"{one.name}_velocity", f"{unit}/s"))
-        return (*found, *((name, "") for name in self.activations))
+                    unit = "m" if joint.kind == "slide" else "rad"
+                    states.append((joint.name, unit) if side == 0 else (f"{joint.name}_velocity", f"{unit}/s"))
+        return (*states, *((name, "") for name in self.activations))
 
     def positions_of(self, qpos: Array) -> Array:
         """A robot's positions (..., nv), with rotation vectors, of MuJoCo's (..., nq), with quaternions."""
-        return self._turned([qpos[..., one.qpos] for one in self.joints], 4, rotations.rotation_vector)
+        return self._turned([qpos[..., joint.qpos] for joint in self.joints], 4, rotations.rotation_vector)
 
     def qpos_of(self, positions: Array) -> Array:
         """MuJoCo's positions (..., nq) of a robot's (..., nv)."""
-        return self._turned([positions[..., one.dofs] for one in self.joints], 3, rotations.quaternion)
+        return self._turned([positions[..., joint.dofs] for joint in self.joints], 3, rotations.quaternion)
 
     def _turned(self, parts: list[Array], size: int, turn: Callable[..., Array]) -> Array:
         """The positions of all joints, the rotation in the last numbers of ball and free joints in its other form."""
-        for i, one in enumerate(self.joints):
-            if one.kind in ("free", "ball"):
+        for i, joint in enumerate(self.joints):
+            if joint.kind in ("free", "ball"):
                 rotation = turn(parts[i][..., -size:], turns_about=self.turns_about)
                 parts[i] = np.concatenate([parts[i][..., :-size], rotation], axis=-1)
         return np.concatenate(parts, axis=-1)
@@ -292,26 +299,26 @@ class MjcfModel:
         geoms that collide.
         """
         model = self.model
-        elements, found = _elements(ElementTree.fromstring(self.xml)), list[Number]()
+        elements, numbers = _elements(ElementTree.fromstring(self.xml)), list[Number]()
         masses = {model.body(number).name: float(model.body_mass[number]) for number in self.carriers}
         names = {model.body(number).name for number in range(1, model.nbody)}
         if names == elements["body"].keys():  # otherwise the text has no place for some masses
-            found += [Number("mass", "", sum(masses.values()))] if masses else []
-            found += [Number("mass", name, mass) for name, mass in masses.items()]
+            numbers += [Number("mass", "", sum(masses.values()))] if masses else []
+            numbers += [Number("mass", name, mass) for name, mass in masses.items()]
         for number in range(model.njnt):
             name, dof = model.joint(number).name, int(model.jnt_dofadr[number])
             if name in elements["joint"]:
                 values = {key: getattr(model, f"dof_{key}")[dof] for key in _NUMBERS if key != "stiffness"}
                 values["stiffness"] = model.jnt_stiffness[number]
-                found += [Number(key, name, float(values[key])) for key in _NUMBERS]
+                numbers += [Number(key, name, float(values[key])) for key in _NUMBERS]
         for number in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
             if (name := model.geom(number).name) in elements["geom"]:
-                found.append(Number("friction", name, float(model.geom_friction[number, 0])))
+                numbers.append(Number("friction", name, float(model.geom_friction[number, 0])))
         for number, gear in enumerate(model.actuator_gear[model.actuator_outadr]):
             if (name := model.actuator(number).name) in elements["actuator"] and gear.any():
-                found.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
-        found += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
-        return {f"{one.part}_{one.what}" if one.part else one.what: one for one in found}
+                numbers.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
+        numbers += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
+        return {f"{number.part}_{number.what}" if number.part else number.what: number for number in numbers}
 
     def keyframe(self, name: str, what: str) -> tuple[Array, Array, Array | None]:
         """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, of which the model has zeros."""
@@ -339,21 +346,23 @@ class MjcfModel:
         root = ElementTree.fromstring(self.xml)
         taken = {element.get("name") for element in root.iter()}
         # An MJCF has its own section worldbody, and one from each file that it includes.
-        there = [one for world in root.iter("worldbody") for one in world.iter()]
+        placed = [element for world in root.iter("worldbody") for element in world.iter()]
         kinds = {"body": ("body",), "joint": ("joint", "freejoint"), "geom": ("geom",)}
-        parts = {kind: [one for one in there if one.tag in tags] for kind, tags in kinds.items()}
-        parts["actuator"] = [one for section in root.iter("actuator") for one in section]
+        parts = {kind: [element for element in placed if element.tag in tags] for kind, tags in kinds.items()}
+        parts["actuator"] = [element for section in root.iter("actuator") for element in section]
         free = [
-            (body.get("name"), one)
+            (body.get("name"), joint)
             for body in parts["body"]
-            for one in body
-            if (one.tag == "freejoint" or (one.tag == "joint" and one.get("type") == "free"))
-            and one.get("name") is None
+            for joint in body
+            if (joint.tag == "freejoint" or (joint.tag == "joint" and joint.get("type") == "free"))
+            and joint.get("name") is None
         ]
         for body, joint in free if len(free) > 1 else ():
-            if body is not None and body not in {one.get("name") for one in parts["joint"]}:
+            if body is not None and body not in {element.get("name") for element in parts["joint"]}:
                 joint.set("name", body)
-        unnamed = {kind: [one for one in elements if one.get("name") is None] for kind, elements in parts.items()}
+        unnamed = {
+            kind: [element for element in elements if element.get("name") is None] for kind, elements in parts.items()
+        }
         for kind, elements in unnamed.items():
             names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in taken)
             for element in elements:
@@ -361,17 +370,17 @@ class MjcfModel:
         changed = len(free) > 1 or any(unnamed.values())
         xml = ElementTree.tostring(root, encoding="unicode") if changed else self.xml
         named = replace(self, xml=xml) if changed else self
-        lit = any(one.tag == "light" for one in there)
+        lit = any(element.tag == "light" for element in placed)
         if lit or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
             return named
         # The size of the whole is known when it is compiled, and the light is to be in what is compiled.
         model = replace(self, xml=_with_light(xml, np.zeros(3))).model
         place = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
-        found = replace(self, xml=_with_light(xml, place))
+        completed = replace(self, xml=_with_light(xml, place))
         for field in (model.light_pos, model.light_pos0, model.light_poscom0):
             field[-1] += [float(f"{number:.6g}") for number in place]
-        vars(found)["model"] = model
-        return found
+        vars(completed)["model"] = model
+        return completed
 
     def with_mocap(self, key: str, what: str) -> "MjcfModel":
         """The same with its mocap bodies where a keyframe has them, and all else as it is.
@@ -390,7 +399,7 @@ class MjcfModel:
             for attribute, values in zip(("pos", "quat"), pose, strict=True):
                 _set(elements[body], attribute, values)
         elements["world"] = next(root.iter("worldbody"))
-        ties = [one for section in root.findall("equality") for one in section]
+        ties = [tie for section in root.findall("equality") for tie in section]
         for i, (tie, values) in enumerate(zip(ties, model.eq_data, strict=False)):
             if tie.tag == "weld" and "body1" in tie.attrib:
                 _set(tie, "relpose", values[3:10])
@@ -401,13 +410,13 @@ class MjcfModel:
                     tied = ElementTree.SubElement(elements[tie.attrib.pop(f"body{side}", "world")], "site", site)
                     _set(tied, "pos", place)
                     tie.set(f"site{side}", site["name"])
-        found = self._of(root)
-        if not _same_forces(model, number, found.model):
+        placed = self._of(root)
+        if not _same_forces(model, number, placed.model):
             raise InputError(
                 f"{what}: mocap: got the keyframe {key!r}, whose mocap bodies cannot be placed by rewriting the MJCF,"
                 " want them directly in the <worldbody>, and springs of tendons at them with a springlength"
             )
-        return found
+        return placed
 
     def with_numbers(self, values: Mapping[str, float], what: str) -> "MjcfModel":
         """The same with other `numbers`.
@@ -417,28 +426,28 @@ class MjcfModel:
         model, numbers, root = self.model, self.numbers, ElementTree.fromstring(self.xml)
         elements, scales = _elements(root), dict[str, float]()
         for name, value in values.items():
-            one = numbers[name]
-            value = check_number(f"{what}: {name}", value, **_BOUNDS.get(one.what, {"at_least": 0.0}))
-            ratio = value / one.value if one.value else 0.0
+            number = numbers[name]
+            value = check_number(f"{what}: {name}", value, **_BOUNDS.get(number.what, {"at_least": 0.0}))
+            ratio = value / number.value if number.value else 0.0
             if name == WHOLE:
                 scales |= dict.fromkeys([model.body(number).name for number in self.carriers], ratio)
                 if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
                     raise InputError(f"{what}: {WHOLE}: got {WHOLE} and {other}, want one of the two")
-            elif one.what == "mass":
-                scales[one.part] = ratio
-            elif one.what in _NUMBERS:
-                joint = model.joint(one.part).id
+            elif number.what == "mass":
+                scales[number.part] = ratio
+            elif number.what in _NUMBERS:
+                joint = model.joint(number.part).id
                 # Damping and stiffness may be polynomials, of which this is the linear coefficient.
                 damping, stiffness = model.dof_dampingpoly[model.jnt_dofadr[joint]], model.jnt_stiffnesspoly[joint]
-                rest = {"damping": damping, "stiffness": stiffness}.get(one.what, ())
-                _set(elements["joint"][one.part], one.what, [value, *rest])
-            elif one.what == "friction":
-                _set(elements["geom"][one.part], "friction", [value, *model.geom(one.part).friction[1:]])
-            elif one.what == "gear":
-                first = np.reshape(model.actuator(one.part).gear, (-1, 6))[0]
-                _set(elements["actuator"][one.part], "gear", ratio * first)
+                higher = {"damping": damping, "stiffness": stiffness}.get(number.what, ())
+                _set(elements["joint"][number.part], number.what, [value, *higher])
+            elif number.what == "friction":
+                _set(elements["geom"][number.part], "friction", [value, *model.geom(number.part).friction[1:]])
+            elif number.what == "gear":
+                first = np.reshape(model.actuator(number.part).gear, (-1, 6))[0]
+                _set(elements["actuator"][number.part], "gear", ratio * first)
             else:
-                _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last element takes precedence
+                _set(ElementTree.SubElement(root, "option"), number.what, [value])  # the last element takes precedence
         if not scales:
             return self._of(root)
         for name, body in elements["body"].items():  # the compiled masses, in the place of what they came from
@@ -459,20 +468,20 @@ class MjcfModel:
     def with_obstacles(self, world: World) -> "MjcfModel":
         """The same with these obstacles as further geoms, fixed to the world, which nothing touches."""
         root = ElementTree.fromstring(self.xml)
-        taken = {one.get("name") for one in root.iter("geom")}
+        taken = {element.get("name") for element in root.iter("geom")}
         section = ElementTree.SubElement(root, "worldbody")
-        for one in world.obstacles:
+        for obstacle in world.obstacles:
             drawn = [kind for kind in KINDS if kind != "mesh"]
-            if one.kind not in drawn:
-                raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(drawn)}")
-            if one.name in taken:
-                raise InputError(f"moving: got {one.name}, which is a geom of the robot's MJCF, want another name")
+            if obstacle.kind not in drawn:
+                raise InputError(f"moving: got {obstacle.name}, a {obstacle.kind}, want one of: {', '.join(drawn)}")
+            if obstacle.name in taken:
+                raise InputError(f"moving: got {obstacle.name}, which is a geom of the robot's MJCF, want another name")
             turn = np.zeros(4)
-            mujoco.mju_mat2Quat(turn, one.rotation.ravel())
-            size = np.minimum([0.0, 0.0, 1.0] if one.kind == "plane" else one.size, _LONG)
-            own = {"name": one.name, "type": one.kind, "contype": "0", "conaffinity": "0"}
-            geom = ElementTree.SubElement(section, "geom", own)
-            for key, values in (("size", size), ("pos", one.position), ("quat", turn)):
+            mujoco.mju_mat2Quat(turn, obstacle.rotation.ravel())
+            size = np.minimum([0.0, 0.0, 1.0] if obstacle.kind == "plane" else obstacle.size, _LONG)
+            attributes = {"name": obstacle.name, "type": obstacle.kind, "contype": "0", "conaffinity": "0"}
+            geom = ElementTree.SubElement(section, "geom", attributes)
+            for key, values in (("size", size), ("pos", obstacle.position), ("quat", turn)):
                 _set(geom, key, values)
         return self._of(root)
 
@@ -491,14 +500,14 @@ def _with_light(xml: str, place: Array) -> str:
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
     """The named elements, by kind and name. Replicas have other names in the model, and are not found."""
-    found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
+    elements = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
     for world in root.iter("worldbody"):
         for element in world.iter():
-            if element.tag in found:
-                found[element.tag][element.get("name", "")] = element
+            if element.tag in elements:
+                elements[element.tag][element.get("name", "")] = element
     for section in root.findall("actuator"):
-        found["actuator"] |= {element.get("name", ""): element for element in section}
-    return found
+        elements["actuator"] |= {element.get("name", ""): element for element in section}
+    return elements
 
 
 def _set(element: ElementTree.Element, name: str, numbers: Iterable[float]) -> None:
@@ -552,31 +561,31 @@ def _unit(one: Actuator, joints: Mapping[str, Joint], what: str) -> str:
 
 def _mocap_poses(model: mujoco.MjModel, key: int) -> dict[str, tuple[Array, Array]]:
     """Positions and quaternions of the mocap bodies that are elsewhere in a keyframe than in the MJCF, by name."""
-    found = {}
+    poses = {}
     for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
         where = int(model.body_mocapid[body])
         place, quat = (all_of[key].reshape(model.nmocap, -1)[where] for all_of in (model.key_mpos, model.key_mquat))
         near = np.abs(place - model.body_pos[body]).max() < _SAME
         if not near or 1 - abs(float(quat @ model.body_quat[body])) > _SAME * np.linalg.norm(quat):
-            found[model.body(body).name] = (place, quat)
-    return found
+            poses[model.body(body).name] = (place, quat)
+    return poses
 
 
 def _same_forces(model: mujoco.MjModel, key: int, other: mujoco.MjModel) -> bool:
     """Whether another model has the forces of this one with its mocap bodies where a keyframe has them."""
-    rng, found = np.random.default_rng(0), []
+    rng, forces = np.random.default_rng(0), []
     move = rng.normal(size=(3, model.nv))
-    for one in (model, other):
-        data = mujoco.MjData(one)
+    for candidate in (model, other):
+        data = mujoco.MjData(candidate)
         mujoco.mj_resetDataKeyframe(model, data, key)
         for step in move:
-            mujoco.mj_integratePos(one, data.qpos, step, 0.3)
-            mujoco.mj_inverse(one, data)
+            mujoco.mj_integratePos(candidate, data.qpos, step, 0.3)
+            mujoco.mj_inverse(candidate, data)
             rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-            found.append(
+            forces.append(
                 np.concatenate([data.efc_pos[rows], data.ten_length, data.qfrc_passive, data.mocap_pos.ravel()])
             )
-    pairs = zip(found[:3], found[3:], strict=True)
+    pairs = zip(forces[:3], forces[3:], strict=True)
     return not _mocap_poses(other, key) and all(
         len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs
     )

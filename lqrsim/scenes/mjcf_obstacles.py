@@ -93,17 +93,17 @@ def link_pairs(model: mujoco.MjModel, body: int) -> Pairs:
     data, welds = placed(model), model.body_weldid
     mujoco.mj_fwdPosition(model, data)  # which also finds what actuators move
     trees = [model.body_treeid[body], *model.dof_treeid[data.moment_colind]]
-    own = np.flatnonzero((welds[model.geom_bodyid] != 0) & np.isin(model.body_treeid[model.geom_bodyid], trees))
-    pairs = np.stack([own[one] for one in np.triu_indices(len(own), 1)], axis=1).astype(np.int64)
-    one, other = welds[model.geom_bodyid[pairs]].T
-    joined = one == other
+    geoms = np.flatnonzero((welds[model.geom_bodyid] != 0) & np.isin(model.body_treeid[model.geom_bodyid], trees))
+    pairs = np.stack([geoms[places] for places in np.triu_indices(len(geoms), 1)], axis=1).astype(np.int64)
+    first, second = welds[model.geom_bodyid[pairs]].T
+    joined = first == second
     if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
         above = welds[model.body_parentid]
-        joined |= (above[one] == other) | (above[other] == one)
+        joined |= (above[first] == second) | (above[second] == first)
     pairs = pairs[_collide_by_kind(model, pairs) & ~joined | _are_stated(model, pairs)]
     base = np.flatnonzero((welds[model.geom_bodyid] == 0) & np.isin(model.geom_bodyid, [*_base(model)]))
     fixed = touching_pairs(model, base.tolist())
-    pairs = np.concatenate([pairs, fixed[np.isin(fixed[:, 0], own)]])
+    pairs = np.concatenate([pairs, fixed[np.isin(fixed[:, 0], geoms)]])
     return pairs[~_always_touch(model, pairs, carried=False)]
 
 
@@ -166,7 +166,7 @@ def levers(model: mujoco.MjModel) -> Array:
     without a range.
     """
     reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
-    found = np.ones(model.nv)
+    arms = np.ones(model.nv)
     for joint in range(model.njnt):
         spans[model.jnt_bodyid[joint]] += 2 * np.linalg.norm(model.jnt_pos[joint])
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
@@ -181,12 +181,12 @@ def levers(model: mujoco.MjModel) -> Array:
         kind, body, first = model.jnt_type[joint], int(model.jnt_bodyid[joint]), int(model.jnt_dofadr[joint])
         far = reach[body] + spans[body] + float(np.linalg.norm(model.jnt_pos[joint]))
         if kind == mujoco.mjtJoint.mjJNT_FREE:
-            found[first + 3 : first + 6] = far
+            arms[first + 3 : first + 6] = far
         elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            found[first : first + 3] = far
+            arms[first : first + 3] = far
         elif kind == mujoco.mjtJoint.mjJNT_HINGE:
-            found[first] = far
-    return found
+            arms[first] = far
+    return arms
 
 
 def _base(model: mujoco.MjModel) -> set[int]:
@@ -215,11 +215,11 @@ def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
 
 def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDArray[np.bool_]:
     """Flags (K,) of the pairs whose geoms touch or overlap."""
-    found, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
+    touching, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
     apart = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1) - sizes.sum(axis=1)
     for k in np.flatnonzero((apart < _NEAR) | (sizes == 0).any(axis=1)):  # planes have no size
-        found[k] = _close(model, data, pairs[k])
-    return found
+        touching[k] = _close(model, data, pairs[k])
+    return touching
 
 
 def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
@@ -237,13 +237,13 @@ def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) 
     always = _touch(model, data, pairs)
     if carried:
         always &= ~_moved_by(model, pairs, _FREE)
-    kept = np.flatnonzero(always)
-    for qpos in _random_positions(model) if len(kept) else ():
+    remaining = np.flatnonzero(always)
+    for qpos in _random_positions(model) if len(remaining) else ():
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
-        always[kept] = [_close(model, data, pair) for pair in pairs[kept]]
-        kept = kept[always[kept]]
-        if not len(kept):
+        always[remaining] = [_close(model, data, pair) for pair in pairs[remaining]]
+        remaining = remaining[always[remaining]]
+        if not len(remaining):
             break
     return always
 
@@ -277,17 +277,20 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
     floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
     if not moving.any():
         return set()
-    data, found, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
-    for qpos, own in ((model.qpos0, pairs[moving]), *((one, pairs[floating]) for one in model.key_qpos)):
+    data, supports, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
+    for qpos, candidates in (
+        (model.qpos0, pairs[moving]),
+        *((keyframe, pairs[floating]) for keyframe in model.key_qpos),
+    ):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
-        for one, other in own[_touch(model, data, own)].tolist():
-            before = mujoco.mj_geomDistance(model, data, one, other, far, None)
-            data.geom_xpos[other, 2] -= _LOWERED
-            if mujoco.mj_geomDistance(model, data, one, other, far, None) - before > _CARRIES * _LOWERED:
-                found.add(other)
-            data.geom_xpos[other, 2] += _LOWERED
-    return found
+        for geom, support in candidates[_touch(model, data, candidates)].tolist():
+            before = mujoco.mj_geomDistance(model, data, geom, support, far, None)
+            data.geom_xpos[support, 2] -= _LOWERED
+            if mujoco.mj_geomDistance(model, data, geom, support, far, None) - before > _CARRIES * _LOWERED:
+                supports.add(support)
+            data.geom_xpos[support, 2] += _LOWERED
+    return supports
 
 
 def _joints(model: mujoco.MjModel, body: int) -> Iterator[tuple[int, int]]:
@@ -338,7 +341,7 @@ def outline_of(model: mujoco.MjModel) -> Outline:
             axis = np.zeros(3)
             mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, half]), model.geom_quat[geom])
             chain = np.array(capsule.between(tuple(middle - axis), tuple(middle + axis)))
-            places = [*(one for one in chain if np.linalg.norm(one - middle) > 1e-9), middle]
+            places = [*(center for center in chain if np.linalg.norm(center - middle) > 1e-9), middle]
         for number, place in enumerate(places, start=1 - len(places)):
             rows.append((body, np.asarray(place, dtype=np.float64), radius))
             names.append(f"{name} ({-number} before)" if number else name)

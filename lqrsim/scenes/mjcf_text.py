@@ -59,8 +59,8 @@ def read_mjcf(name_or_path: str | os.PathLike[str]) -> tuple[str, str]:
             raise InputError(f"{error}; or the path of an .xml or .urdf file") from None
     elif not os.path.isfile(path):
         packaged = ", ".join(names())
-        there = [one.name for one in path.parent.glob("*.xml") if os.path.isfile(one)]
-        near = difflib.get_close_matches(path.name, there, n=1)
+        files = [file.name for file in path.parent.glob("*.xml") if os.path.isfile(file)]
+        near = difflib.get_close_matches(path.name, files, n=1)
         hint = f" (did you mean {path.with_name(near[0])}?)" if near else ""
         got = os.fspath(name_or_path)
         raise InputError(f"scene: got {got!r}, want a file that exists, or one of: {packaged}{hint}")
@@ -174,7 +174,7 @@ def _check_elements(xml: str, what: str) -> None:
     reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
     try:
         reader.feed(xml)
-        made = 0
+        total = 0
         events: Any = reader.read_events()
         for event, element in events:
             depth += 1 if event == "start" else -1
@@ -183,8 +183,8 @@ def _check_elements(xml: str, what: str) -> None:
             if element.tag in _COPIERS:
                 copies = [*copies, copies[-1] * _product(element.get("count", ""))] if event == "start" else copies[:-1]
             if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", *_COPIERS):
-                made += copies[-1]
-                if made > MOST_COPIES:
+                total += copies[-1]
+                if total > MOST_COPIES:
                     got = f"<{element.tag}> of {copies[-1]:,} copies" if element.tag in _COPIERS else "more"
                     raise InputError(f"{what}: got {got}, want {MOST_COPIES:,} elements at most")
             for key in _MASSES.intersection(element.attrib) if event == "start" else ():

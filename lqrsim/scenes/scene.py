@@ -154,8 +154,8 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
         if model.geom_bodyid[geom]:
             geoms_of.setdefault(model.body(model.geom_bodyid[geom]).name, []).append(geom)
     geoms_of.pop("", None)
-    found = {geom for name in listed for geom in geoms_of[check_name(f"{what}: obstacles", name, tuple(geoms_of))]}
-    return sorted(found)
+    chosen = {geom for name in listed for geom in geoms_of[check_name(f"{what}: obstacles", name, tuple(geoms_of))]}
+    return sorted(chosen)
 
 
 def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
@@ -171,10 +171,10 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
     data, text = placed(model), model.names
     names = [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
     taken, types = set(names), model.geom_type.tolist()
-    kind_of = {one: mujoco.mjtGeom(one).name.removeprefix("mjGEOM_").lower() for one in set(types)}
+    kind_of = {number: mujoco.mjtGeom(number).name.removeprefix("mjGEOM_").lower() for number in set(types)}
     places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
     sizes, still, none = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
-    found: list[Obstacle] = []
+    obstacles: list[Obstacle] = []
     for geom in geoms:
         kind = kind_of[types[geom]]
         name = names[geom] or free_name(f"{kind} {geom}", taken)
@@ -189,12 +189,12 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
             middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], FLAT)
             position = position + axes[geom] @ middle
             corners = _hull_of(model, int(model.geom_dataid[geom])) - middle if kind == "mesh" else none
-        found.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still, corners))
-    planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
-    for i, one in enumerate(found):
-        if one.kind in ("capsule", "cylinder") and all(_walled_off(one, end, planes) for end in (-1, 1)):
-            found[i] = replace(one, size=np.array([one.size[0], np.inf, 0.0]))
-    return found
+        obstacles.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still, corners))
+    planes = [obstacle for obstacle in obstacles if obstacle.kind == "plane"]
+    for i, obstacle in enumerate(obstacles):
+        if obstacle.kind in ("capsule", "cylinder") and all(_walled_off(obstacle, end, planes) for end in (-1, 1)):
+            obstacles[i] = replace(obstacle, size=np.array([obstacle.size[0], np.inf, 0.0]))
+    return obstacles
 
 
 def _hull_of(model: mujoco.MjModel, mesh: int) -> Array:

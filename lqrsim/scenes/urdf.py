@@ -47,7 +47,9 @@ def read_urdf(
     root = _parsed(path)
     check_name(f"{path.name}: base", base, ("fixed", "free"))
     settings = root.findall("mujoco/*")  # MuJoCo's extension: elements of an MJCF
-    compiler = {key: value for one in settings if one.tag == "compiler" for key, value in one.attrib.items()}
+    compiler = {
+        key: value for setting in settings if setting.tag == "compiler" for key, value in setting.attrib.items()
+    }
     _find_meshes(root, path, compiler)
     spec = _read(root, path.name, {key: value for key, value in compiler.items() if key not in _PATHS})
     _set_armature(spec, path.name, {} if armature is None else armature)
@@ -55,9 +57,9 @@ def read_urdf(
         _free_base(spec, path.name)
     mjcf = ElementTree.Element("mujoco", {"model": spec.modelname})
     _add(mjcf, "option", {"integrator": "implicitfast"})  # which is stable for damping, also that of servos
-    for one in settings:
-        one.attrib = {key: value for key, value in one.attrib.items() if key not in _PATHS}
-        mjcf.append(one)
+    for setting in settings:
+        setting.attrib = {key: value for key, value in setting.attrib.items() if key not in _PATHS}
+        mjcf.append(setting)
     _add(mjcf, "compiler", {"angle": "radian"})
     with np.errstate(all="ignore"):  # masses that are not finite are refused where the model is used
         _add_parts(mjcf, spec)
@@ -97,7 +99,7 @@ def _parsed(path: Path) -> ElementTree.Element:
         raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want a file that can be read ({error})") from None
     if root.tag != "robot":
         raise InputError(f"URDF: got {path.name} with <{root.tag}> at its root, want <robot>")
-    if any(one.tag.startswith("xacro:") for one in root.iter()):
+    if any(element.tag.startswith("xacro:") for element in root.iter()):
         raise InputError(f"URDF: got {path.name} with macros, want what `xacro {path.name}` prints")
     if (links := len(root.findall("link"))) > DEEPEST:
         raise InputError(f"URDF: got {path.name} with {links:,} links, want {DEEPEST} at most")
@@ -116,9 +118,9 @@ def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, s
                 for place in _places(name, path.parent.resolve(), settings):
                     is_read = place.suffix.lower() in _MESHES
                     files += [place] if is_read else [place.with_suffix(kind) for kind in _MESHES if place.name]
-                found = next((str(one) for one in files if os.path.isfile(one)), None)
-                mesh.set("filename", found or "")
-                if found is None:
+                mesh_file = next((str(candidate) for candidate in files if os.path.isfile(candidate)), None)
+                mesh.set("filename", mesh_file or "")
+                if mesh_file is None:
                     link.remove(geometry)
                     lost.setdefault(kind, []).append(name)
     for kind, names in lost.items():
@@ -130,14 +132,14 @@ def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, s
 
 def _places(name: str, folder: Path, settings: Mapping[str, str]) -> Iterator[Path]:
     """Where a mesh may be. A package is in a folder of its name, above the URDF or in a path of ROS."""
-    scheme, separator, rest = name.rpartition("://")
+    scheme, separator, location = name.rpartition("://")
     if not separator or scheme == "file":
-        stripped = Path(rest).name if settings.get("strippath") == "true" else rest
+        stripped = Path(location).name if settings.get("strippath") == "true" else location
         yield folder / settings.get("meshdir", settings.get("assetdir", "")) / stripped
         return
     for parent in (folder, *folder.parents):
-        yield parent / rest.lstrip("/")
-    package, _, inside = rest.lstrip("/").partition("/")
+        yield parent / location.lstrip("/")
+    package, _, inside = location.lstrip("/").partition("/")
     for entry in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
         yield Path(entry) / package / inside
         if Path(entry).name == package:
@@ -148,8 +150,8 @@ def _places(name: str, folder: Path, settings: Mapping[str, str]) -> Iterator[Pa
 
 def _read(root: ElementTree.Element, name: str, compiler: Mapping[str, str]) -> mujoco.MjSpec:
     """What MuJoCo reads, with all links and with all their geoms, each of which has a name."""
-    for own in root.findall("mujoco"):
-        root.remove(own)
+    for extension in root.findall("mujoco"):
+        root.remove(extension)
     _add(_add(root, "mujoco"), "compiler", {**compiler, "fusestatic": "false", "discardvisual": "false"})
     try:
         with unlogged():
@@ -164,7 +166,7 @@ def _read(root: ElementTree.Element, name: str, compiler: Mapping[str, str]) -> 
         if not geom.name:
             first = f"{geom.parent.name}_{'collision' if geom.contype else 'visual'}"
             names = itertools.chain([first], (f"{first}_{number}" for number in itertools.count(1)))
-            geom.name = next(one for one in names if one not in taken)
+            geom.name = next(candidate for candidate in names if candidate not in taken)
             taken.add(geom.name)
     return spec
 
@@ -173,7 +175,7 @@ def _free_base(spec: mujoco.MjSpec, name: str) -> None:
     """Let the root link float. Raises InputError if there are several, or it moves by a joint of its own."""
     roots = spec.worldbody.bodies
     if len(roots) != 1 or roots[0].joints:
-        got = f"'free', with {listed([one.name or '' for one in roots], _LISTED)} at the root"
+        got = f"'free', with {listed([link.name or '' for link in roots], _LISTED)} at the root"
         raise InputError(f"{name}: base: got {got}, want one link there, without a joint")
     roots[0].add_freejoint()
 
@@ -186,26 +188,28 @@ def _add_parts(mjcf: ElementTree.Element, spec: mujoco.MjSpec) -> None:
         _add(assets, "mesh", {"name": mesh.name, "file": mesh.file, "inertia": "shell"}, scale=mesh.scale)
     _add_body(_add(mjcf, "worldbody"), spec.worldbody)
     ties = _add(mjcf, "equality")
-    for one in spec.equalities:
-        _add(ties, "joint", {"joint1": one.name1, "joint2": one.name2}, polycoef=one.data[:5])
+    for equality in spec.equalities:
+        _add(ties, "joint", {"joint1": equality.name1, "joint2": equality.name2}, polycoef=equality.data[:5])
 
 
 def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> None:
     """Raise InputError for limits in the wrong order, and warn of limits and couplings that MuJoCo does not take."""
-    for one in spec.joints:
-        if one.range[0] > one.range[1]:
-            got = f"got limits from {one.range[0]:g} to {one.range[1]:g} for {one.name}"
+    for joint in spec.joints:
+        if joint.range[0] > joint.range[1]:
+            got = f"got limits from {joint.range[0]:g} to {joint.range[1]:g} for {joint.name}"
             raise InputError(f"{name}: {got}, want lower below upper")
     coupled, names = (
-        {one.name1 for one in spec.equalities},
-        [one.get("name", "") for one in root.iterfind("joint[mimic]")],
+        {equality.name1 for equality in spec.equalities},
+        [element.get("name", "") for element in root.iterfind("joint[mimic]")],
     )
-    if loose := [one for one in names if one not in coupled]:
+    if loose := [follower for follower in names if follower not in coupled]:
         _log.warning(
             "%s: no joint is followed by %s: want a <mimic> of one that turns or slides", name, listed(loose, _LISTED)
         )
-    bounded = {one.get("name") for one in root.iterfind("joint") if one.get("type") in ("revolute", "prismatic")}
-    if endless := [one.name or "" for one in spec.joints if one.name in bounded and not _is_limited(one)]:
+    bounded = {
+        element.get("name") for element in root.iterfind("joint") if element.get("type") in ("revolute", "prismatic")
+    }
+    if endless := [joint.name or "" for joint in spec.joints if joint.name in bounded and not _is_limited(joint)]:
         _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(endless, _LISTED))
 
 
@@ -267,11 +271,11 @@ def _frame(position: Array, quaternion: Array) -> Array:
 
 
 def _set_armature(spec: mujoco.MjSpec, name: str, armature: float | Mapping[str, float]) -> None:
-    joints = {one.name: one for one in spec.joints if _kind(one) in ("slide", "hinge")}
-    each = armature if isinstance(armature, Mapping) else dict.fromkeys(joints, armature)
-    for joint, inertia in each.items():
-        one = joints[check_name(f"{name}: armature", joint, joints)]
-        one.armature = check_number(f"{name}: armature of {joint}", inertia, at_least=0.0)
+    joints = {joint.name: joint for joint in spec.joints if _kind(joint) in ("slide", "hinge")}
+    inertias = armature if isinstance(armature, Mapping) else dict.fromkeys(joints, armature)
+    for joint, inertia in inertias.items():
+        element = joints[check_name(f"{name}: armature", joint, joints)]
+        element.armature = check_number(f"{name}: armature of {joint}", inertia, at_least=0.0)
 
 
 def _add_actuators(
@@ -282,27 +286,31 @@ def _add_actuators(
     efforts: Mapping[str, float] | None,
 ) -> None:
     """Add a motor or a servo for each joint with an effort that does not follow another; a warning names the others."""
-    followers = {one.name1 for one in spec.equalities}
-    joints = {one.name: one for one in spec.joints if _kind(one) in ("slide", "hinge") and one.name not in followers}
+    followers = {equality.name1 for equality in spec.equalities}
+    joints = {
+        joint.name: joint for joint in spec.joints if _kind(joint) in ("slide", "hinge") and joint.name not in followers
+    }
     given = check_kind(f"{name}: efforts", efforts or {}, Mapping, "numbers by joint: {'shoulder': 20.0}")
     for joint, effort in given.items():
         check_name(f"{name}: efforts", joint, joints)
         check_number(f"{name}: efforts of {joint}", effort, at_least=0.0)
-    limits = {joint: float(given.get(joint, one.actfrcrange[1])) for joint, one in joints.items()}
+    limits = {joint: float(given.get(joint, element.actfrcrange[1])) for joint, element in joints.items()}
     if not isinstance(servos, Mapping):
-        servos = {} if servos is None else dict.fromkeys((one for one in joints if limits[one] > 0), servos)
-    gains = {check_name(f"{name}: servos", joint, joints): _gains(name, joint, one) for joint, one in servos.items()}
+        servos = {} if servos is None else dict.fromkeys((joint for joint in joints if limits[joint] > 0), servos)
+    gains = {
+        check_name(f"{name}: servos", joint, joints): _gains(name, joint, servo) for joint, servo in servos.items()
+    }
     section = _add(mjcf, "actuator")
-    for joint, one in joints.items():
-        own, effort = {"name": joint, "joint": joint}, limits[joint]
+    for joint, element in joints.items():
+        attributes, effort = {"name": joint, "joint": joint}, limits[joint]
         force = [-effort, effort] if 0 < effort < np.inf else None
         if joint in gains:
             stiffness, damping = gains[joint]
-            numbers = {"ctrlrange": one.range} if _is_limited(one) else {}
+            numbers = {"ctrlrange": element.range} if _is_limited(element) else {}
             numbers |= {"forcerange": force} if force else {}
-            _add(section, "position", own, kp=stiffness, kv=damping, **numbers)
+            _add(section, "position", attributes, kp=stiffness, kv=damping, **numbers)
         elif effort > 0:
-            _add(section, "motor", own, **({"ctrlrange": force} if force else {}))
+            _add(section, "motor", attributes, **({"ctrlrange": force} if force else {}))
     if bare := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *given)]:
         _log.warning(
             "%s: no motor for %s: want an effort in <limit>, or efforts={%r: 10.0}, with 0.0 if there is none",
@@ -322,7 +330,7 @@ def _add_speed_limits(mjcf: ElementTree.Element, root: ElementTree.Element, name
     """Add the largest speeds of joints, for which MuJoCo has no place, as numbers of the user's."""
     section = _add(mjcf, "custom")
     for joint in root.iterfind("joint"):
-        text = next((one.get("velocity", "") for one in joint.iterfind("limit")), "") or "0"
+        text = next((limit.get("velocity", "") for limit in joint.iterfind("limit")), "") or "0"
         try:
             speed = float(text)
         except ValueError:
@@ -342,7 +350,7 @@ def _compiled(mjcf: ElementTree.Element) -> tuple[mujoco.MjModel | None, str]:
 
 def _remove_refused_shapes(mjcf: ElementTree.Element, name: str) -> None:
     """Take out the geoms that MuJoCo refuses, such as boxes and meshes without a volume, with a warning."""
-    meshes = {one.get("name"): one for one in mjcf.iterfind("asset/mesh")}
+    meshes = {element.get("name"): element for element in mjcf.iterfind("asset/mesh")}
     lost, used = dict[str, str](), set[str | None]()
     shapes = [(body, geom) for body in mjcf.iter("body") for geom in body.findall("geom")]
     for body, geom in shapes:
@@ -372,11 +380,11 @@ def _exclude_overlaps(mjcf: ElementTree.Element, model: mujoco.MjModel, name: st
     data.qpos[places] = np.clip(data.qpos[places], *model.jnt_range[limited].T)
     mujoco.mj_fwdPosition(model, data)
     bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
-    pairs = dict.fromkeys((model.body(one).name, model.body(other).name) for one, other in bodies.tolist())
+    pairs = dict.fromkeys((model.body(first).name, model.body(second).name) for first, second in bodies.tolist())
     section = _add(mjcf, "contact")
-    for one, other in pairs:
-        _add(section, "exclude", {"body1": one, "body2": other})
-    if touching := [f"{one} and {other}" for one, other in pairs]:
+    for first, second in pairs:
+        _add(section, "exclude", {"body1": first, "body2": second})
+    if touching := [f"{first} and {second}" for first, second in pairs]:
         _log.warning("%s: links that touch at zero never collide: %s", name, listed(touching, _LISTED))
 
 
@@ -397,5 +405,5 @@ def _add(
     parent: ElementTree.Element, tag: str, own: Mapping[str, str] | None = None, **numbers: npt.ArrayLike
 ) -> ElementTree.Element:
     """A new element, whose numbers read back exactly."""
-    texts = {key: " ".join(repr(float(one)) for one in np.ravel(given)) for key, given in numbers.items()}
+    texts = {key: " ".join(repr(float(number)) for number in np.ravel(values)) for key, values in numbers.items()}
     return ElementTree.SubElement(parent, tag, {**(own or {}), **texts})

@@ -89,11 +89,11 @@ class Obstacle:
         cls, name: str, kind: str, position: Array, rotation: Array, size: Array, velocity: Array, corners: Array
     ) -> "Obstacle":
         """Make an obstacle that MuJoCo has compiled, without checks: there can be tens of thousands."""
-        made = object.__new__(cls)
-        vars(made).update(
+        obstacle = object.__new__(cls)
+        vars(obstacle).update(
             name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity, corners=corners
         )
-        return made
+        return obstacle
 
     @property
     def row(self) -> Array:
@@ -162,11 +162,11 @@ class World:
         rows = np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
         tables = np.repeat(rows[None], len(moved), axis=0)
         tables[:, :, 1:4] += moved
-        first = tables.size + np.cumsum([0, *(one.corners.size for one in self.obstacles)])[:-1]
-        meshes = [number for number, one in enumerate(self.obstacles) if len(one.corners)]
+        first = tables.size + np.cumsum([0, *(obstacle.corners.size for obstacle in self.obstacles)])[:-1]
+        meshes = [number for number, obstacle in enumerate(self.obstacles) if len(obstacle.corners)]
         begin = ROW * np.arange(len(moved) * len(self)).reshape(tables.shape[:2])
         tables[:, meshes, 13] = (first - begin)[:, meshes]
-        return np.concatenate([tables.ravel(), *(one.corners.ravel() for one in self.obstacles)]), len(moved)
+        return np.concatenate([tables.ravel(), *(obstacle.corners.ravel() for obstacle in self.obstacles)]), len(moved)
 
     @checked
     def moved(self, seconds: Finite) -> "World":
@@ -176,7 +176,9 @@ class World:
         """
         if not self.moving:
             return self
-        return World([replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles])
+        return World(
+            [replace(obstacle, position=obstacle.position + seconds * obstacle.velocity) for obstacle in self.obstacles]
+        )
 
     @checked
     def seen_by(self, plane: Annotated[str, OneOf((SPACE, *PLANES))], offset: Finite | None = None) -> "World":
@@ -234,7 +236,7 @@ class World:
 
         Raises InputError if the outline of one depends on the height.
         """
-        return World([_prism(one) for one in self.obstacles])
+        return World([_prism(obstacle) for obstacle in self.obstacles])
 
     def distances(self, point: npt.ArrayLike) -> Array:
         """The signed distances in metres to each obstacle, (len(self),), of a point (2,) or (3,); negative inside.
@@ -243,9 +245,9 @@ class World:
         """
         x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
         return np.array([
-            hull_distance(self.table, ROW * i, np.array([x, y, z]), 0, 1, np.empty(3)) if one.kind == "mesh"
+            hull_distance(self.table, ROW * i, np.array([x, y, z]), 0, 1, np.empty(3)) if obstacle.kind == "mesh"
             else signed_distance(self.table, ROW * i, x, y, z)
-            for i, one in enumerate(self.obstacles)
+            for i, obstacle in enumerate(self.obstacles)
         ])  # fmt: skip
 
     def distance(self, points: npt.ArrayLike) -> Array:
