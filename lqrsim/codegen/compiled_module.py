@@ -105,8 +105,8 @@ class CompiledModule:
         def write(program: Program, scope: Scope) -> list[Type | None]:
             return [program.entry(scope.function(name), of, f"entry_{name}") for name, of in types.items()]
 
-        what = f"{' and '.join(list(types)[:2])} for {self.what}"
-        loaded, returns = self._load(what, repr(types), write, not types.keys().isdisjoint(LONG))
+        label = f"{' and '.join(list(types)[:2])} for {self.what}"
+        loaded, returns = self._load(label, repr(types), write, not types.keys().isdisjoint(LONG))
         pairs = zip(types.items(), returns, strict=True)
         return {name: Entry(of, loaded.address(f"entry_{name}"), kind) for (name, of), kind in pairs}
 
@@ -125,10 +125,10 @@ class CompiledModule:
         """Machine code of some functions, from disk or newly compiled, and the types that entries among them return."""
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
-        kept = disk.load(key)
-        if kept is not None and (found := _unpacked(*kept)) is not None:
-            self._loaded.append(found[0])
-            return found
+        stored = disk.load(key)
+        if stored is not None and (unpacked := _unpacked(*stored)) is not None:
+            self._loaded.append(unpacked[0])
+            return unpacked
         compilations.append(what)
         # It is a warning, because scripts show warnings without setting up logging: a long silence would be worse.
         log, timed = logger.warning if long else logger.debug, f"{what} on {instruction_set()[1]}"
@@ -233,8 +233,8 @@ class Call:
         elif layout.parts or isinstance(kind, Group):
             if not isinstance(argument, tuple) or len(argument) != len(layout.parts):
                 raise TypeError(f"got {type(argument).__name__}, want {layout.what}")
-            for part, one in zip(layout.parts, argument, strict=True):
-                self._lay(part, one, place)
+            for part, member in zip(layout.parts, argument, strict=True):
+                self._lay(part, member, place)
                 place += part.size
         elif kind is FLOAT:
             self._floats[place] = argument
@@ -298,7 +298,7 @@ def _encoded(returns: Type | None) -> Any:
     """The type of a result, for JSON."""
     if returns is None:
         return None
-    return [one.name for one in scalars(returns) if isinstance(one, Scalar)], isinstance(returns, Group)
+    return [scalar.name for scalar in scalars(returns) if isinstance(scalar, Scalar)], isinstance(returns, Group)
 
 
 def _decoded(known: Any) -> Type | None:
@@ -306,7 +306,7 @@ def _decoded(known: Any) -> Type | None:
     if known is None:
         return None
     names, several = known
-    kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
+    kinds = tuple({scalar.name: scalar for scalar in (FLOAT, INT, BOOL)}[name] for name in names)
     return Group(kinds) if several else kinds[0]
 
 

@@ -59,13 +59,13 @@ def load(name: str) -> tuple[bytes, dict[str, Any]] | None:
         header, _, contents = path.read_bytes().partition(b"\n")
     except OSError:
         return None
-    found = _object_of(header)
-    said = found.get("said", {})
-    if found.get("sha256") != sha256(json.dumps(said), contents):
+    header_fields = _object_of(header)
+    details = header_fields.get("said", {})
+    if header_fields.get("sha256") != sha256(json.dumps(details), contents):
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # marks it as used now
-    return contents, said
+    return contents, details
 
 
 def save(name: str, contents: bytes, what: str, **said: Any) -> None:
@@ -100,20 +100,20 @@ def _durations() -> dict[str, Any]:
 def _object_of(text: bytes) -> dict[str, Any]:
     """The object of a JSON text, such as the header in an item's first line; empty if it is damaged."""
     try:
-        found = json.loads(text[:_LONGEST])
+        fields = json.loads(text[:_LONGEST])
     except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return fields if isinstance(fields, dict) else {}
 
 
 def items() -> list[Item]:
     """All items, the most recently used first."""
-    found = []
+    cached = []
     for used, path, size in _files(_SUFFIX):
         with contextlib.suppress(OSError), path.open("rb") as file:
-            what = _object_of(file.readline(_LONGEST)).get("what", "damaged; will be made again")
-            found.append(Item(str(what), path, size, used))
-    return sorted(found, key=lambda item: -item.used)
+            description = _object_of(file.readline(_LONGEST)).get("what", "damaged; will be made again")
+            cached.append(Item(str(description), path, size, used))
+    return sorted(cached, key=lambda item: -item.used)
 
 
 def clear() -> int:
@@ -131,9 +131,9 @@ def _shrink() -> None:
 
     It opens no file: there may be tens of thousands.
     """
-    kept = _files(_SUFFIX)
-    total = sum(size for _, _, size in kept)
-    for _, path, size in sorted(kept) if total > LIMIT else ():
+    files = _files(_SUFFIX)
+    total = sum(size for _, _, size in files)
+    for _, path, size in sorted(files) if total > LIMIT else ():
         if total <= LIMIT:
             break
         path.unlink(missing_ok=True)
@@ -147,14 +147,14 @@ def _files(suffix: str = "", prefix: str = "") -> list[tuple[float, Path, int]]:
 
     Hidden files count only if their prefix is given. Empty for a folder that cannot be read.
     """
-    found = []
+    files = []
     with contextlib.suppress(OSError), os.scandir(folder()) as entries:
         for entry in entries:
             if entry.name.endswith(suffix) and entry.name.startswith(prefix) and (prefix or entry.name[0] != "."):
                 with contextlib.suppress(OSError):  # another process may have removed it
                     status = entry.stat()
-                    found.append((status.st_mtime, Path(entry.path), status.st_size))
-    return found
+                    files.append((status.st_mtime, Path(entry.path), status.st_size))
+    return files
 
 
 def _unfinished(age: float) -> list[Path]:

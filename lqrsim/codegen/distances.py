@@ -45,17 +45,17 @@ def hull_distances(
     Returns:
       The distances (..., H, O), and the derivatives (..., H, O, C, 3), for C corners of the largest hull.
     """
-    many, count, widest = places.shape[:-2], len(world_seen), max(hulls)
-    flat = np.zeros((int(np.prod(many)), places.shape[-2], 3))
+    batch, count, widest = places.shape[:-2], len(world_seen), max(hulls)
+    flat = np.zeros((int(np.prod(batch)), places.shape[-2], 3))
     flat[..., : places.shape[-1]] = places.reshape(-1, *places.shape[-2:])
     displaced = np.zeros((1, count, 3)) if displaced is None else displaced
-    rows, each = len(flat) * len(hulls) * count, max(1, len(flat) // len(displaced))
+    rows, per_displacement = len(flat) * len(hulls) * count, max(1, len(flat) // len(displaced))
     out, pulls = np.empty(rows), np.zeros((rows, 3 * widest))
     _distances().hull_distances(
-        count, len(flat), each, world_seen.table, np.cumsum([0, *hulls], dtype=np.float64),
+        count, len(flat), per_displacement, world_seen.table, np.cumsum([0, *hulls], dtype=np.float64),
         len(hulls), flat.reshape(len(flat), -1), np.ascontiguousarray(displaced).reshape(-1, 3), out, pulls,
     )  # fmt: skip
-    shape = (*many, len(hulls), count)
+    shape = (*batch, len(hulls), count)
     return out.reshape(shape), pulls.reshape(*shape, widest, 3)
 
 

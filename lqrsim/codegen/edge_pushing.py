@@ -50,9 +50,9 @@ class Operations:
         if not expression.args:
             return expression
         operation = expression.func(*[self.name(part) for part in expression.args])
-        found = self.step(operation) if isinstance(operation, sympy.Expr) else operation
-        self._names[expression] = found
-        return found
+        symbol = self.step(operation) if isinstance(operation, sympy.Expr) else operation
+        self._names[expression] = symbol
+        return symbol
 
     def step(self, operation: Any) -> Any:
         """The name of one operation, or of a sum or product of names as a whole."""
@@ -189,9 +189,9 @@ def jacobian_of(operations: Operations, results: Sequence[Any], variables: Seque
             slope = operations.name(without_kinks(operation.diff(a)))
             for j, inner in slopes[a].items():
                 terms[j].append(slope * inner)
-        found = {j: operations.name(sympy.Add(*parts)) for j, parts in terms.items()}
-        if found:
-            slopes[symbol] = {j: slope for j, slope in found.items() if slope != 0}
+        derivatives = {j: operations.name(sympy.Add(*parts)) for j, parts in terms.items()}
+        if derivatives:
+            slopes[symbol] = {j: slope for j, slope in derivatives.items() if slope != 0}
     return {
         (i, j): slope * result.diff(symbol)
         for i, result in enumerate(results)

@@ -87,16 +87,16 @@ def _parts(value: Any) -> Iterator[tuple[str, Any]]:
     elif isinstance(value, types.FunctionType):
         code = value.__code__
         yield from (("code", code.co_code), ("names", code.co_names), ("defaults", value.__defaults__))
-        yield from (("constant", one) for one in code.co_consts if not isinstance(one, types.CodeType))
+        yield from (("constant", constant) for constant in code.co_consts if not isinstance(constant, types.CodeType))
         yield from sorted((value.__kwdefaults__ or {}).items())
         for name, cell in zip(code.co_freevars, value.__closure__ or (), strict=True):
             with contextlib.suppress(ValueError):  # not yet assigned
                 yield name, cell.cell_contents
         yield from ((name, value.__globals__[name]) for name in code.co_names if name in value.__globals__)
     elif isinstance(value, Mapping):
-        yield from ((f"key {key}" if isinstance(key, str) else "key", one) for key, one in value.items())
+        yield from ((f"key {key}" if isinstance(key, str) else "key", entry) for key, entry in value.items())
     elif isinstance(value, list | tuple):
-        yield from (("item", one) for one in value)
+        yield from (("item", entry) for entry in value)
     elif not isinstance(value, type | types.ModuleType):
         if dataclasses.is_dataclass(value):
             yield from ((field.name, getattr(value, field.name, None)) for field in dataclasses.fields(value))
@@ -118,7 +118,7 @@ def _helpers(function: Any) -> list[Any]:
     seen: dict[int, Any] = {}
     for _ in _function(function, seen):
         pass
-    return [found for found in seen.values() if found is not function and hasattr(found, "py_func")]
+    return [helper for helper in seen.values() if helper is not function and hasattr(helper, "py_func")]
 
 
 _seen_fresh: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDictionary()
@@ -133,7 +133,7 @@ def note_helpers(function: Any) -> None:
 
 def stale(function: Any) -> bool:
     """Whether a helper may have been compiled with other values of its globals, which numba freezes."""
-    return any(one.overloads and _seen_fresh.get(one, "") != fingerprint(one) for one in _helpers(function))
+    return any(helper.overloads and _seen_fresh.get(helper, "") != fingerprint(helper) for helper in _helpers(function))
 
 
 def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:
@@ -181,11 +181,11 @@ def _names(code: types.CodeType) -> set[str]:
     texts = {constant for constant in code.co_consts if isinstance(constant, str)}
     if _REFUSED & set(code.co_names) or _UNCOVERED & (texts | set(code.co_names)):
         raise _NoFingerprint
-    found = set()
+    names = set()
     instructions = list(dis.get_instructions(code))
     for i, instruction in enumerate(instructions):
         if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-            found.add(instruction.argval)
+            names.add(instruction.argval)
         elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
             raise _NoFingerprint
         elif instruction.opname == "IMPORT_NAME":
@@ -194,8 +194,8 @@ def _names(code: types.CodeType) -> set[str]:
                 raise _NoFingerprint
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            found |= _names(constant)
-    return found
+            names |= _names(constant)
+    return names
 
 
 def _known(module: str) -> bool:

@@ -71,12 +71,12 @@ class JaxSteps(UserFunction):
         with in_double_precision():
             if what not in self._jitted:
                 self._jitted[what] = self._compiled(what)
-            found = np.asarray(self._jitted[what](packed))
-        outputs[0][...] = found[:, :n]
+            outcome = np.asarray(self._jitted[what](packed))
+        outputs[0][...] = outcome[:, :n]
         if what >= JACOBIANS:
-            outputs[1][...] = found[:, n : n + n * w]
+            outputs[1][...] = outcome[:, n : n + n * w]
         if what == HESSIANS:
-            outputs[2][...] += found[:, n + n * w :]
+            outputs[2][...] += outcome[:, n + n * w :]
 
     def _compiled(self, what: int) -> Callable[[Array], Any]:
         import jax
@@ -100,9 +100,9 @@ class JaxSteps(UserFunction):
             if what == STATES:
                 return step(z, h, p)
             jacobian, after = jax.jacfwd(lambda z: (step(z, h, p),) * 2, has_aux=True)(z)
-            found = [after, jacobian.ravel()]
+            results = [after, jacobian.ravel()]
             if what == HESSIANS:
-                found.append(jax.hessian(lambda z: weights @ step(z, h, p))(z).ravel())
-            return jnp.concatenate(found)
+                results.append(jax.hessian(lambda z: weights @ step(z, h, p))(z).ravel())
+            return jnp.concatenate(results)
 
         return jax.jit(jax.vmap(of_row))

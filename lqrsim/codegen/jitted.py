@@ -70,8 +70,8 @@ class JittedDerivatives(Jitted):
     def __call__(self, *given: Any) -> Any:
         count = len(self.shapes)
         with in_double_precision():
-            for array, found in zip(given[-count:], self._jitted(*given[:-count]), strict=True):
-                array[...] = found
+            for array, values in zip(given[-count:], self._jitted(*given[:-count]), strict=True):
+                array[...] = values
 
     def traced(self, *given: Any) -> tuple[Any, ...]:
         import jax

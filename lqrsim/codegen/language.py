@@ -138,7 +138,7 @@ def describe(kind: Type | None) -> str:
 def scalars(kind: Type) -> list[Scalar | Pointer | Pointers | StructArray | Struct]:
     """The parts of a type that are neither tuples nor records."""
     if isinstance(kind, Group):
-        return [one for member in kind.members for one in scalars(member)]
+        return [scalar for member in kind.members for scalar in scalars(member)]
     return [kind]
 
 

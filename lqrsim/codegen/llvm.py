@@ -89,10 +89,10 @@ class Loaded:
 
     def address(self, symbol: str) -> int:
         """The address of a function. Raises RuntimeError if no function has this name."""
-        found = self._engine.get_function_address(symbol)
-        if not found:
+        address = self._engine.get_function_address(symbol)
+        if not address:
             raise RuntimeError(f"the object file has no {symbol}")
-        return found
+        return address
 
 
 @cache
@@ -112,10 +112,10 @@ def _provide(name: str) -> None:
 @cache
 def _libraries() -> list[ctypes.CDLL]:
     names = ["ucrtbase", "msvcrt"] if os.name == "nt" else [ctypes.util.find_library("m"), None]
-    found = []
+    libraries = []
     for name in names:
         try:
-            found.append(ctypes.CDLL(name))
+            libraries.append(ctypes.CDLL(name))
         except OSError:
             continue
-    return found
+    return libraries

@@ -33,8 +33,8 @@ def plain_functions(
       functions: Python functions that kernels call by their index here, in place of an address.
       caller: if given, calls each kernel: `caller(kernel, run, arguments)`.
     """
-    scope, made = Scope(source, sizes), {}
-    return {name: _run(scope.function(name), _words(functions), made, caller) for name in names}
+    scope, plain = Scope(source, sizes), {}
+    return {name: _run(scope.function(name), _words(functions), plain, caller) for name in names}
 
 
 def _run(
@@ -70,7 +70,7 @@ def _run(
 def _compiled(node: ast.FunctionDef, what: str) -> tuple[CodeType, frozenset[str]]:
     """Python's code that defines a kernel, and the names in it."""
     module = ast.Module([_Plain().visit(ast.parse(ast.unparse(node)).body[0])], [])
-    names = frozenset(one.id for one in ast.walk(module) if isinstance(one, ast.Name))
+    names = frozenset(name.id for name in ast.walk(module) if isinstance(name, ast.Name))
     return compile(ast.fix_missing_locations(module), f"<{what}>", "exec"), names
 
 
@@ -127,23 +127,27 @@ def _quietly(function: Callable[[float], float]) -> Callable[[float], float]:
 
 
 def _taken_apart(arguments: Sequence[Any]) -> list[Any]:
-    return [part for one in arguments for part in (_taken_apart(one) if isinstance(one, tuple) else [one])]
+    return [
+        part
+        for argument in arguments
+        for part in (_taken_apart(argument) if isinstance(argument, tuple) else [argument])
+    ]
 
 
 def _c_call(returns: Any, address: float, arguments: Sequence[Any]) -> Any:
     """Call a C function; arrays are passed by their addresses."""
-    kinds, given = list[Any](), list[Any]()
-    for one in _taken_apart(arguments):
-        number = one.item() if isinstance(one, np.generic) else one
-        if isinstance(one, np.ndarray):
+    kinds, numbers = list[Any](), list[Any]()
+    for argument in _taken_apart(arguments):
+        number = argument.item() if isinstance(argument, np.generic) else argument
+        if isinstance(argument, np.ndarray):
             kinds.append(ctypes.c_void_p)
-            number = one.ctypes.data
-        elif isinstance(one, ctypes.c_int32):
+            number = argument.ctypes.data
+        elif isinstance(argument, ctypes.c_int32):
             kinds.append(ctypes.c_int32)
         else:
             kinds.append(ctypes.c_double if isinstance(number, float) else ctypes.c_int64)
-        given.append(number)
-    return ctypes.CFUNCTYPE(returns, *kinds)(int(address))(*given)
+        numbers.append(number)
+    return ctypes.CFUNCTYPE(returns, *kinds)(int(address))(*numbers)
 
 
 def _memory(address: float, kind: Any) -> Array:

@@ -153,12 +153,12 @@ class Program:
 
         A whole number that it returns becomes a float, such as the value of a formula that is 0: callers take a float.
         """
-        given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(_passed(function, types))]
+        given = [f"{llvm_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types))]
         kind, call, result = self._call_of(function, types)
         body = [f"  {call}", "  ret void"] if kind == "void" else [f"  %r = {call}", f"  ret {kind} %r"]
         if result is INT or result is BOOL:
-            convert, whole, kind = "sitofp" if result is INT else "uitofp", kind, "double"
-            body = [f"  %n = {call}", f"  %r = {convert} {whole} %n to double", "  ret double %r"]
+            convert, integer, kind = "sitofp" if result is INT else "uitofp", kind, "double"
+            body = [f"  %n = {call}", f"  %r = {convert} {integer} %n to double", "  ret double %r"]
         self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(given)}) #0 {{", *body, "}"]))
 
     def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> Type | None:
@@ -171,30 +171,30 @@ class Program:
         if not {FLOAT, INT, BOOL}.issuperset(returned):
             raise SubsetError(f"{where(function, function.node)}: got {describe(result)} returned, want numbers")
         lines, place = [], 0
-        for i, one in enumerate(_passed(function, types)):
-            if isinstance(one, Group):
+        for i, member in enumerate(_passed(function, types)):
+            if isinstance(member, Group):
                 lines.append(f"  %a{i} = getelementptr inbounds i64, ptr %words, i64 {place}")
             else:
-                loaded = "i64" if one is BOOL else llvm_type(one)
+                loaded = "i64" if member is BOOL else llvm_type(member)
                 lines += [
                     f"  %p{i} = getelementptr inbounds i64, ptr %words, i64 {place}",
-                    f"  %{'w' if one is BOOL else 'a'}{i} = load {loaded}, ptr %p{i}",
+                    f"  %{'w' if member is BOOL else 'a'}{i} = load {loaded}, ptr %p{i}",
                 ]
-                if one is BOOL:
+                if member is BOOL:
                     lines.append(f"  %a{i} = trunc i64 %w{i} to i1")
-            place += len(scalars(one))
+            place += len(scalars(member))
         lines.append(f"  {call}" if result is None else f"  %r = {call}")
-        for i, one in enumerate(returned):
+        for i, member in enumerate(returned):
             part = "%r"
             if isinstance(result, Group):
                 lines.append(f"  %o{i} = extractvalue {kind} %r, {i}")
                 part = f"%o{i}"
-            if one is BOOL:
+            if member is BOOL:
                 lines.append(f"  %z{i} = zext i1 {part} to i64")
                 part = f"%z{i}"
             lines += [
                 f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {place + i}",
-                f"  store {'i64' if one is BOOL else llvm_type(one)} {part}, ptr %q{i}",
+                f"  store {'i64' if member is BOOL else llvm_type(member)} {part}, ptr %q{i}",
             ]
         self._texts.append("\n".join([f"define void @{symbol}(ptr %words) #0 {{", *lines, "  ret void", "}"]))
         return result
@@ -203,7 +203,7 @@ class Program:
         """LLVM's type of a function's result, a call with the arguments %a0, %a1, ..., and the type of the result."""
         name, result = self.instance(function, types)
         kind = "void" if result is None else llvm_type(result)
-        given = ", ".join(f"{_passed_type(one)} %a{i}" for i, one in enumerate(_passed(function, types)))
+        given = ", ".join(f"{_passed_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types)))
         return kind, f"call {kind} {name}({given})", result
 
 
@@ -233,9 +233,9 @@ class _Body:
         self._left: set[str] = set()  # ends of loops that a break reaches
         self._own: set[str] = set()  # variables that may be or hold work arrays of this function
         self._constants: dict[str, Value] = {}  # arguments that keep their values
-        names = (one for one in ast.walk(function.node) if isinstance(one, ast.Name))
-        self._stores = Counter(one.id for one in names if isinstance(one.ctx, ast.Store))
-        self._local = {*self._stores, *(one.arg for one in function.node.args.args)}
+        names = (name for name in ast.walk(function.node) if isinstance(name, ast.Name))
+        self._stores = Counter(name.id for name in names if isinstance(name.ctx, ast.Store))
+        self._local = {*self._stores, *(argument.arg for argument in function.node.args.args)}
         self._now = Block("body", [])  # the block that is printed
         self._blocks = [self._now]
         self._fast = "contract" if "exact" in function.decorators else FAST
@@ -255,14 +255,14 @@ class _Body:
         if len(arguments.args) != len(self.types):
             self._refuse(self.function.node, f"{len(self.types)} arguments", str(len(arguments.args)))
         names = (f"%a{i}" for i in itertools.count())
-        for one, kind in zip(arguments.args, self.types, strict=True):
+        for argument, kind in zip(arguments.args, self.types, strict=True):
             record = (kind, Address(next(names))) if isinstance(kind, Group) and _by_address(self.function) else None
-            if one.arg in self._stores:
-                self._store(one.arg, self._get(*record) if record else _assemble(kind, names), one)
+            if argument.arg in self._stores:
+                self._store(argument.arg, self._get(*record) if record else _assemble(kind, names), argument)
             elif record:
-                self._names[one.arg] = record
+                self._names[argument.arg] = record
             else:
-                self._constants[one.arg] = _assemble(kind, names)
+                self._constants[argument.arg] = _assemble(kind, names)
         self._block(self.function.node.body)
         if not self._now.ended:
             if self.result is not None:
@@ -275,8 +275,8 @@ class _Body:
         """The IR."""
         given = ", ".join(
             # Records do not change: LLVM need not read their parts again.
-            f"ptr noalias readonly %a{i}" if isinstance(one, Group) else f"{llvm_type(one)} %a{i}"
-            for i, one in enumerate(_passed(self.function, self.types))
+            f"ptr noalias readonly %a{i}" if isinstance(kind, Group) else f"{llvm_type(kind)} %a{i}"
+            for i, kind in enumerate(_passed(self.function, self.types))
         )
         kind = "void" if self.result is None else llvm_type(self.result)
         decorators = self.function.decorators
@@ -433,18 +433,18 @@ class _Body:
         match node.targets, node.value:
             case [ast.Tuple(elts=each)], ast.Tuple(elts=parts) if len(each) == len(parts):
                 targets, values = [[target] for target in each], parts
-        found = [self._reference(one) for one in values]  # all of them, before any name changes
-        for group, one, value in zip(targets, values, found, strict=True):
-            if self._has_own(value, one):
+        results = [self._reference(expression) for expression in values]  # all of them, before any name changes
+        for group, expression, value in zip(targets, values, results, strict=True):
+            if self._has_own(value, expression):
                 self._own |= {name.id for target in group for name in ast.walk(target) if isinstance(name, ast.Name)}
             for target in group:
                 self._assign(target, value)
 
     def _has_own(self, value: Value, node: ast.expr) -> bool:
         """Whether a value may be or hold a work array of this function, which ends when the function returns."""
-        names = {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
+        names = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
         return bool(names & ({"stack", "zeros"} | self._own)) and any(
-            isinstance(one, Pointer | Pointers) for one in scalars(value.type)
+            isinstance(scalar, Pointer | Pointers) for scalar in scalars(value.type)
         )
 
     def _statement_AnnAssign(self, node: ast.AnnAssign) -> None:
@@ -475,8 +475,8 @@ class _Body:
             case ast.Tuple(elts=parts):
                 if not isinstance(value.type, Group) or len(parts) != len(value.parts):
                     self._refuse(target, f"{describe(value.type)} for {len(parts)} names", "as many values")
-                for one, part in zip(parts, value.parts, strict=True):
-                    self._assign(one, part)
+                for element, part in zip(parts, value.parts, strict=True):
+                    self._assign(element, part)
             case ast.Subscript() | ast.Attribute():
                 address = self._address(target)
                 self._do(f"store double {self._float(value, target)}, ptr {address}")
@@ -486,9 +486,9 @@ class _Body:
     def _address(self, target: ast.expr) -> str:
         """The address of an entry of an array or a field of a struct."""
         if isinstance(target, ast.Subscript):
-            found = self._entry(self._expression(target.value), target)
-            if isinstance(found, str):
-                return found
+            entry = self._entry(self._expression(target.value), target)
+            if isinstance(entry, str):
+                return entry
         elif isinstance(target, ast.Attribute):
             row = self._expression(target.value)
             if isinstance(row.type, Struct) and target.attr in row.type.fields:
@@ -571,7 +571,7 @@ class _Body:
                 pass
             case _:
                 self._refuse(node, f"`{ast.unparse(node).splitlines()[0]}`", "for NAME in range(...), without an else")
-        values = [self._expression(one) for one in given]
+        values = [self._expression(argument) for argument in given]
         numbers = [self._int(value, node) for value in values]
         start, stop, step = ("0", numbers[0], "1") if len(numbers) == 1 else (*numbers, "1")[:3]
         size = values[2].constant if len(values) == 3 else 1
@@ -634,17 +634,17 @@ class _Body:
             return self._get(*self._names[node.id])
         if node.id in self._constants:
             return self._constants[node.id]
-        found = self.scope.find(node.id)
+        meaning = self.scope.find(node.id)
         if node.id in self._local:
             self._refuse(node, f"the name {node.id}, which has no value yet", "a value assigned before")
-        if found is None:
+        if meaning is None:
             self._refuse(node, f"the name {node.id}, which is not defined", "a defined one")
-        if isinstance(found, ScopedFunction | Word | Record):
+        if isinstance(meaning, ScopedFunction | Word | Record):
             self._refuse(node, f"the function {node.id} as a value", "a call of it")
-        return _constant(found)
+        return _constant(meaning)
 
     def _expression_Tuple(self, node: ast.Tuple) -> Value:
-        return _group([self._expression(one) for one in node.elts])
+        return _group([self._expression(entry) for entry in node.elts])
 
     def _expression_Attribute(self, node: ast.Attribute) -> Value:
         part = self._part(node)
@@ -678,16 +678,16 @@ class _Body:
         return None
 
     def _expression_Subscript(self, node: ast.Subscript) -> Value:
-        found = self._entry(self._expression(node.value), node)
-        return Value(FLOAT, self._emit(f"load double, ptr {found}")) if isinstance(found, str) else found
+        entry = self._entry(self._expression(node.value), node)
+        return Value(FLOAT, self._emit(f"load double, ptr {entry}")) if isinstance(entry, str) else entry
 
     def _entry(self, base: Value, node: ast.Subscript) -> Value | str:
         """The part of a value at an index; the address of an array's entry."""
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        values = [self._expression(one) for one in indices]
-        if any(isinstance(one.constant, int) and one.constant < 0 for one in values):
+        values = [self._expression(index) for index in indices]
+        if any(isinstance(value.constant, int) and value.constant < 0 for value in values):
             self._refuse(node, "a negative index", "one from 0 on")
-        if not values or (not isinstance(base.type, Group) and any(one.type is BOOL for one in values)):
+        if not values or (not isinstance(base.type, Group) and any(value.type is BOOL for value in values)):
             self._refuse(node, f"`{ast.unparse(node)}`", "ints as indices")
         match base.type:
             case Pointer(block=block) if len(values) <= len(block) + 1:
@@ -761,17 +761,17 @@ class _Body:
             return self._whole(name, self._int(left, node), self._int(right, node))
         a, b = self._float(left, node), self._float(right, node)
         if name in ("floordiv", "mod"):
-            rest = self._emit(f"frem double {a}, {b}")
-            signs = [self._emit(f"fcmp olt double {one}, {_hex(0.0)}") for one in (rest, b)]
-            other = self._emit(f"xor i1 {signs[0]}, {signs[1]}")
-            there = self._emit(f"fcmp one double {rest}, {_hex(0.0)}")
-            down = self._emit(f"and i1 {other}, {there}")
+            remainder = self._emit(f"frem double {a}, {b}")
+            signs = [self._emit(f"fcmp olt double {number}, {_hex(0.0)}") for number in (remainder, b)]
+            unlike = self._emit(f"xor i1 {signs[0]}, {signs[1]}")
+            inexact = self._emit(f"fcmp one double {remainder}, {_hex(0.0)}")
+            down = self._emit(f"and i1 {unlike}, {inexact}")
             if name == "mod":
                 shift = self._emit(f"select i1 {down}, double {b}, double {_hex(0.0)}")
-                return Value(FLOAT, self._emit(f"fadd double {rest}, {shift}"))
-            whole = self._emit(f"fdiv double {self._emit(f'fsub double {a}, {rest}')}, {b}")
-            whole = self._emit(f"call double {self.program.library('llvm.rint.f64', 1)}(double {whole})")
-            return Value(FLOAT, self._emit(f"fsub double {whole}, {self._emit(f'uitofp i1 {down} to double')}"))
+                return Value(FLOAT, self._emit(f"fadd double {remainder}, {shift}"))
+            quotient = self._emit(f"fdiv double {self._emit(f'fsub double {a}, {remainder}')}, {b}")
+            quotient = self._emit(f"call double {self.program.library('llvm.rint.f64', 1)}(double {quotient})")
+            return Value(FLOAT, self._emit(f"fsub double {quotient}, {self._emit(f'uitofp i1 {down} to double')}"))
         return Value(FLOAT, self._emit(f"f{name} {self._fast} double {a}, {b}"))
 
     def _whole(self, name: str, a: str, b: str) -> Value:
@@ -780,13 +780,13 @@ class _Body:
             return Value(INT, self._emit(f"{name} nsw i64 {a}, {b}"))
         none = self._emit(f"icmp eq i64 {b}, 0")  # because a division by zero would end the process
         a, b = self._emit(f"select i1 {none}, i64 0, i64 {a}"), self._emit(f"select i1 {none}, i64 1, i64 {b}")
-        quotient, rest = self._emit(f"sdiv i64 {a}, {b}"), self._emit(f"srem i64 {a}, {b}")
+        quotient, remainder = self._emit(f"sdiv i64 {a}, {b}"), self._emit(f"srem i64 {a}, {b}")
         # Python rounds down, the processor towards zero.
-        signs = self._emit(f"icmp slt i64 {self._emit(f'xor i64 {rest}, {b}')}, 0")
-        down = self._emit(f"and i1 {signs}, {self._emit(f'icmp ne i64 {rest}, 0')}")
+        signs = self._emit(f"icmp slt i64 {self._emit(f'xor i64 {remainder}, {b}')}, 0")
+        down = self._emit(f"and i1 {signs}, {self._emit(f'icmp ne i64 {remainder}, 0')}")
         if name == "floordiv":
             return Value(INT, self._emit(f"sub nsw i64 {quotient}, {self._emit(f'zext i1 {down} to i64')}"))
-        return Value(INT, self._emit(f"add nsw i64 {rest}, {self._emit(f'select i1 {down}, i64 {b}, i64 0')}"))
+        return Value(INT, self._emit(f"add nsw i64 {remainder}, {self._emit(f'select i1 {down}, i64 {b}, i64 0')}"))
 
     def _power(self, base: Value, exponent: Value, node: ast.AST) -> Value:
         number = exponent.constant
@@ -809,13 +809,13 @@ class _Body:
         left, total = self._expression(node.left), None
         for op, comparator in zip(node.ops, node.comparators, strict=True):
             right = self._expression(comparator)
-            one = self._compare(op, left, right, node)
+            outcome = self._compare(op, left, right, node)
             if total is None:
-                total = one
-            elif total.constant is not None and one.constant is not None:
-                total = _constant(bool(total.constant) and bool(one.constant))
+                total = outcome
+            elif total.constant is not None and outcome.constant is not None:
+                total = _constant(bool(total.constant) and bool(outcome.constant))
             else:
-                total = Value(BOOL, self._emit(f"and i1 {total.name}, {one.name}"))
+                total = Value(BOOL, self._emit(f"and i1 {total.name}, {outcome.name}"))
             left = right
         assert total is not None
         return total
@@ -841,8 +841,8 @@ class _Body:
         """Evaluate operands until one decides; `of_bools` refuses non-bools, which are conditions but no values."""
         decides = isinstance(node.op, ast.Or)
         end, slot, pending = self._label(), "", False
-        for i, one in enumerate(node.values):
-            value = self._expression(one) if of_bools else self._condition(one)
+        for i, operand in enumerate(node.values):
+            value = self._expression(operand) if of_bools else self._condition(operand)
             if value.type is not BOOL:
                 self._refuse(node, f"{describe(value.type)} as a value of `{ast.unparse(node)}`", "a bool")
             last = i + 1 == len(node.values)
@@ -868,15 +868,15 @@ class _Body:
             return self._expression(node.body if test.constant else node.orelse)
         yes, no, end = self._label(), self._label(), self._label()
         self._branch(test, yes, no)
-        found = []
+        branches = []
         for label, branch in ((yes, node.body), (no, node.orelse)):
             self._begin(label)
-            found.append((self._expression(branch), self._now))
-        kind = join(found[0][0].type, found[1][0].type)
+            branches.append((self._expression(branch), self._now))
+        kind = join(branches[0][0].type, branches[1][0].type)
         if kind is None:
-            self._refuse(node, f"{describe(found[0][0].type)} or {describe(found[1][0].type)}", "one type")
+            self._refuse(node, f"{describe(branches[0][0].type)} or {describe(branches[1][0].type)}", "one type")
         slots = self._slots_of(kind)
-        for value, self._now in found:  # the common type is known only now
+        for value, self._now in branches:  # the common type is known only now
             self._put(slots, self._cast(value, kind, node))
             self._end(f"br label %{end}")
         self._begin(end)
@@ -894,28 +894,28 @@ class _Body:
         if not isinstance(node.func, ast.Name) or node.keywords:
             self._refuse(node, f"`{ast.unparse(node)}`", "a call by a bare name, of positional arguments")
         name = node.func.id
-        found = self.scope.find(name) if name not in self._local else None
-        by_address = isinstance(found, ScopedFunction) and _by_address(found)
-        given = [self._reference(one) if by_address else self._expression(one) for one in node.args]
-        match found:
+        meaning = self.scope.find(name) if name not in self._local else None
+        by_address = isinstance(meaning, ScopedFunction) and _by_address(meaning)
+        given = [self._reference(argument) if by_address else self._expression(argument) for argument in node.args]
+        match meaning:
             case ScopedFunction():
-                return self._call_kernel(found, given, node)
+                return self._call_kernel(meaning, given, node)
             case Record(name=record, fields=fields):
                 if len(given) != len(fields):
                     self._refuse(node, f"{len(given)} fields of {record}", str(len(fields)))
-                return Value(Group(tuple(one.type for one in given), record, fields), parts=tuple(given))
+                return Value(Group(tuple(value.type for value in given), record, fields), parts=tuple(given))
             case Word():
-                return self._call_word(found.name, given, node)
+                return self._call_word(meaning.name, given, node)
         self._refuse(node, f"a call of {name}", "a kernel, a record or a word of `codegen/language.py`")
 
     def _call_kernel(self, function: ScopedFunction, given: list[Value], node: ast.Call) -> Value | None:
         count = len(function.node.args.args)
         if len(given) != count:
             self._refuse(node, f"{len(given)} arguments for {function.node.name}", str(count))
-        symbol, result = self.program.instance(function, tuple(one.type for one in given))
+        symbol, result = self.program.instance(function, tuple(value.type for value in given))
         if _by_address(function):
-            given = [self._in_memory(one) if isinstance(one.type, Group) else one for one in given]
-        parts = [part for one in given for part in ([one] if _is_address(one) else _leaves(one))]
+            given = [self._in_memory(value) if isinstance(value.type, Group) else value for value in given]
+        parts = [part for value in given for part in ([value] if _is_address(value) else _leaves(value))]
         arguments = ", ".join(f"{_passed_type(part.type)} {part.name}" for part in parts)
         if result is None:
             self._do(f"call void {symbol}({arguments})")
@@ -949,7 +949,7 @@ class _Body:
         if name in UNARY or name in BINARY:
             library = UNARY.get(name) or BINARY[name]
             function = self.program.library(library, count)
-            numbers = ", ".join(f"double {self._float(one, node)}" for one in given)
+            numbers = ", ".join(f"double {self._float(value, node)}" for value in given)
             fast = f" {self._fast}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
             return Value(FLOAT, self._emit(f"call{fast} double {function}({numbers})"))
         if name in SCALES:
@@ -1004,7 +1004,7 @@ class _Body:
         return _constant(len(given[0].parts))
 
     def _word_stack(self, given: list[Value], node: ast.AST) -> Value:
-        shape = [one.constant for one in given if isinstance(one.constant, int) and one.constant >= 0]
+        shape = [size.constant for size in given if isinstance(size.constant, int) and size.constant >= 0]
         if not shape or len(shape) < len(given):
             self._refuse(node, f"`{ast.unparse(node)}`", "constant sizes")
         total = math.prod(shape)
@@ -1014,7 +1014,7 @@ class _Body:
 
     def _word_zeros(self, given: list[Value], node: ast.Call) -> Value:
         value = self._word_stack(given, node)
-        size = 8 * math.prod(one.constant for one in given)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        size = 8 * math.prod(size.constant for size in given)  # pyright: ignore[reportArgumentType, reportCallIssue]
         memset = self.program.declare("llvm.memset.p0.i64", "void", "ptr, i8, i64, i1")
         self._do(f"call void {memset}(ptr align 64 {value.name}, i8 0, i64 {size}, i1 false)")
         return value
@@ -1046,9 +1046,9 @@ class _Body:
 
     def _c_call(self, kind: str, given: list[Value], node: ast.AST) -> str:
         function = self._pointer(given[0], node)
-        parts = [part for one in given[1:] for part in _leaves(one)]
+        parts = [part for value in given[1:] for part in _leaves(value)]
         parts = [self._cast(part, INT, node) if part.type is BOOL else part for part in parts]
-        return f"call {kind} {function}({', '.join(f'{llvm_type(one.type)} {one.name}' for one in parts)})"
+        return f"call {kind} {function}({', '.join(f'{llvm_type(part.type)} {part.name}' for part in parts)})"
 
     def _word_call(self, given: list[Value], node: ast.AST) -> None:
         self._do(self._c_call("void", given, node))
@@ -1094,7 +1094,7 @@ def _constant(number: Constant) -> Value:
         return Value(INT, str(number), constant=number)
     if isinstance(number, float):
         return Value(FLOAT, _hex(number), constant=number)
-    return _group([_constant(one) for one in number])
+    return _group([_constant(entry) for entry in number])
 
 
 def _group(parts: list[Value]) -> Value:
@@ -1110,7 +1110,7 @@ def _by_address(function: ScopedFunction) -> bool:
 
 def _passed(function: ScopedFunction, types: tuple[Type, ...]) -> list[Type]:
     """The types that a function takes in LLVM: records, if by address, and parts of records otherwise."""
-    return list(types) if _by_address(function) else [one for kind in types for one in scalars(kind)]
+    return list(types) if _by_address(function) else [scalar for kind in types for scalar in scalars(kind)]
 
 
 def _passed_type(kind: Type) -> str:

@@ -66,9 +66,9 @@ class Source:
     @functools.cached_property
     def digest(self) -> str:
         """A hash of everything that defines the source."""
-        filled = (f"{name}={source.digest}.{there}" for name, source, there in self.fills)
-        own = _text_of(self.module) if self.module else ""
-        return sha256(self.module, own, self.text, repr(self.constants), *filled)
+        filled = (f"{name}={source.digest}.{inner_name}" for name, source, inner_name in self.fills)
+        text = _text_of(self.module) if self.module else ""
+        return sha256(self.module, text, self.text, repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
         """This source with functions filled in: name -> source, or (source, name there).
@@ -76,7 +76,7 @@ class Source:
         A function can be filled in if the module defines it, or if the module, or one that it imports from, imports it
         from `declarations.py`, where it is empty: there stands which files have the real one.
         """
-        pairs = {name: one if isinstance(one, tuple) else (one, name) for name, one in fills.items()}
+        pairs = {name: fill if isinstance(fill, tuple) else (fill, name) for name, fill in fills.items()}
         kept = tuple(fill for fill in self.fills if fill[0] not in pairs)
         return Source(
             self.module, self.text, self.constants, (*kept, *((name, *pair) for name, pair in pairs.items())), self.what
@@ -137,11 +137,11 @@ def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
         return f"got {excerpt(source)}, which is not valid Python ({error}), want function definitions"
     defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     for name, count in functions:
-        found = defined.get(name)
-        if found is None:
+        definition = defined.get(name)
+        if definition is None:
             return f"got {excerpt(source)}, which does not define {name}(...), want it to"
-        if len(found.args.args) != count:
-            return f"got {name}(...) with {len(found.args.args)} arguments, want {count}"
+        if len(definition.args.args) != count:
+            return f"got {name}(...) with {len(definition.args.args)} arguments, want {count}"
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like need none"
@@ -160,7 +160,7 @@ class ScopedFunction:
     @property
     def decorators(self) -> set[str]:
         """The names of the decorators: `inline`, `outline`, `exact`."""
-        return {one.id for one in self.node.decorator_list if isinstance(one, ast.Name)}
+        return {decorator.id for decorator in self.node.decorator_list if isinstance(decorator, ast.Name)}
 
 
 @dataclass(frozen=True)
@@ -198,32 +198,32 @@ class Scope:
         parsed = _parsed_module(source.module) if source.module else _parse(source.text)
         self._functions, self._imports = parsed.functions, parsed.imports
         self._constants = dict(source.constants)
-        self._fills = {name: (filled, there) for name, filled, there in source.fills}
+        self._fills = {name: (filled, inner_name) for name, filled, inner_name in source.fills}
         self._scopes: dict[Source, Scope] = {}
         self._found: dict[str, Meaning] = {}
 
     def find(self, name: str) -> Meaning | None:
         """The meaning of a name; None if it is not defined."""
         if name not in self._found:
-            found = self._find(name)
-            if found is None:
+            meaning = self._find(name)
+            if meaning is None:
                 return None
-            self._found[name] = found
+            self._found[name] = meaning
         return self._found[name]
 
     def function(self, name: str) -> ScopedFunction:
         """The function of that name. Raises SubsetError if there is none."""
-        found = self.find(name)
-        if not isinstance(found, ScopedFunction):
+        meaning = self.find(name)
+        if not isinstance(meaning, ScopedFunction):
             raise SubsetError(f"{self.source.what}: got no function {name}, want it defined")
-        return found
+        return meaning
 
     def _find(self, name: str) -> Meaning | None:
         if name in self._constants:
             return self._constants[name]
         if name in self._fills:
-            source, there = self._fills[name]
-            return self._scope_of(source).function(there)
+            source, inner_name = self._fills[name]
+            return self._scope_of(source).function(inner_name)
         if name in self._functions:
             return ScopedFunction(self, self._functions[name])
         if name in self._imports:
@@ -232,8 +232,8 @@ class Scope:
             value = getattr(_imported(self.source.module), name, None)
             if _is_constant(value):
                 return value
-        elif (found := self._at_hand(name)) is not None:
-            return found
+        elif (meaning := self._at_hand(name)) is not None:
+            return meaning
         return Word(name) if name in PYTHON else None
 
     def _imported(self, module: str, name: str) -> Meaning | None:
@@ -253,8 +253,8 @@ class Scope:
         if name in WORDS:
             return Word(name)
         if name in self._fills:
-            source, there = self._fills[name]
-            return self._scope_of(source).function(there)
+            source, inner_name = self._fills[name]
+            return self._scope_of(source).function(inner_name)
         value = getattr(declarations, name, None)
         return value if _is_constant(value) else None
 
@@ -274,15 +274,15 @@ class Scope:
 
     def _scope_of(self, source: Source) -> "Scope":
         if source not in self._scopes:
-            made = Scope(source, self.sizes)
-            made._scopes = self._scopes  # one scope per source in a program
-            self._scopes[source] = made
+            scope = Scope(source, self.sizes)
+            scope._scopes = self._scopes  # one scope per source in a program
+            self._scopes[source] = scope
         return self._scopes[source]
 
 
 def _is_constant(value: object) -> bool:
     if isinstance(value, tuple):
-        return all(_is_constant(one) for one in value)
+        return all(_is_constant(entry) for entry in value)
     return isinstance(value, bool | int | float)
 
 
@@ -337,7 +337,9 @@ def _parse(text: str) -> _Parsed:
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             functions[node.name] = node
-            texts += lines[min([node.lineno, *(one.lineno for one in node.decorator_list)]) - 1 : node.end_lineno]
+            texts += lines[
+                min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)]) - 1 : node.end_lineno
+            ]
         elif isinstance(node, ast.ImportFrom):
-            imports |= {one.asname or one.name: (str(node.module), one.name) for one in node.names}
+            imports |= {alias.asname or alias.name: (str(node.module), alias.name) for alias in node.names}
     return _Parsed(functions, imports, "\n".join(texts))

@@ -35,9 +35,9 @@ class Vector(tuple[Any, ...]):
     names: tuple[str, ...]
 
     def __new__(cls, symbols: Iterable[Any], names: Sequence[str]) -> "Vector":
-        made = super().__new__(cls, symbols)
-        made.names = tuple(names)
-        return made
+        vector = super().__new__(cls, symbols)
+        vector.names = tuple(names)
+        return vector
 
     def __getattribute__(self, name: str) -> Any:  # names come first: a state may be called `count`
         names = super().__getattribute__("__dict__").get("names", ())
@@ -49,8 +49,8 @@ class Vector(tuple[Any, ...]):
         check_name("name", name, self.names)
 
     def __getitem__(self, place: Any) -> Any:
-        found = super().__getitem__(place)
-        return Vector(found, self.__dict__["names"][place]) if isinstance(place, slice) else found
+        entries = super().__getitem__(place)
+        return Vector(entries, self.__dict__["names"][place]) if isinstance(place, slice) else entries
 
 
 def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]:
@@ -84,13 +84,15 @@ def kept(
     stored = disk_cache.load(key)
     if stored is not None:
         with contextlib.suppress(ValueError, RecursionError):
-            found = json.loads(stored[0])
-            if isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items()):
-                return found
-    made = make()
+            stored_values = json.loads(stored[0])
+            if isinstance(stored_values, dict) and all(
+                isinstance(stored_values.get(name), kind) for name, kind in kinds.items()
+            ):
+                return stored_values
+    values = make()
     name = getattr(function, "__qualname__", repr(function))
-    disk_cache.save(key, json.dumps(made).encode(), f"derivatives of {name}(x, u, p)")
-    return made
+    disk_cache.save(key, json.dumps(values).encode(), f"derivatives of {name}(x, u, p)")
+    return values
 
 
 @functools.cache
@@ -185,17 +187,20 @@ def _unsorted_extremes() -> Iterator[None]:
     from sympy.functions.elementary.miscellaneous import MinMaxBase
 
     def keep(cls: Any, *given: Any, **options: Any) -> Any:
-        if any(getattr(one, "free_symbols", ()) for one in given):
-            options, given = {"evaluate": False} | options, tuple(one for one in given if one != cls.identity)
-        return made(cls, *given, **options)
+        if any(getattr(argument, "free_symbols", ()) for argument in given):
+            options, given = (
+                {"evaluate": False} | options,
+                tuple(argument for argument in given if argument != cls.identity),
+            )
+        return original(cls, *given, **options)
 
     with _TRACING:
-        made = MinMaxBase.__new__
+        original = MinMaxBase.__new__
         MinMaxBase.__new__ = keep
         try:
             yield
         finally:
-            MinMaxBase.__new__ = made
+            MinMaxBase.__new__ = original
 
 
 @functools.cache
@@ -212,14 +217,14 @@ def own_functions() -> SimpleNamespace:
 
         @classmethod
         def eval(cls, *args: Any) -> Any:
-            condition, one, other = args
+            condition, chosen, otherwise = args
             if condition in (True, False):
-                return one if condition else other
-            return one if one == other else None
+                return chosen if condition else otherwise
+            return chosen if chosen == otherwise else None
 
         def _eval_derivative(self: Any, s: Any) -> Any:
-            condition, one, other = self.args
-            return choice(condition, one.diff(s), other.diff(s))
+            condition, chosen, otherwise = self.args
+            return choice(condition, chosen.diff(s), otherwise.diff(s))
 
     class max(sympy.Function):
         def _eval_derivative(self: Any, s: Any) -> Any:
@@ -272,16 +277,16 @@ def _rules() -> dict[Any, Callable[..., Any]]:
 
 def without_kinks(expression: Any) -> Any:
     """The expression with `own_functions` in the place of SymPy's with kinks and jumps."""
-    rules, made = _rules(), {}
+    rules, rewritten = _rules(), {}
     if not expression.has(*rules):
         return expression
 
     def remade(part: Any) -> Any:
-        if part not in made:
-            parts = [remade(one) for one in part.args]
-            known = rules.get(part.func) or (part.func if parts != list(part.args) else lambda *_: part)
-            made[part] = known(*parts)
-        return made[part]
+        if part not in rewritten:
+            parts = [remade(argument) for argument in part.args]
+            rebuild = rules.get(part.func) or (part.func if parts != list(part.args) else lambda *_: part)
+            rewritten[part] = rebuild(*parts)
+        return rewritten[part]
 
     return remade(expression)
 
@@ -317,8 +322,8 @@ def write_function(
             return super()._print_Function(expr)  # pyright: ignore[reportAttributeAccessIssue]
 
         def _print_choice(self, expr: Any) -> str:
-            condition, one, other = map(self._print, expr.args)
-            return f"({one} if {condition} else {other})"
+            condition, chosen, otherwise = map(self._print, expr.args)
+            return f"({chosen} if {condition} else {otherwise})"
 
         def _print_Pow(self, expr: Any, rational: bool = False) -> str:
             base, exponent = expr.args

@@ -253,16 +253,16 @@ class UserFunction:
 
             def write() -> None:
                 p = parameters_class(self.parameters)(*view(data, end)[self.offset :].tolist())
-                found = self._values(self.function, view(x, self.states), view(u, self.controls), p)
-                for array, values in zip(arrays, found, strict=True):
+                results = self._values(self.function, view(x, self.states), view(u, self.controls), p)
+                for array, values in zip(arrays, results, strict=True):
                     array[:] = values.reshape(-1)
 
             self._guarded(write, arrays)
 
-        held = prototype(callback)
-        address = ctypes.cast(held, ctypes.c_void_p).value
+        pointer = prototype(callback)
+        address = ctypes.cast(pointer, ctypes.c_void_p).value
         assert address is not None
-        return held, address
+        return pointer, address
 
     def _guarded(self, write: Callable[[], None], outputs: Sequence[Array]) -> None:
         """Let a callback write its outputs. After an exception they are NaN, and the solver checks `raised`."""
@@ -301,9 +301,9 @@ class UserFunction:
         key = disk.key(*parts, own) if own else ""
         if key in _loaded:
             return _loaded[key]
-        kept = disk.load(key) if key else None
-        found = _unpacked(*kept) if kept is not None else None
-        if found is None:
+        stored = disk.load(key) if key else None
+        compiled = _unpacked(*stored) if stored is not None else None
+        if compiled is None:
             note_helpers(function)
             # numba compiled helpers with their globals at that time. If these have changed, the result is not cached.
             lasting = bool(key) and not stale(function)
@@ -317,18 +317,18 @@ class UserFunction:
                 again = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
                 namespace = _numba_names() | {"function": again, "nan": float("nan"), "Parameters": parameters}
                 exec(compile(adapter, "<lqrsim>", "exec"), namespace)
-                made: Any = numba.cfunc(numba.types.void(*pointers), **_OPTIONS)(namespace["adapter"])
+                adapted: Any = numba.cfunc(numba.types.void(*pointers), **_OPTIONS)(namespace["adapter"])
             except Exception as error:  # mostly NumbaError, but numba also raises others
                 raise InputError(f"{self.name}: got code that numba cannot compile, want {_reason(error)}") from error
-            found = made, made.address
-            text = made.inspect_llvm()
+            compiled = adapted, adapted.address
+            text = adapted.inspect_llvm()
             if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
-                code, needed = object_code_of_one(text, made.native_name, _SYMBOL)
+                code, needed = object_code_of_one(text, adapted.native_name, _SYMBOL)
                 disk.save(key, code, self.name, needed=needed)
-                found = _unpacked(code, {"needed": needed}) or found
+                compiled = _unpacked(code, {"needed": needed}) or compiled
         if key:
-            _loaded[key] = found
-        return found
+            _loaded[key] = compiled
+        return compiled
 
     def _adapter(self) -> str:
         """Source of `adapter`, which numba compiles around `function`."""

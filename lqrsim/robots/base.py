@@ -111,11 +111,11 @@ def indices_in(robot: Robot, model: "mujoco.MjModel") -> tuple[Indices, Indices,
         [model.actuator(name).id for name in robot.actuators],
     )
     spans = (
-        [(one.qposadr[0], one.qpos0.size) for one in joints],
-        [(one.dofadr[0], one.damping.size) for one in joints],
+        [(joint.qposadr[0], joint.qpos0.size) for joint in joints],
+        [(joint.dofadr[0], joint.damping.size) for joint in joints],
         [(model.actuator_ctrladr[i], model.actuator_ctrlnum[i]) for i in actuators],
     )
     qpos, qvel, ctrl = (
-        np.array([at for first, size in each for at in range(first, first + size)], dtype=np.intp) for each in spans
+        np.array([at for first, size in span for at in range(first, first + size)], dtype=np.intp) for span in spans
     )
     return qpos, qvel, ctrl

@@ -73,13 +73,15 @@ class ForceLimits(Constraint):
 
     def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
         self.limits, self.later = tuple(limits), later
-        self._slopes = np.stack([one.slopes for one in self.limits]) if self.limits else np.zeros((0, 1))
+        self._slopes = np.stack([limit.slopes for limit in self.limits]) if self.limits else np.zeros((0, 1))
         # Less than what is spared, so that forces of such a plan are within their limits.
-        self._rough = 0.5 * SPARED * min((one.high - one.low for one in self.limits), default=0.0)
+        self._rough = 0.5 * SPARED * min((limit.high - limit.low for limit in self.limits), default=0.0)
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
-        actuators, joints = (tuple(one.id for one in self.limits if one.of_joint is joint) for joint in (False, True))
+        actuators, joints = (
+            tuple(limit.id for limit in self.limits if limit.of_joint is joint) for joint in (False, True)
+        )
         return dynamics.stating(unlimited=(actuators, joints))
 
     def within(self, dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> "ForceLimits":
@@ -92,8 +94,8 @@ class ForceLimits(Constraint):
         by_state, by_control = np.split(self._slopes[:, 1:], [len(x)], axis=1)
         forces = [np.zeros((0, 1 + len(x) + len(u)))]
         for _ in range(1, count):
-            own, pushed, rest = dynamics.linearize(state, u, dynamics.period)
-            state, a, b = own @ state + pushed @ u + rest, own @ a, own @ b + pushed
+            by_itself, pushed, offset = dynamics.linearize(state, u, dynamics.period)
+            state, a, b = by_itself @ state + pushed @ u + offset, by_itself @ a, by_itself @ b + pushed
             at_zero = self._slopes[:, :1] + (by_state @ (state - a @ x - b @ u))[:, None]
             forces.append(np.hstack([at_zero, by_state @ a, by_state @ b + by_control]))
         return np.concatenate(forces)
@@ -107,40 +109,42 @@ class ForceLimits(Constraint):
         def wide(slopes: Array) -> Array:
             return np.insert(slopes, [slopes.shape[-1] - controls] * count, 0.0, axis=-1)
 
-        limits = [one._replace(slopes=wide(one.slopes)) for one in self.limits]
+        limits = [limit._replace(slopes=wide(limit.slopes)) for limit in self.limits]
         return ForceLimits(limits, None if self.later is None else wide(self.later))
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
         own, n, m = dynamics.calling, len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         assert isinstance(own, MjcfDynamics)
         if more := n - len(own.state_coordinates):
-            limits = [one._replace(slopes=np.delete(one.slopes, np.s_[1 + n - more : 1 + n])) for one in self.limits]
+            limits = [
+                limit._replace(slopes=np.delete(limit.slopes, np.s_[1 + n - more : 1 + n])) for limit in self.limits
+            ]
             narrow = ForceLimits(limits)._refined(own, replace(plan, states=plan.states[:, : n - more]))
             return None if narrow is None else narrow._widened(m, more)
         dynamics = own
         count, pairs = round(plan.dt / dynamics.period), zip(plan.states, plan.controls, strict=False)
         later = np.stack([self._ahead(dynamics, x, u, count) for x, u in pairs])
         forces = later[..., 0] + np.einsum("tki,ti->tk", later[..., 1:], np.hstack([plan.states[:-1], plan.controls]))
-        low, high = (np.tile([getattr(one, side) for one in self.limits], count - 1) for side in ("low", "high"))
+        low, high = (np.tile([getattr(limit, side) for limit in self.limits], count - 1) for side in ("low", "high"))
         return ForceLimits(self.limits, later) if ((forces < low) | (forces > high)).any() else None
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        for one in self.limits:
-            if len(one.slopes) != 1 + n + m:
-                got = f"forces of {len(one.slopes) - 1} states and controls"
+        for limit in self.limits:
+            if len(limit.slopes) != 1 + n + m:
+                got = f"forces of {len(limit.slopes) - 1} states and controls"
                 raise InputError(f"ForceLimits: got {got}, want {n + m}, as the dynamics have")
         later = np.zeros((1, 0, 1 + n + m)) if self.later is None else self.later
         first = np.broadcast_to(self._slopes, (len(later), *self._slopes.shape))
         table = np.concatenate([first, later], axis=1)
         limits, described = self.limits * (table.shape[1] // len(self.limits)), []
         for side, word in (("low", "at least"), ("high", "at most")):
-            described += [f"the force {one.name} of {word} {getattr(one, side):g} {one.unit}" for one in limits]
-        names = tuple(f"{one.name} {side}" for side in ("low", "high") for one in limits)
+            described += [f"the force {limit.name} of {word} {getattr(limit, side):g} {limit.unit}" for limit in limits]
+        names = tuple(f"{limit.name} {side}" for side in ("low", "high") for limit in limits)
         low, high = (table.copy(), -table)
-        ranges = np.array([one.high - one.low for one in limits])
-        low[..., 0] -= [one.low for one in limits] + SPARED * ranges
-        high[..., 0] += [one.high for one in limits] - SPARED * ranges
+        ranges = np.array([limit.high - limit.low for limit in limits])
+        low[..., 0] -= [limit.low for limit in limits] + SPARED * ranges
+        high[..., 0] += [limit.high for limit in limits] - SPARED * ranges
         rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
@@ -156,16 +160,16 @@ def limited_forces(mjcf: MjcfModel) -> tuple[tuple[ForceLimit, ...], tuple[str, 
     model = without_limits(mjcf.model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
     data, nv, n = mujoco.MjData(model), model.nv, 2 * model.nv + model.na
-    units = {one.name: "N m" if one.kind == "hinge" else "N" for one in mjcf.joints}
+    units = {joint.name: "N m" if joint.kind == "hinge" else "N" for joint in mjcf.joints}
     limited = [
-        (f"of {one.name}", units.get(one.joint or "", "N"), one.forces, one.outputs.start, False, i)
-        for i, one in enumerate(mjcf.actuators)
+        (f"of {actuator.name}", units.get(actuator.joint or "", "N"), actuator.forces, actuator.outputs.start, False, i)
+        for i, actuator in enumerate(mjcf.actuators)
     ]
     limited += [
-        (f"on {one.name}", units[one.name], one.forces, model.nout + one.dof, True, i)
-        for i, one in enumerate(mjcf.joints)
+        (f"on {joint.name}", units[joint.name], joint.forces, model.nout + joint.dof, True, i)
+        for i, joint in enumerate(mjcf.joints)
     ]
-    limited = [one for one in limited if np.isfinite(one[2]).any()]
+    limited = [force for force in limited if np.isfinite(force[2]).any()]
     if not limited:
         return (), ()
 
@@ -178,7 +182,7 @@ def limited_forces(mjcf: MjcfModel) -> tuple[tuple[ForceLimit, ...], tuple[str, 
         return np.concatenate([data.actuator_force, data.qfrc_actuator])
 
     with unlogged():
-        slopes = np.stack([(forces(one) - forces(-one)) / 2 for one in np.eye(n + model.nu)])
+        slopes = np.stack([(forces(axis) - forces(-axis)) / 2 for axis in np.eye(n + model.nu)])
         zero, linear = forces(np.zeros(n + model.nu)), np.ones(slopes.shape[1], dtype=bool)
         for z in np.random.default_rng(0).normal(size=(_PROBES, n + model.nu)):
             size = np.abs(zero) + np.abs(z) @ np.abs(slopes)

@@ -120,11 +120,11 @@ class MjcfRobot(Robot):
         turns_about: Annotated[str, OneOf(AXES)] | None = None,
         mocap: str | None = None,
     ) -> None:
-        given = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
-        self.name, who = given.name, f"MjcfRobot {given.name}"
-        if given.turns_about != turns_about:
-            given = replace(given, turns_about=turns_about)
-        mjcf = given.complete() if mocap is None else given.complete().with_mocap(mocap, who)
+        stated = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
+        self.name, who = stated.name, f"MjcfRobot {stated.name}"
+        if stated.turns_about != turns_about:
+            stated = replace(stated, turns_about=turns_about)
+        mjcf = stated.complete() if mocap is None else stated.complete().with_mocap(mocap, who)
         model, number = mjcf.model, mjcf.body_of(body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
         default = in_the_way(model, candidates, number, floors=floors)
@@ -136,36 +136,37 @@ class MjcfRobot(Robot):
             "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
         }  # fmt: skip
         self.body = model.body(number).name
-        self.joints = tuple(one.name for one in mjcf.joints)
-        self.actuators = tuple(one.name for one in mjcf.actuators)
+        self.joints = tuple(joint.name for joint in mjcf.joints)
+        self.actuators = tuple(actuator.name for actuator in mjcf.actuators)
         self.activations = len(mjcf.activations)
         names, units = zip(*mjcf.states, strict=True)
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
-        rotations = tuple(one.dof + turned[one.kind] for one in mjcf.joints if one.kind in turned)
+        rotations = tuple(joint.dof + turned[joint.kind] for joint in mjcf.joints if joint.kind in turned)
         if turns_about is not None and not rotations:
             raise InputError(f"{who}: turns_about: got {turns_about!r} without a free or ball joint, want None")
         turns = [] if turns_about is None else [first + AXES.index(turns_about) for first in rotations]
         self._axes = position_of(mjcf, number)
         place, plane = self._position(position, names, who)
-        ends = {one.dof: one.limits for one in mjcf.joints if one.limits is not None}
+        ends = {joint.dof: joint.limits for joint in mjcf.joints if joint.limits is not None}
         low, high = zip(*(ends.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
         states = Coordinates(
             names=names, units=units, position=place, plane=plane, low=low, high=high, rotation_vectors=rotations,
-            angles=(*(one.dof for one in mjcf.joints if one.kind == "hinge" and one.limits is None), *turns),
+            angles=(*(joint.dof for joint in mjcf.joints if joint.kind == "hinge" and joint.limits is None), *turns),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
             mjcf, who, body=number, obstacles=tuple(geoms), states=states,
             controls=Coordinates(
-                names=tuple(one.name for one in mjcf.controls) or ("none",),
-                units=tuple(one.unit for one in mjcf.controls) or ("",),
-                low=tuple(one.low for one in mjcf.controls), high=tuple(one.high for one in mjcf.controls),
+                names=tuple(control.name for control in mjcf.controls) or ("none",),
+                units=tuple(control.unit for control in mjcf.controls) or ("",),
+                low=tuple(control.low for control in mjcf.controls),
+                high=tuple(control.high for control in mjcf.controls),
             ),
         )  # fmt: skip
         reach = reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
-        found = outline_of(model)
-        many = not place and len(found.radii) > 0 if outline is None else outline
-        self.balls = MjcfBalls(found, mjcf) if many else None
+        outline_balls = outline_of(model)
+        many = not place and len(outline_balls.radii) > 0 if outline is None else outline
+        self.balls = MjcfBalls(outline_balls, mjcf) if many else None
 
     @cached_property
     def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -180,29 +181,29 @@ class MjcfRobot(Robot):
         stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
         other = MjcfRobot(copy, **stated)
         # Their places in the compiled model, which differ in the last bits.
-        each = zip(other.scene.world.obstacles, world.obstacles, strict=True)
-        there = World([replace(own, velocity=one.velocity) for own, one in each])
-        return shape_in(other.dynamics, there, geoms=other.geoms)
+        pairs = zip(other.scene.world.obstacles, world.obstacles, strict=True)
+        moved = World([replace(own, velocity=obstacle.velocity) for own, obstacle in pairs])
+        return shape_in(other.dynamics, moved, geoms=other.geoms)
 
     def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
         axes = self._axes
         if asked is None:
-            found = sorted(axes.of, key=lambda dof: axes.of[dof])
-            reached = {axes.of[dof] for dof in found}
+            dofs = sorted(axes.of, key=lambda dof: axes.of[dof])
+            reached = {axes.of[dof] for dof in dofs}
             # A plane is a position only if nothing moves the body out of it.
-            if len(reached) < len(found) or len(found) < max(sum(axes.moving), 2):
+            if len(reached) < len(dofs) or len(dofs) < max(sum(axes.moving), 2):
                 return (), ""
         else:
             listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
-            found = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
-        plane = "".join(AXES[axes.of[dof]] for dof in found if dof in axes.of)
-        if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
-            got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes.of) or "none"
+            dofs = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
+        plane = "".join(AXES[axes.of[dof]] for dof in dofs if dof in axes.of)
+        if dofs and (len(plane) != len(dofs) or len(set(plane)) < len(plane)):
+            got, among = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes.of) or "none"
             raise InputError(
                 f"{who}: position: got {got}, want 2 or 3 that are the position of the body {self.body!r},"
-                f" among: {told}" + "".join(f"; {line}" for line in self._shifted(names))
+                f" among: {among}" + "".join(f"; {line}" for line in self._shifted(names))
             )
-        return tuple(found), plane if len(found) == 2 else ""
+        return tuple(dofs), plane if len(dofs) == 2 else ""
 
     def _shifted(self, names: tuple[str, ...]) -> list[str]:
         """Of each slide that moves the body along an axis, but from another zero: what makes it part of a position."""
@@ -242,13 +243,13 @@ class MjcfRobot(Robot):
         MuJoCo does not let bodies collide that are fixed to each other, parent and child, or in an `<exclude>` of the
         MJCF. Links that touch in every position are left out, and so is what the robot handles.
         """
-        found = SelfClearance(self.mjcf, self.body, margin)
-        if not found.links:
+        constraint = SelfClearance(self.mjcf, self.body, margin)
+        if not constraint.links:
             want = "an MJCF that lets two links collide"
             raise InputError(
                 f"MjcfRobot {self.name}: self_clearance: got no pair of links that can collide, want {want}"
             )
-        return found
+        return constraint
 
     def with_parameters(self, **values: float) -> "MjcfRobot":
         """The robot with other numbers in its MJCF, for plans and plants: `robot.with_parameters(mass=0.6)`.
@@ -286,26 +287,26 @@ class MjcfRobot(Robot):
                 f"state: got no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
                 f" robot touches its support, or is above it{apart}"
             )
-        found = state.copy()
-        found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
-        held = self._held(found)
+        rested = state.copy()
+        rested[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
+        held = self._held(rested)
         for drifting in self._drifting(held)[:1]:
             raise InputError(f"state: got one at which {drifting}, want activations that come to rest")
-        found[2 * model.nv :] = held.activations
-        return found
+        rested[2 * model.nv :] = held.activations
+        return rested
 
     def _drifting(self, held: Holding) -> list[str]:
         """Why each actuator that never rests does not, as text."""
-        found = list[str]()
+        reasons = list[str]()
         for number in np.flatnonzero(held.drifting).tolist():
             actuator = self.mjcf.actuators[number]
-            own = list(zip(self.mjcf.controls[actuator.controls], held.controls[actuator.controls], strict=True))
-            ends = [(one, "least", one.low) for one, value in own if value <= one.low]
-            ends += [(one, "most", one.high) for one, value in own if value >= one.high]
-            its = "its control" if len(own) == 1 else "{}"
-            why = "".join(f": {its.format(one.name)} is at {end} {side:g}" for one, end, side in ends[:1])
-            found.append(f"the activation of {actuator.name} drifts{why}")
-        return found
+            controls = list(zip(self.mjcf.controls[actuator.controls], held.controls[actuator.controls], strict=True))
+            ends = [(control, "least", control.low) for control, value in controls if value <= control.low]
+            ends += [(control, "most", control.high) for control, value in controls if value >= control.high]
+            its = "its control" if len(controls) == 1 else "{}"
+            why = "".join(f": {its.format(control.name)} is at {end} {side:g}" for control, end, side in ends[:1])
+            reasons.append(f"the activation of {actuator.name} drifts{why}")
+        return reasons
 
     def _held(self, state: Array) -> Holding:
         return holding(self.mjcf, self.dynamics.physics.model, self.configuration(state)[0])
@@ -364,13 +365,15 @@ class MjcfRobot(Robot):
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
         spent = efforts(self.mjcf) ** -2.0 if effort is None else effort
         cost: Cost = ControlCost(_weights("effort", spent, len(controls)), about=about)
-        damping, attitude = (check_number(*one, at_least=0.0) for one in (("damping", damping), ("attitude", attitude)))
+        damping, attitude = (
+            check_number(*field, at_least=0.0) for field in (("damping", damping), ("attitude", attitude))
+        )
         calm, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
-        for one in self.mjcf.joints:
-            if one.kind != "free":
-                calm[model.nv : 2 * model.nv][one.dofs] = damping
-            elif model.dof_bodyid[one.dof] == root:  # not of something that the robot handles
-                turned = slice(one.dof + 3, one.dof + 6)
+        for joint in self.mjcf.joints:
+            if joint.kind != "free":
+                calm[model.nv : 2 * model.nv][joint.dofs] = damping
+            elif model.dof_bodyid[joint.dof] == root:  # not of something that the robot handles
+                turned = slice(joint.dof + 3, joint.dof + 6)
                 calm[turned], about_state[turned] = attitude, goal[turned]
                 calm[model.nv : 2 * model.nv][turned] = 0.5 * attitude
         if calm.any():
@@ -378,21 +381,21 @@ class MjcfRobot(Robot):
         if limits > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
         period = dynamics.period_near(_PERIOD) or dynamics.period if dt is None else dt
-        kept: list[Constraint] = []
+        constraints: list[Constraint] = []
         if clearance is not None:
-            kept.append(Clearance(self.scene.world, **self.shape, margin=clearance))
+            constraints.append(Clearance(self.scene.world, **self.shape, margin=clearance))
         if self_clearance is not None:
             apart = self.self_clearance(self_clearance)
             for field, state in (("start", start), ("goal", goal)):
                 apart.check(field, dynamics, state)
-            kept.append(apart)
+            constraints.append(apart)
         sides = np.array([controls.low, controls.high])
-        forces = ForceLimits([one for one in self._forces[0] if one.can_be_kept(start, *sides)])
+        forces = ForceLimits([limit for limit in self._forces[0] if limit.can_be_kept(start, *sides)])
         if force_limits and forces.limits:
             free = forces.removed_from(dynamics)
             if _is_stable(free, start, first.controls, period):
                 dynamics = free
-                kept.append(forces.within(dynamics, start, first.controls, period))
+                constraints.append(forces.within(dynamics, start, first.controls, period))
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
@@ -400,7 +403,7 @@ class MjcfRobot(Robot):
             steps=steps, initial=FixedState(start), stage_cost=cost,
             final_cost=QuadraticCost(_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
-            constraints=kept, control_rate=control_rate,
+            constraints=constraints, control_rate=control_rate,
         )  # fmt: skip
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
@@ -410,25 +413,27 @@ class MjcfRobot(Robot):
         start far past them, and for a goal that moves a joint past them.
         """
         names, low, high, model = self.dynamics.state_coordinates.names, {}, {}, self.scene.model
-        for one in self.mjcf.joints:
-            if one.limits is None:
+        for joint in self.mjcf.joints:
+            if joint.limits is None:
                 continue
-            begin, end = start[one.dof], goal[one.dof]
-            stated = [model.qpos0[one.qpos.start], *model.key_qpos[:, one.qpos.start]]
-            if not np.isclose(begin, stated, rtol=0, atol=1e-9).any() and (said := one.past_limits(begin, FAR_PAST)):
-                raise InputError(f"start: {said}")
-            if end != begin and (said := one.past_limits(end, _PAST)):
-                raise InputError(f"goal: {said}")
-            least, most = one.limits
+            begin, end = start[joint.dof], goal[joint.dof]
+            stated = [model.qpos0[joint.qpos.start], *model.key_qpos[:, joint.qpos.start]]
+            if not np.isclose(begin, stated, rtol=0, atol=1e-9).any() and (
+                complaint := joint.past_limits(begin, FAR_PAST)
+            ):
+                raise InputError(f"start: {complaint}")
+            if end != begin and (complaint := joint.past_limits(end, _PAST)):
+                raise InputError(f"goal: {complaint}")
+            least, most = joint.limits
             room = min(_ROOM[0], _ROOM[1] * (most - least))
-            low[names[one.dof]] = max(least, min(least + room, begin, end))
-            high[names[one.dof]] = min(most, max(most - room, begin, end))
+            low[names[joint.dof]] = max(least, min(least + room, begin, end))
+            high[names[joint.dof]] = min(most, max(most - room, begin, end))
         return low, high
 
     def __str__(self) -> str:
         space, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
         held = self._held(self.at())
-        told = [f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True)]
+        commands = [f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True)]
         worst = int(np.argmax(np.abs(held.missed)))
         unit = "N m" if space.units[worst] == "rad" else "N"
         short = "".join(f"; {drifting}" for drifting in self._drifting(held))
@@ -441,8 +446,8 @@ class MjcfRobot(Robot):
             if space.position
             else f"  body: {self.body}, whose position is not among the states",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
-            f"  held at rest by: {listed(told)}{short}",
-            *(f"  {title}: {listed(found)}" for title, found in self._remarks().items() if found),
+            f"  held at rest by: {listed(commands)}{short}",
+            *(f"  {title}: {listed(entries)}" for title, entries in self._remarks().items() if entries),
         ]
         return "\n".join(lines)
 
@@ -454,26 +459,26 @@ class MjcfRobot(Robot):
         tendons = ((model.tendon(i).name, "m", loss) for i, loss in enumerate(model.tendon_frictionloss.tolist()))
         units, obstacle_of = {"rad": "N m", "m": "N"}, dict(zip(self.scene.geoms, self.scene.world.names, strict=True))
         past = [
-            f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
-            for one in joints
-            if one.limits is not None and not one.limits[0] <= rest[one.dof] <= one.limits[1]
+            f"{names[joint.dof]} {rest[joint.dof]:.4g} (want {joint.limits[0]:.4g} to {joint.limits[1]:.4g})"
+            for joint in joints
+            if joint.limits is not None and not joint.limits[0] <= rest[joint.dof] <= joint.limits[1]
         ]
         mounts = [
-            f"{obstacle_of[other]} ({self.scene.model.body(int(self.scene.model.geom_bodyid[own])).name})"
-            for own, other in mounting_pairs(self.scene.model, list(self.scene.geoms)).tolist()
+            f"{obstacle_of[obstacle]} ({self.scene.model.body(int(self.scene.model.geom_bodyid[mount])).name})"
+            for mount, obstacle in mounting_pairs(self.scene.model, list(self.scene.geoms)).tolist()
         ]
         return {
             "force limits, constraints of plans": [
-                f"{one.name.partition(' ')[2]} {one.low:.4g} to {one.high:.4g} {one.unit}" for one in kept
+                f"{limit.name.partition(' ')[2]} {limit.low:.4g} to {limit.high:.4g} {limit.unit}" for limit in kept
             ],
             "force limits, clipped in plans as in runs": [name.partition(" ")[2] for name in clipped],
             "dry friction, in plans and runs": [
                 f"{name} {loss:.4g} {units[unit]}" for name, unit, loss in (*losses, *tendons) if loss > 0
             ],
             "limits of speed, kept only by robot.joint_limits": [
-                f"{one.name} {one.speed:.4g} {'m' if one.kind == 'slide' else 'rad'}/s"
-                for one in joints
-                if np.isfinite(one.speed)
+                f"{joint.name} {joint.speed:.4g} {'m' if joint.kind == 'slide' else 'rad'}/s"
+                for joint in joints
+                if np.isfinite(joint.speed)
             ],
             "past their limits at rest": past,
             "touching at rest": [" and ".join(pair) for pair in contacts_of(model, self.configuration(rest)[0])],
@@ -489,8 +494,10 @@ class MjcfRobot(Robot):
         <custom> section of an MJCF: `<numeric name="JOINT_velocity_limit" data="2"/>`.
         """
         names, nv = self.dynamics.state_coordinates.names, self.mjcf.model.nv
-        places = {names[one.dof]: one.limits for one in self.mjcf.joints if one.limits is not None}
-        speeds = {names[nv + one.dof]: (-one.speed, one.speed) for one in self.mjcf.joints if np.isfinite(one.speed)}
+        places = {names[joint.dof]: joint.limits for joint in self.mjcf.joints if joint.limits is not None}
+        speeds = {
+            names[nv + joint.dof]: (-joint.speed, joint.speed) for joint in self.mjcf.joints if np.isfinite(joint.speed)
+        }
         return StateBounds(places | speeds)
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
@@ -523,21 +530,21 @@ class MjcfRobot(Robot):
         """The positions (nv,) of a state that meet equalities and are as named, beginning with qpos (nq,)."""
         model, names = self.scene.model, self.dynamics.state_coordinates.names
         fixed = np.zeros(model.nv, dtype=bool)
-        for one in self.mjcf.joints:
-            fixed[one.dofs] = not set(names[one.dofs]).isdisjoint(named)
+        for joint in self.mjcf.joints:
+            fixed[joint.dofs] = not set(names[joint.dofs]).isdisjoint(named)
         equalities, aim = Equalities(model), self.configuration(state)[0]
         # Followers follow; what they follow moves only if one of them is named.
-        tries = (equalities.met(qpos, aim, one) for one in (fixed | leaders_of(model), fixed))
+        tries = (equalities.met(qpos, aim, dofs) for dofs in (fixed | leaders_of(model), fixed))
         place = next((place for place in tries if place is not None), None)
         if place is None:
-            told = ", ".join(f"{names[dof]} {state[dof]:g}" for dof in np.flatnonzero(fixed)) or "none of them named"
+            got = ", ".join(f"{names[dof]} {state[dof]:g}" for dof in np.flatnonzero(fixed)) or "none of them named"
             raise InputError(
-                f"MjcfRobot {self.name}: joints: got {told}, want positions at which all loops close and followers are"
+                f"MjcfRobot {self.name}: joints: got {got}, want positions at which all loops close and followers are"
                 " where their equalities have them"
             )
-        found = self.state(place, np.zeros(model.nv))[: model.nv]
-        found[fixed] = state[: model.nv][fixed]  # to the last bit
-        return found
+        closed = self.state(place, np.zeros(model.nv))[: model.nv]
+        closed[fixed] = state[: model.nv][fixed]  # to the last bit
+        return closed
 
     def with_closed_loops(self, states: npt.ArrayLike) -> Array:
         """The nearest states (..., n) at which all equality constraints are met, in positions and in velocities."""
@@ -545,15 +552,15 @@ class MjcfRobot(Robot):
         states = vectors_of("states", states, len(self.dynamics.state_coordinates))
         if not model.eq_active0.any():
             return states
-        equalities, found = Equalities(model), states.copy()
-        for state in found.reshape(-1, states.shape[-1]):
+        equalities, corrected = Equalities(model), states.copy()
+        for state in corrected.reshape(-1, states.shape[-1]):
             closed = equalities.closed(*self.configuration(state))
             if closed is None:
-                names, told = self.dynamics.state_coordinates.names, state[: model.nv].tolist()
-                got = listed([f"{name} {value:.4g}" for name, value in zip(names, told, strict=False)])
+                names, positions = self.dynamics.state_coordinates.names, state[: model.nv].tolist()
+                got = listed([f"{name} {value:.4g}" for name, value in zip(names, positions, strict=False)])
                 raise InputError(f"MjcfRobot {self.name}: states: got {got}, want positions near which all loops close")
             state[: 2 * model.nv] = self.state(*closed, near=state)
-        return found
+        return corrected
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
@@ -563,8 +570,8 @@ class MjcfRobot(Robot):
             return state
         near = vectors_of("near", near, len(self.dynamics.state_coordinates))
         unknown = np.zeros((*state.shape[:-1], self.activations))
-        whole = self.dynamics.state_coordinates.nearest(np.concatenate([state, unknown], axis=-1), near)
-        return whole[..., : 2 * model.nv]
+        nearest = self.dynamics.state_coordinates.nearest(np.concatenate([state, unknown], axis=-1), near)
+        return nearest[..., : 2 * model.nv]
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
         state, nv = vectors_of("state", state, len(self.dynamics.state_coordinates)), self.mjcf.model.nv

@@ -236,9 +236,9 @@ class MjcfDynamics(Dynamics):
             "plugins": (model.npluginstate > 0, "got plugins with their own states", "none"),
             "delays": (model.actuator_history.any(), "got actuators with a delay", "none"),
         }
-        for what, (found, got, wanted) in refused.items():
-            if found:
-                raise InputError(f"{self._name}: {what}: {got}, want {wanted}")
+        for part, (present, got, wanted) in refused.items():
+            if present:
+                raise InputError(f"{self._name}: {part}: {got}, want {wanted}")
         for geom in np.intersect1d(self._stated["obstacles"], [model.pair_geom1, model.pair_geom2])[:1]:
             who = model.geom(int(geom)).name
             raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
@@ -308,8 +308,10 @@ class MjcfDynamics(Dynamics):
         are several; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
         passed = {self.mjcf.model.geom(geom).name for geom in self._stated["obstacles"]}  # which do not collide here
-        found = self.mjcf.numbers.items()
-        return {name: one.value for name, one in found if one.what != "friction" or one.part not in passed}
+        numbers = self.mjcf.numbers.items()
+        return {
+            name: number.value for name, number in numbers if number.what != "friction" or number.part not in passed
+        }
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
@@ -336,8 +338,8 @@ class MjcfDynamics(Dynamics):
     @unlogged()
     def touches(self, states: Array) -> bool:
         positions = self._qpos_of(states[np.isfinite(states).all(axis=1)])
-        each = posed(self.physics.model, positions, mujoco.mj_fwdPosition)
-        return any(np.isin(data.efc_type, _ONE_SIDED).any() for data in each)
+        poses = posed(self.physics.model, positions, mujoco.mj_fwdPosition)
+        return any(np.isin(data.efc_type, _ONE_SIDED).any() for data in poses)
 
     @unlogged()
     def untouched_body(self, states: Array, state: int) -> str:
@@ -349,7 +351,7 @@ class MjcfDynamics(Dynamics):
         roots = model.body_weldid
         for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
             for pair in data.contact.geom:
-                first, second = (int(roots[model.geom_bodyid[one]]) for one in pair)
+                first, second = (int(roots[model.geom_bodyid[geom]]) for geom in pair)
                 if int(roots[body]) in (first, second) and first and second:
                     return ""
         return model.body(body).name
@@ -358,8 +360,8 @@ class MjcfDynamics(Dynamics):
         return self.mjcf.qpos_of(states[:, : self.mjcf.model.nv])
 
     def _cause_of_failure(self, state: Array) -> str | None:
-        found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in self.mjcf.joints)
-        return next((said for said in found if said), None)
+        complaints = (joint.past_limits(float(state[joint.dof]), FAR_PAST) for joint in self.mjcf.joints)
+        return next((complaint for complaint in complaints if complaint), None)
 
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
         if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):
@@ -372,10 +374,10 @@ class MjcfDynamics(Dynamics):
         wanted = moves[:nv] if moves[:nv].any() else moves[nv : 2 * nv]  # a velocity points the way
         if not wanted.any():
             return
-        found = Approaches(self.mjcf, states, wanted)
+        approaches = Approaches(self.mjcf, states, wanted)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
-            other = self.stating(obstacles=(*self._stated["obstacles"], *found.thing))
-            for words, positions in found:
+            other = self.stating(obstacles=(*self._stated["obstacles"], *approaches.thing))
+            for words, positions in approaches:
                 yield words, other, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
 
     def stating(self, **stated: Any) -> "MjcfDynamics":
@@ -399,15 +401,15 @@ class MjcfDynamics(Dynamics):
         explicit, nv, n = copy.copy(self.physics.model), self.mjcf.model.nv, states.shape[1]
         explicit.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
         explicit.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        data, found, step = mujoco.MjData(explicit), np.zeros((len(states), n, n)), np.zeros((n, n))
-        found[:, :nv, nv : 2 * nv] = np.eye(nv)
-        for slopes, qpos, state, control in zip(found, self._qpos_of(states), states, controls, strict=True):
+        data, jacobians, step = mujoco.MjData(explicit), np.zeros((len(states), n, n)), np.zeros((n, n))
+        jacobians[:, :nv, nv : 2 * nv] = np.eye(nv)
+        for slopes, qpos, state, control in zip(jacobians, self._qpos_of(states), states, controls, strict=True):
             data.qpos[:], data.qvel[:], data.act[:] = qpos, state[nv : 2 * nv], state[2 * nv :]
             data.qacc_warmstart[:], data.ctrl[:] = 0.0, control
             with unlogged():
                 mujoco.mjd_transitionFD(explicit, data, _DIFFERENCE, True, step, None, None, None)
             slopes[nv:] = (step - np.eye(n))[nv:] / self.period
-        return self.period, found
+        return self.period, jacobians
 
     def _with_finer_steps(self, dt: float, most: float) -> str:
         return f'set <option timestep="{dt / math.ceil(dt / most):.9g}"/>, or integrator="implicitfast", in the MJCF'

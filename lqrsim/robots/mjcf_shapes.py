@@ -53,7 +53,7 @@ class MjcfGeoms(CollisionGeoms):
         if world.moving:
             raise InputError("geoms: got obstacles that move, want balls=robot.balls for them")
         chosen = np.flatnonzero(np.isin(self._number, numbers))
-        place = {int(one): i for i, one in enumerate(numbers)}
+        place = {int(number): i for i, number in enumerate(numbers)}
         keys = [(int(self._bodies[k]), place[int(self._number[k])]) for k in chosen]
         if len(set(keys)) > MOST_ROWS:
             keys = [(body, -1) for body, _ in keys]
@@ -75,11 +75,13 @@ class MjcfGeoms(CollisionGeoms):
         flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(numbers)
         moved = displaced is not None and bool(displaced.any())
         away = in_c_order(displaced.reshape(-1)) if moved and displaced is not None else np.zeros(1)
-        each = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
+        per_displacement = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
         out, which, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
         if count:
             _, data = self._to_each(own, numbers)
-            self._module(dynamics).distances_of(len(flat), flat, each, away, int(moved), data, out, which, segments)
+            self._module(dynamics).distances_of(
+                len(flat), flat, per_displacement, away, int(moved), data, out, which, segments
+            )
         return out[: len(flat) * count].reshape(*states.shape[:-1], count)
 
     def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
@@ -116,17 +118,17 @@ class MjcfGeoms(CollisionGeoms):
             raise InputError(f"geoms: got an MJCF's geoms for {dynamics.name}, want its own dynamics, robot.dynamics")
         if world is self.scene.world:
             return own, np.arange(len(world))
-        known = {one.name: (number, one) for number, one in enumerate(self.scene.world.obstacles)}
-        found = []
-        for one in world.obstacles:
-            number, stated = known.get(one.name, (-1, None))
-            if not _same(one, stated):
+        known = {obstacle.name: (number, obstacle) for number, obstacle in enumerate(self.scene.world.obstacles)}
+        numbers = []
+        for obstacle in world.obstacles:
+            number, stated = known.get(obstacle.name, (-1, None))
+            if not _same(obstacle, stated):
                 raise InputError(
-                    f"geoms: got the obstacle {one.name!r}, which is not one of the robot's MJCF, want those of"
+                    f"geoms: got the obstacle {obstacle.name!r}, which is not one of the robot's MJCF, want those of"
                     f" robot.scene.world: {', '.join(known) or 'there are none'}; or balls=robot.balls"
                 )
-            found.append(number)
-        return own, np.array(found, dtype=np.int64)
+            numbers.append(number)
+        return own, np.array(numbers, dtype=np.int64)
 
     def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
         """The kernel's data, except the address of p."""
@@ -162,11 +164,13 @@ class SelfClearance(Constraint):
         model = mjcf.model
         self.margin = margin
         self._mjcf, self._pairs = mjcf, mjcf_obstacles.link_pairs(model, model.body(body).id)
-        own = model.geom_bodyid[self._pairs]
-        bodies = np.sort(np.where(model.body_weldid[own] != 0, model.body_weldid[own], own), axis=1)
+        geom_bodies = model.geom_bodyid[self._pairs]
+        bodies = np.sort(
+            np.where(model.body_weldid[geom_bodies] != 0, model.body_weldid[geom_bodies], geom_bodies), axis=1
+        )
         keys, rows = np.unique(bodies, axis=0, return_inverse=True)
         self._rows = np.asarray(rows, dtype=np.int64).ravel()
-        self.links = tuple((model.body(one).name, model.body(other).name) for one, other in keys.tolist())
+        self.links = tuple((model.body(first).name, model.body(second).name) for first, second in keys.tolist())
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return self
@@ -176,22 +180,22 @@ class SelfClearance(Constraint):
             raise InputError(f"SelfClearance: got dynamics {dynamics.name}, want the robot's own, robot.dynamics")
         model = self._mjcf.model
         reach = self.margin + SEEN * float(model.geom_rbound[self._pairs].max(initial=0.0))
-        told = [f"{one!r} and {other!r}" for one, other in self.links]
-        rows, merged = self._rows, np.arange(len(told))
-        if len(told) > MOST_ROWS:  # then one for each link, to those after it
-            firsts = list(dict.fromkeys(one for one, _ in self.links))
-            merged = np.array([firsts.index(one) for one, _ in self.links])
-            told, rows = [f"{one!r} and other links" for one in firsts], merged[rows]
-        count = max(1, len(told))
+        described = [f"{first!r} and {second!r}" for first, second in self.links]
+        rows, merged = self._rows, np.arange(len(described))
+        if len(described) > MOST_ROWS:  # then one for each link, to those after it
+            firsts = list(dict.fromkeys(first for first, _ in self.links))
+            merged = np.array([firsts.index(first) for first, _ in self.links])
+            described, rows = [f"{link!r} and other links" for link in firsts], merged[rows]
+        count = max(1, len(described))
         distances = Residual(
             source_of(mjcf_distances, ROWS=count), mjcf_obstacles.distance_data(model, self._pairs, rows, count, reach),
-            parts=tuple(told), moved=model.nv, functions=(MjcfMemory.of(own),),
+            parts=tuple(described), moved=model.nv, functions=(MjcfMemory.of(own),),
         )  # fmt: skip
 
         def describe(row: int) -> str:
-            return f"a clearance of {self.margin:g} m between {told[row]}"
+            return f"a clearance of {self.margin:g} m between {described[row]}"
 
-        return ConstraintTerm.of_residual(distances, np.array([[self.margin]]), [0] * len(told), describe)
+        return ConstraintTerm.of_residual(distances, np.array([[self.margin]]), [0] * len(described), describe)
 
     def distances(self, dynamics: MjcfDynamics, states: npt.ArrayLike) -> Array:
         """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m."""
@@ -206,13 +210,13 @@ class SelfClearance(Constraint):
 
     def check(self, field: str, dynamics: MjcfDynamics, state: Array) -> None:
         """Raises InputError if links are nearer to each other than the margin at a state (n,), named `field`."""
-        found = self.distances(dynamics, state)
-        if found.min(initial=np.inf) < self.margin:
-            one, other = self.links[int(found.argmin())]
+        distances = self.distances(dynamics, state)
+        if distances.min(initial=np.inf) < self.margin:
+            first, second = self.links[int(distances.argmin())]
             raise InputError(
-                f"{field}: got a state with {one!r} and {other!r} at {found.min():.3g} m from each other, want"
+                f"{field}: got a state with {first!r} and {second!r} at {distances.min():.3g} m from each other, want"
                 f" {self.margin:g} m; or, if they may touch, <contact><exclude"
-                f' body1="{one}" body2="{other}"/></contact> in the MJCF'
+                f' body1="{first}" body2="{second}"/></contact> in the MJCF'
             )
 
 

@@ -83,7 +83,7 @@ def _dynamics(robot: Quadrotor) -> Dynamics:
         states={name: unit for names, unit in units.items() for name in names.split()},
         controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
         parameters={name: getattr(robot, name) for name in constants},
-        disturbances={f"{what}_{axis}": 0.0 for what in ("wind", "force", "torque") for axis in "xyz"},
+        disturbances={f"{disturbance}_{axis}": 0.0 for disturbance in ("wind", "force", "torque") for axis in "xyz"},
         position=("x", "y", "z"),
         rotation_vectors=(("rx", "ry", "rz"),),
         control_limits=(robot.min_force, robot.max_force),
@@ -100,7 +100,9 @@ def _rate_with_two_inertias(x: Any, u: Any, p: Any) -> list[Any]:
 def _rate(x: Any, u: Any, p: Any) -> list[Any]:
     velocity, rotation, w = x[3:6], x[6:9], x[9:12]
     thrust = rotations.rotate(rotation, [0, 0, sum(u)])
-    wind, force, push = ([getattr(p, f"{what}_{axis}") for axis in "xyz"] for what in ("wind", "force", "torque"))
+    wind, force, push = (
+        [getattr(p, f"{disturbance}_{axis}") for axis in "xyz"] for disturbance in ("wind", "force", "torque")
+    )
     acceleration = [(thrust[i] + force[i] - p.drag * (velocity[i] - wind[i])) / p.mass for i in range(3)]
     acceleration[2] -= p.gravity
     # The inertia is the same about each axis, so the gyroscopic term w x J w is zero.

@@ -74,26 +74,26 @@ class RobotSensors:
     @checked
     def __init__(self, robot: Robot, scene: Scene, sensors: Sequence[Sensor]) -> None:
         given = check_items("sensors", sensors, Sensor, "a list of Sensor")
-        if not given or len({one.name for one in given}) < len(given):
-            raise InputError(f"sensors: got {[one.name for one in given]}, want at least one, each at most once")
+        if not given or len({sensor.name for sensor in given}) < len(given):
+            raise InputError(f"sensors: got {[sensor.name for sensor in given]}, want at least one, each at most once")
         self._robot, self._scene = robot, scene
         self.drag = robot.drag
         model, sensors, places, far = scene.model, list[Sensor](), list[npt.NDArray[np.intp]](), list[Array]()
         columns, names, quaternions, count = list[slice](), list[str](), list[bool](), 0
-        for one in given:
-            number = _number_of(model, one.name)
+        for sensor in given:
+            number = _number_of(model, sensor.name)
             kind, size = _TYPES(model.sensor_type[number]), int(model.sensor_dim[number])
             interval = float(model.sensor_interval[number, 0])  # 0 for each physics step
             sensors.append(
                 replace(
-                    one,
-                    noise=float(model.sensor_noise[number]) if one.noise is None else one.noise,
-                    rate=1 / interval if one.rate is None and interval else one.rate,
-                    delay=float(model.sensor_delay[number]) if one.delay is None else one.delay,
+                    sensor,
+                    noise=float(model.sensor_noise[number]) if sensor.noise is None else sensor.noise,
+                    rate=1 / interval if sensor.rate is None and interval else sensor.rate,
+                    delay=float(model.sensor_delay[number]) if sensor.delay is None else sensor.delay,
                 )
             )
             columns.append(slice(count, count + size))
-            names += [f"{one.name}[{i}]" for i in range(size)] if size > 1 else [one.name]
+            names += [f"{sensor.name}[{i}]" for i in range(size)] if size > 1 else [sensor.name]
             quaternions.append(kind in _QUATERNIONS)
             places.append(int(model.sensor_adr[number]) + np.arange(size))
             far.append(np.full(size, kind == _TYPES.mjSENS_RANGEFINDER))
@@ -103,7 +103,7 @@ class RobotSensors:
         self._places, self._far = np.concatenate(places), np.concatenate(far)
 
     def __repr__(self) -> str:
-        return f"RobotSensors({', '.join(one.name for one in self.sensors)})"
+        return f"RobotSensors({', '.join(sensor.name for sensor in self.sensors)})"
 
     @property
     def digest(self) -> str:
@@ -118,24 +118,24 @@ class RobotSensors:
 
     def each(self, field: str) -> Array:
         """A field of the sensors, for each number of the readings, (Y,)."""
-        sizes = [one.stop - one.start for one in self.columns]
-        return np.repeat([float(getattr(one, field)) for one in self.sensors], sizes)
+        sizes = [columns.stop - columns.start for columns in self.columns]
+        return np.repeat([float(getattr(sensor, field)) for sensor in self.sensors], sizes)
 
     def due(self, knot: int, dt: float) -> npt.NDArray[np.bool_]:
         """Whether each sensor is read at a knot, for a control period of dt seconds."""
-        rates = np.array([np.inf if one.rate is None else one.rate for one in self.sensors])
-        each = np.minimum(rates, 1 / dt) * dt  # multiples of the interval in a period
-        return np.floor(knot * each + _ROUNDING) > np.floor((knot - 1) * each + _ROUNDING)
+        rates = np.array([np.inf if sensor.rate is None else sensor.rate for sensor in self.sensors])
+        per_period = np.minimum(rates, 1 / dt) * dt  # multiples of the interval in a period
+        return np.floor(knot * per_period + _ROUNDING) > np.floor((knot - 1) * per_period + _ROUNDING)
 
     def late(self, dt: float) -> list[int]:
         """The number of control periods of dt seconds after which the reading of each sensor arrives."""
-        return [int(np.ceil((one.delay or 0.0) / dt - _ROUNDING)) for one in self.sensors]
+        return [int(np.ceil((sensor.delay or 0.0) / dt - _ROUNDING)) for sensor in self.sensors]
 
     def readings(self, sensordata: Array) -> Array:
         """The readings (K, Y) in MuJoCo's `sensordata` (K, any); NaN where a rangefinder meets nothing."""
-        found = sensordata[:, self._places]
-        found[(found == _NO_HIT) & self._far] = np.nan
-        return found
+        readings = sensordata[:, self._places]
+        readings[(readings == _NO_HIT) & self._far] = np.nan
+        return readings
 
     def reader(self) -> Reader:
         """A function that computes exact readings by MuJoCo, for one thread; see `Reader`.
@@ -149,7 +149,7 @@ class RobotSensors:
 
         def read(states: Array, controls: Array, wrench: Array) -> Array:
             qpos, qvel, ctrl = *robot.configuration(states), robot.actuation(controls)
-            found = np.empty((len(states), model.nsensordata))
+            sensordata = np.empty((len(states), model.nsensordata))
             for k, state in enumerate(states):
                 data.qpos[:], data.qvel[:], data.ctrl[:], data.qacc_warmstart[:] = model.qpos0, 0.0, 0.0, 0.0
                 data.qpos[in_qpos], data.qvel[in_qvel], data.ctrl[in_ctrl] = qpos[k], qvel[k], ctrl[k]
@@ -157,8 +157,8 @@ class RobotSensors:
                     data.act[:] = state[len(state) - robot.activations :]
                 data.xfrc_applied[body] = wrench[k]
                 mujoco.mj_forward(model, data)
-                found[k] = data.sensordata
-            return self.readings(found)
+                sensordata[k] = data.sensordata
+            return self.readings(sensordata)
 
         return read
 
@@ -168,7 +168,7 @@ def _number_of(model: mujoco.MjModel, name: str) -> int:
     names = [model.sensor(i).name for i in range(model.nsensor)]
     if not any(names):
         raise InputError(f"sensors: got {name!r}, want a named element of <sensor>, of which the MJCF has none")
-    number = names.index(check_name("sensors", name, [one for one in names if one]))
+    number = names.index(check_name("sensors", name, [sensor_name for sensor_name in names if sensor_name]))
     if (kind := _TYPES(model.sensor_type[number])) in _REFUSED:
         tag = kind.name.removeprefix("mjSENS_").lower()
         raise InputError(f"sensors: got {name!r} of the kind {tag}, which has no smooth reading, want another sensor")
