@@ -325,8 +325,8 @@ def _toolchain() -> str:
     """A hash of everything that machine code depends on, except the source: all kernels, and the compiler's own
     modules.
     """
-    own = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
-    paths = [Path(str(importlib.import_module(name).__file__)) for name in own]
+    modules = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
+    paths = [Path(str(importlib.import_module(name).__file__)) for name in modules]
     paths += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))
     texts = (path.read_bytes() for path in paths)
     return disk.key(version("llvmlite"), *texts)

@@ -24,8 +24,8 @@ class JaxSteps(UserFunction):
         numbers = np.array(list(parameters.values()))
 
         def run(what: int, count: int, skipped: int, x: Array, u: Array, p: Array, h: float, *more: Array) -> None:
-            given = zip((x, u, *more[: what + 2]), self._sizes, strict=False)
-            x, u, weights, *outputs = (array.reshape(-1, size) for array, size in given)
+            pairs = zip((x, u, *more[: what + 2]), self._sizes, strict=False)
+            x, u, weights, *outputs = (array.reshape(-1, size) for array, size in pairs)
             rows = slice(skipped, skipped + count)
             self._write(what, x[:count], u[:count], numbers, h, weights[rows], [output[:count] for output in outputs])
 
@@ -50,9 +50,9 @@ class JaxSteps(UserFunction):
                 return view(address + 8 * first * size, count * size).reshape(count, size)
 
             arrays = list(map(rows, outputs[: what + 1], self._sizes[3:]))
-            given = rows(x, n), rows(u, m), view(data, end)[self.offset :], h
+            arguments = rows(x, n), rows(u, m), view(data, end)[self.offset :], h
             w = rows(weights, n, skipped) if what == HESSIANS else None
-            self._guarded(lambda: self._write(what, *given, w, arrays), arrays)
+            self._guarded(lambda: self._write(what, *arguments, w, arrays), arrays)
 
         held = prototype(callback)
         address = ctypes.cast(held, ctypes.c_void_p).value

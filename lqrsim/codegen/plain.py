@@ -45,9 +45,9 @@ def _run(
     if key in made:
         return made[key]
     code, names = _compiled(function.node, function.scope.source.what)
-    given: dict[str, Any] = {}
-    exec(code, given)
-    run = given[function.node.name]
+    namespace: dict[str, Any] = {}
+    exec(code, namespace)
+    run = namespace[function.node.name]
     called = run if caller is None else lambda *arguments: caller(function, run, arguments)
     made[key] = called
     for name in names:
@@ -55,14 +55,14 @@ def _run(
             case None:
                 continue
             case ScopedFunction() as other:
-                given[name] = _run(other, words, made, caller)
+                namespace[name] = _run(other, words, made, caller)
             case Record():
-                given[name] = getattr(records, name)
+                namespace[name] = getattr(records, name)
             case Word(name=word):
                 if word not in PYTHON:
-                    given[name] = words[word]
+                    namespace[name] = words[word]
             case constant:
-                given[name] = constant
+                namespace[name] = constant
     return called
 
 

@@ -153,13 +153,13 @@ class Program:
 
         A whole number that it returns becomes a float, such as the value of a formula that is 0: callers take a float.
         """
-        given = [f"{llvm_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types))]
+        parameters = [f"{llvm_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types))]
         kind, call, result = self._call_of(function, types)
         body = [f"  {call}", "  ret void"] if kind == "void" else [f"  %r = {call}", f"  ret {kind} %r"]
         if result is INT or result is BOOL:
             convert, integer, kind = "sitofp" if result is INT else "uitofp", kind, "double"
             body = [f"  %n = {call}", f"  %r = {convert} {integer} %n to double", "  ret double %r"]
-        self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(given)}) #0 {{", *body, "}"]))
+        self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(parameters)}) #0 {{", *body, "}"]))
 
     def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> Type | None:
         """Add a C function of one address, at which there are 8 bytes for each number and address of the arguments.
@@ -203,8 +203,8 @@ class Program:
         """LLVM's type of a function's result, a call with the arguments %a0, %a1, ..., and the type of the result."""
         name, result = self.instance(function, types)
         kind = "void" if result is None else llvm_type(result)
-        given = ", ".join(f"{_passed_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types)))
-        return kind, f"call {kind} {name}({given})", result
+        arguments = ", ".join(f"{_passed_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types)))
+        return kind, f"call {kind} {name}({arguments})", result
 
 
 def where(function: ScopedFunction, node: ast.AST) -> str:
@@ -273,7 +273,7 @@ class _Body:
 
     def text(self, name: str) -> str:
         """The IR."""
-        given = ", ".join(
+        passed = ", ".join(
             # Records do not change: LLVM need not read their parts again.
             f"ptr noalias readonly %a{i}" if isinstance(kind, Group) else f"{llvm_type(kind)} %a{i}"
             for i, kind in enumerate(_passed(self.function, self.types))
@@ -282,7 +282,7 @@ class _Body:
         decorators = self.function.decorators
         known = {"inline": "#1", "outline": "#2", "compact": "#3"}
         attributes = next((number for name, number in known.items() if name in decorators), "#0")
-        lines = [f"define internal {kind} {name}({given}) {attributes} {{", "entry:", *self._slots, "  br label %body"]
+        lines = [f"define internal {kind} {name}({passed}) {attributes} {{", "entry:", *self._slots, "  br label %body"]
         for block in self._blocks:
             lines += [f"{block.label}:", *block.lines]
         return "\n".join([*lines, "}"])
@@ -431,8 +431,8 @@ class _Body:
     def _statement_Assign(self, node: ast.Assign) -> None:
         targets, values = [node.targets], [node.value]
         match node.targets, node.value:
-            case [ast.Tuple(elts=each)], ast.Tuple(elts=parts) if len(each) == len(parts):
-                targets, values = [[target] for target in each], parts
+            case [ast.Tuple(elts=elements)], ast.Tuple(elts=parts) if len(elements) == len(parts):
+                targets, values = [[target] for target in elements], parts
         results = [self._reference(expression) for expression in values]  # all of them, before any name changes
         for group, expression, value in zip(targets, values, results, strict=True):
             if self._has_own(value, expression):
@@ -566,12 +566,12 @@ class _Body:
     def _statement_For(self, node: ast.For) -> None:
         match node:
             case ast.For(
-                target=ast.Name(id=name), iter=ast.Call(func=ast.Name("range"), args=given, keywords=[]), orelse=[]
-            ) if 1 <= len(given) <= 3:
+                target=ast.Name(id=name), iter=ast.Call(func=ast.Name("range"), args=bounds, keywords=[]), orelse=[]
+            ) if 1 <= len(bounds) <= 3:
                 pass
             case _:
                 self._refuse(node, f"`{ast.unparse(node).splitlines()[0]}`", "for NAME in range(...), without an else")
-        values = [self._expression(argument) for argument in given]
+        values = [self._expression(bound) for bound in bounds]
         numbers = [self._int(value, node) for value in values]
         start, stop, step = ("0", numbers[0], "1") if len(numbers) == 1 else (*numbers, "1")[:3]
         size = values[2].constant if len(values) == 3 else 1
@@ -896,16 +896,16 @@ class _Body:
         name = node.func.id
         meaning = self.scope.find(name) if name not in self._local else None
         by_address = isinstance(meaning, ScopedFunction) and _by_address(meaning)
-        given = [self._reference(argument) if by_address else self._expression(argument) for argument in node.args]
+        values = [self._reference(argument) if by_address else self._expression(argument) for argument in node.args]
         match meaning:
             case ScopedFunction():
-                return self._call_kernel(meaning, given, node)
+                return self._call_kernel(meaning, values, node)
             case Record(name=record, fields=fields):
-                if len(given) != len(fields):
-                    self._refuse(node, f"{len(given)} fields of {record}", str(len(fields)))
-                return Value(Group(tuple(value.type for value in given), record, fields), parts=tuple(given))
+                if len(values) != len(fields):
+                    self._refuse(node, f"{len(values)} fields of {record}", str(len(fields)))
+                return Value(Group(tuple(value.type for value in values), record, fields), parts=tuple(values))
             case Word():
-                return self._call_word(meaning.name, given, node)
+                return self._call_word(meaning.name, values, node)
         self._refuse(node, f"a call of {name}", "a kernel, a record or a word of `codegen/language.py`")
 
     def _call_kernel(self, function: ScopedFunction, given: list[Value], node: ast.Call) -> Value | None:

@@ -305,7 +305,7 @@ def _text_of(module: str) -> str:
     if module.startswith(__name__.partition(".")[0] + "."):
         return inspect.getsource(_imported(module))
     home, parsed = _imported(module), _parsed_module(module)
-    names = {node.id for own in parsed.functions.values() for node in ast.walk(own) if isinstance(node, ast.Name)}
+    names = {node.id for tree in parsed.functions.values() for node in ast.walk(tree) if isinstance(node, ast.Name)}
     constants = ((name, getattr(home, name, None)) for name in sorted(names))
     return "\n".join([parsed.text, *(f"{name} = {value!r}" for name, value in constants if _is_constant(value))])
 

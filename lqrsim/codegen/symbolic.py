@@ -138,12 +138,12 @@ def trace(
     p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
     for constant, value in (constants or {}).items():  # Integers, so that x + 0 and 1 * x simplify to x
         setattr(p, constant, sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(value))
-    given = (Vector(x, states), p) if controls is None else (Vector(x, states), Vector(u, controls), p)
+    arguments = (Vector(x, states), p) if controls is None else (Vector(x, states), Vector(u, controls), p)
     of, counted = ("x", "") if controls is None else ("x, u", f" and {len(u)} in u")
     called = f"{getattr(function, '__qualname__', repr(function))}({of}, p)"
     try:
         with _unsorted_extremes():
-            returned = function(*given)
+            returned = function(*arguments)
     except InputError as error:
         raise InputError(f"{called}: {error}") from None
     except Exception as error:  # any exception of a user's function becomes one line

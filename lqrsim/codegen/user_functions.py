@@ -198,10 +198,10 @@ class UserFunction:
 
     def _values(self, function: Callable[..., Any], x: Array, u: Array, p: Any) -> list[Array]:
         """What it returns, as one vector, or writes; of copies, because it may keep them beyond the call."""
-        given = (x.copy(), u.copy())[: 1 + self.with_control]
+        inputs = (x.copy(), u.copy())[: 1 + self.with_control]
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
-            returned = function(*given, p, *written)
+            returned = function(*inputs, p, *written)
             if self.writes and returned is not None:
                 last = "argument" if len(self.writes) == 1 else "two arguments"
                 raise InputError(f"got {excerpt(returned)} returned, want the result written to the last {last}")
@@ -296,9 +296,9 @@ class UserFunction:
             got = "got 'compiled', which needs numba, want pip install 'lqrsim[numba]'"
             raise InputError(f"{self.name}: level: {got}") from error
         function, adapter = self.function, self._adapter()
-        own, parameters = fingerprint(function), parameters_class(self.parameters)
+        digest, parameters = fingerprint(function), parameters_class(self.parameters)
         parts = [version("numba"), version("llvmlite"), repr(instruction_set()), adapter, repr(parameters._fields)]
-        key = disk.key(*parts, own) if own else ""
+        key = disk.key(*parts, digest) if digest else ""
         if key in _loaded:
             return _loaded[key]
         stored = disk.load(key) if key else None

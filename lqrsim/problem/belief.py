@@ -164,8 +164,8 @@ class Belief(Dynamics):
         standard deviations.
         """
         n, rows = self.size, self.rows
-        given = real("covariance", covariance)
-        full = np.diag(check_array("covariance", given, (n,)) ** 2) if given.ndim == 1 else given
+        numbers = real("covariance", covariance)
+        full = np.diag(check_array("covariance", numbers, (n,)) ** 2) if numbers.ndim == 1 else numbers
         try:
             root = np.linalg.cholesky(check_array("covariance", full, (n, n))[np.ix_(rows, rows)])
         except np.linalg.LinAlgError:
@@ -175,10 +175,10 @@ class Belief(Dynamics):
     def covariance(self, states: npt.ArrayLike) -> Array:
         """The covariances (..., n, n) of beliefs (..., N), zero in states that are known."""
         n, rows = self.size, np.array(self.rows)
-        given = vectors_of("states", states, len(self.state_coordinates))
-        root = np.zeros((*given.shape[:-1], n, n))
+        beliefs = vectors_of("states", states, len(self.state_coordinates))
+        root = np.zeros((*beliefs.shape[:-1], n, n))
         i, j = np.tril_indices(len(rows))
-        root[..., rows[i], rows[j]] = given[..., n:]
+        root[..., rows[i], rows[j]] = beliefs[..., n:]
         return root @ root.swapaxes(-1, -2)
 
     def uncertainty(self, weights: Mapping[str, float]) -> dict[str, float]:

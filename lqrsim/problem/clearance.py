@@ -48,10 +48,10 @@ class Clearance(KeepsClear, Constraint):
         margin: float | npt.ArrayLike = 0.0,
     ) -> None:
         self._set_shape(world, radius, balls, geoms)
-        given = real("Clearance: margin", margin)
-        self.margin: float | Array = check_number("Clearance: margin", margin) if given.ndim == 0 else given
-        if given.ndim:
-            self.margin = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
+        numbers = real("Clearance: margin", margin)
+        self.margin: float | Array = check_number("Clearance: margin", margin) if numbers.ndim == 0 else numbers
+        if numbers.ndim:
+            self.margin = check_array("Clearance: margin", margin, (None,) * min(numbers.ndim, 2))
             if not self.margin.size:
                 raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
 

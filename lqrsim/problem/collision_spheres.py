@@ -172,8 +172,8 @@ class CollisionSpheres:
         """Check and set the attributes of each ball."""
         self.hulls = None
         if hulls is not None:
-            given = check_items("CollisionSpheres: hulls", hulls, (int, np.integer), "the number of balls of each hull")
-            self.hulls = tuple(check_count("CollisionSpheres: hulls", size, at_most=MOST_CORNERS) for size in given)
+            sizes = check_items("CollisionSpheres: hulls", hulls, (int, np.integer), "the number of balls of each hull")
+            self.hulls = tuple(check_count("CollisionSpheres: hulls", size, at_most=MOST_CORNERS) for size in sizes)
             if np.ndim(radii) == 0:  # pyright: ignore[reportArgumentType]
                 radius = check_number("CollisionSpheres: radii", radii, at_least=0.0)
                 radii = np.full(sum(self.hulls), radius)
@@ -226,15 +226,15 @@ class CollisionSpheres:
         """Bind the places to the system whose states move the balls."""
         if self.level != "symbolic":
             return self._bind_functions(dynamics)
-        own = dynamics.calling
-        states, constants = dynamics.state_coordinates.names, own.constants
-        details = ("balls", states, len(self), tuple(own.parameters), *constants.items())
+        called = dynamics.calling
+        states, constants = dynamics.state_coordinates.names, called.constants
+        details = ("balls", states, len(self), tuple(called.parameters), *constants.items())
         traced = symbolic.kept(
-            self.function, details, lambda: self._trace(states, own.parameters, constants),
+            self.function, details, lambda: self._trace(states, called.parameters, constants),
             source=str, size=int, depends_on=list,
         )  # fmt: skip
         self._check_plane(traced["size"], dynamics.state_coordinates)
-        return SphereCenters(traced["source"], own.data, tuple(traced["depends_on"]), traced["size"] == 2)
+        return SphereCenters(traced["source"], called.data, tuple(traced["depends_on"]), traced["size"] == 2)
 
     def _trace(
         self, states: Sequence[str], parameters: Mapping[str, float], constants: Mapping[str, float]
@@ -266,17 +266,17 @@ class CollisionSpheres:
         return {"source": f"{places}\n\n{jacobian}", "size": size, "depends_on": depends_on}
 
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
-        names, size, own = dynamics.state_coordinates.names, self._size_of(dynamics), dynamics.calling
+        names, size, called = dynamics.state_coordinates.names, self._size_of(dynamics), dynamics.calling
         axes, unused = axes_of("CollisionSpheres", self.depends_on, names)
         returned = {"values": size * len(self), "entries": self.ball_names, "columns": size, "unused": unused}
         functions = with_derivatives(
             self.function, returned, self.jacobian, ((len(self), size, len(names)),),
-            level=self.level, states=len(names), controls=0, parameters=tuple(own.parameters), with_control=False,
+            level=self.level, states=len(names), controls=0, parameters=tuple(called.parameters), with_control=False,
         )  # fmt: skip
         source = source_of(user_functions, BALLS=len(self), COORDINATES=size)
         if len(functions) == 1:
             source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
-        return SphereCenters(source, own.data, axes, size == 2, functions=functions)
+        return SphereCenters(source, called.data, axes, size == 2, functions=functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
         """The number of coordinates that a compiled or plain function returns for each ball, found by calling it."""
@@ -313,11 +313,11 @@ class CollisionSpheres:
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
     """Centres of this number of balls, (..., count, 3), by compiled code, at states (..., n)."""
-    given = np.asarray(states, dtype=np.float64)
-    flat = in_c_order(given.reshape(-1, given.shape[-1]))
+    points = np.asarray(states, dtype=np.float64)
+    flat = in_c_order(points.reshape(-1, points.shape[-1]))
     out = np.empty((len(flat), 3 * count))
     _call(places, "centres_of", flat, out)
-    return out.reshape(*given.shape[:-1], count, 3)
+    return out.reshape(*points.shape[:-1], count, 3)
 
 
 def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:

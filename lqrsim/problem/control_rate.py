@@ -51,12 +51,12 @@ class ControlRate:
         if self.weight is None and self.limits is None:
             raise InputError("ControlRate: got neither a weight nor limits, want one of the two at least")
         for name in ("weight", "previous"):
-            given = getattr(self, name)
-            if given is not None and not isinstance(given, Mapping):
-                given = _sized(f"ControlRate: {name}", given, "a number, or one for each control")
-                if name == "weight" and (given < 0).any():
-                    raise InputError(f"ControlRate: weight: got {brief(given)}, want numbers >= 0")
-                keep(self, **{name: given})
+            numbers = getattr(self, name)
+            if numbers is not None and not isinstance(numbers, Mapping):
+                numbers = _sized(f"ControlRate: {name}", numbers, "a number, or one for each control")
+                if name == "weight" and (numbers < 0).any():
+                    raise InputError(f"ControlRate: weight: got {brief(numbers)}, want numbers >= 0")
+                keep(self, **{name: numbers})
         if self.limits is not None and not isinstance(self.limits, Mapping):
             keep(self, limits=_range("ControlRate: limits", self.limits))
 
@@ -68,10 +68,10 @@ class ControlRate:
         """The same with an array (m,) for all that is given. Raises InputError if it does not fit the controls."""
         space, fields = dynamics.control_coordinates, dict[str, Any]()
         for name in ("weight", "previous"):
-            given = getattr(self, name)
-            if isinstance(given, Mapping):
-                given = space._numbers(f"ControlRate: {name}", given)
-            fields[name] = None if given is None else _each(f"ControlRate: {name}", given, space)
+            numbers = getattr(self, name)
+            if isinstance(numbers, Mapping):
+                numbers = space._numbers(f"ControlRate: {name}", numbers)
+            fields[name] = None if numbers is None else _each(f"ControlRate: {name}", numbers, space)
         limits: Any = self.limits
         if isinstance(limits, Mapping):
             sides = np.tile([[-inf], [inf]], len(space))

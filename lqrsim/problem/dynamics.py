@@ -124,9 +124,9 @@ class Dynamics:
         period: Positive | None = None,
     ) -> None:
         self._period = period
-        for field, given in (("states", states), ("controls", controls)):
-            if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
-                raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: unit")
+        for field, units in (("states", states), ("controls", controls)):
+            if not isinstance(units, Mapping) or not all(isinstance(name, str) for name in units):
+                raise InputError(f"{field}: got {excerpt(units)}, want a dictionary of name: unit")
         if not states or not controls:
             raise InputError(
                 f"dynamics: got {len(states)} states and {len(controls)} controls, want at least one of each"
@@ -271,8 +271,8 @@ class Dynamics:
     def source(self) -> Source:
         """Source of `rate` and `rate_jacobian` of `kernels/declarations.py`; symbolic dynamics are traced, once."""
         if self.level != "symbolic":
-            given = source_of(user_functions)
-            return given if len(self.functions) > 1 else source_of(differences).filled(rate=given)
+            kernel = source_of(user_functions)
+            return kernel if len(self.functions) > 1 else source_of(differences).filled(rate=kernel)
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names, *self.constants.items())
         traced = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)

@@ -116,8 +116,8 @@ class Noise:
             if not self.matrix.size or self.matrix.shape[1] > MOST:
                 raise InputError(f"Noise: function: got shape {self.matrix.shape}, want (n, k), k from 1 to {MOST}")
             self.size = self.matrix.shape[1]
-            given = {"size": size, "parameters": parameters, "depends_on": depends_on, "level": level}
-            for name, value in given.items():
+            others = {"size": size, "parameters": parameters, "depends_on": depends_on, "level": level}
+            for name, value in others.items():
                 if value is not None:
                     raise InputError(f"Noise: {name}: got {excerpt(value)} beside a matrix, want none")
         self.function: Any = function
@@ -163,8 +163,8 @@ class Noise:
                 {"values": n * self.size, "entries": names[0], "columns": self.size, "unused": unused}, None, (),
                 level=self.level, states=n, controls=len(names[1]), parameters=tuple(self.parameters),
             )  # fmt: skip
-            given = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
-            source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
+            user_source = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
+            source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=user_source)
             return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
         details = ("noise", *names, self.size, tuple(self.parameters))
         traced = symbolic.kept(self.function, details, lambda: self._trace(*names), source=str, rows=list, active=list)

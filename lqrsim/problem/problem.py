@@ -165,8 +165,8 @@ class Problem(OneVersion):
         self.dynamics.check_period(self.dt)
         check_memory("steps", self.steps, self.bytes_per_step)
         for name in ("stage_cost", "final_cost", "initial"):
-            given, fixed = getattr(self, name), name == "initial" and isinstance(self.initial, FixedState)
-            keep(self, **{name: given._in(self.dynamics) if fixed else in_system(given, self.dynamics, name)})
+            part, fixed = getattr(self, name), name == "initial" and isinstance(self.initial, FixedState)
+            keep(self, **{name: part._in(self.dynamics) if fixed else in_system(part, self.dynamics, name)})
         costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
         if isinstance(self.initial, FixedState):
             # A zero cost, with which fixed and soft starts share compiled code.
@@ -199,8 +199,8 @@ class Problem(OneVersion):
             keep(self, control_limits=(limited.low, limited.high), _controls=(limited, limited.within(controls)))
         else:
             keep(self, _controls=(controls, controls))
-        start, kept = self.start, [cost.kept_clear for cost in self.obstacle_costs]
-        if start is not None and (collision := self._inside(kept, start, self.begin)) is not None:
+        start, terms = self.start, [cost.kept_clear for cost in self.obstacle_costs]
+        if start is not None and (collision := self._inside(terms, start, self.begin)) is not None:
             where, advice = collision
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
 
@@ -428,7 +428,7 @@ class Problem(OneVersion):
     def kept_clear(self) -> tuple[KeepsClear, ...]:
         """The costs and constraints that keep the robot clear of obstacles."""
         parts = *terms_of(self.stage_cost), *self.constraints
-        return tuple(kept for part in parts if (kept := part.kept_clear) is not None)
+        return tuple(term for part in parts if (term := part.kept_clear) is not None)
 
     def terms(self, which: str) -> tuple[CostTerm, ...]:
         """The bound terms of "initial", "stage_cost" or "final_cost"."""

@@ -122,11 +122,11 @@ class _SquareCost(Cost):
         return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        own = self._in(dynamics)
-        (weight, about), size = own._known, own.weight.shape[-1]
-        counts = [about.size // size, weight.size // size**2] if own.by_knot else []
+        cost = self._in(dynamics)
+        (weight, about), size = cost._known, cost.weight.shape[-1]
+        counts = [about.size // size, weight.size // size**2] if cost.by_knot else []
         data = np.concatenate([counts, about.ravel(), weight.ravel()])
-        kernel = source_of(__name__, CONTROL=self.controls, BY_KNOT=own.by_knot)
+        kernel = source_of(__name__, CONTROL=self.controls, BY_KNOT=cost.by_knot)
         return CostTerm(kernel, data, uses_control=self.controls)
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:

@@ -62,7 +62,7 @@ class WithinPeriods(Constraint):
 
     def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         term = self.constraint._bind_beside(dynamics, times, goals)
-        own = [times[1] - times[0], *self.acts.shape, *dynamics.data, *self.spares, *self.acts.ravel()]
+        numbers = [times[1] - times[0], *self.acts.shape, *dynamics.data, *self.spares, *self.acts.ravel()]
         kernel = source_of(
             __name__, AT=len(term.functions) + len(term.data), PARAMETERS=len(dynamics.data), SHARED=term.shared,
             BOTH=int(self.constraint.by_knot and not term.uses_control),
@@ -72,7 +72,7 @@ class WithinPeriods(Constraint):
         if term.shared:
             filled |= {name: (term.code, name) for name in ("places", "places_jacobian")}
         return replace(
-            term, source=kernel.filled(**filled), data=np.concatenate([term.data, own]), rows=TIMES * term.rows,
+            term, source=kernel.filled(**filled), data=np.concatenate([term.data, numbers]), rows=TIMES * term.rows,
             describe=lambda row: f"{term.describe(row % term.rows)}, between the knots", names=TIMES * term.names,
             ranges=None if term.ranges is None else np.tile(term.ranges, TIMES),
             uses_control=True, shared=0, convex=False, linear=False,
