@@ -113,15 +113,15 @@ class ForceLimits(Constraint):
         return ForceLimits(limits, None if self.later is None else wide(self.later))
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
-        own, n, m = dynamics.calling, len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        assert isinstance(own, MjcfDynamics)
-        if more := n - len(own.state_coordinates):
+        mjcf_dynamics, n, m = dynamics.calling, len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        assert isinstance(mjcf_dynamics, MjcfDynamics)
+        if more := n - len(mjcf_dynamics.state_coordinates):
             limits = [
                 limit._replace(slopes=np.delete(limit.slopes, np.s_[1 + n - more : 1 + n])) for limit in self.limits
             ]
-            narrow = ForceLimits(limits)._refined(own, replace(plan, states=plan.states[:, : n - more]))
+            narrow = ForceLimits(limits)._refined(mjcf_dynamics, replace(plan, states=plan.states[:, : n - more]))
             return None if narrow is None else narrow._widened(m, more)
-        dynamics = own
+        dynamics = mjcf_dynamics
         count, pairs = round(plan.dt / dynamics.period), zip(plan.states, plan.controls, strict=False)
         later = np.stack([self._ahead(dynamics, x, u, count) for x, u in pairs])
         forces = later[..., 0] + np.einsum("tki,ti->tk", later[..., 1:], np.hstack([plan.states[:-1], plan.controls]))
@@ -188,12 +188,12 @@ def limited_forces(mjcf: MjcfModel) -> tuple[tuple[ForceLimit, ...], tuple[str, 
             size = np.abs(zero) + np.abs(z) @ np.abs(slopes)
             linear &= np.abs(forces(z) - zero - z @ slopes) <= _LINEAR * size
     slopes = np.vstack([zero, slopes])
-    kept = tuple(
-        ForceLimit(name, unit, *sides, slopes[:, place].copy(), of_joint, number)
-        for name, unit, sides, place, of_joint, number in limited
-        if linear[place]
+    limits = tuple(
+        ForceLimit(name, unit, *sides, slopes[:, column].copy(), of_joint, number)
+        for name, unit, sides, column, of_joint, number in limited
+        if linear[column]
     )
-    return kept, tuple(name for name, _, _, place, _, _ in limited if not linear[place])
+    return limits, tuple(name for name, _, _, column, _, _ in limited if not linear[column])
 
 
 # The kernel. `data` has the numbers of steps and rows, and for each step and row its value at zero and its slopes.

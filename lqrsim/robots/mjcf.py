@@ -182,7 +182,7 @@ class MjcfRobot(Robot):
         other = MjcfRobot(copy, **stated)
         # Their places in the compiled model, which differ in the last bits.
         pairs = zip(other.scene.world.obstacles, world.obstacles, strict=True)
-        moved = World([replace(own, velocity=obstacle.velocity) for own, obstacle in pairs])
+        moved = World([replace(compiled, velocity=obstacle.velocity) for compiled, obstacle in pairs])
         return shape_in(other.dynamics, moved, geoms=other.geoms)
 
     def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
@@ -453,15 +453,15 @@ class MjcfRobot(Robot):
 
     def _remarks(self) -> dict[str, list[str]]:
         """What a plan does about forces and speeds, what is amiss at the MJCF's rest, and obstacles, by title."""
-        model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
-        space, joints, (kept, clipped) = self.dynamics.state_coordinates, self.mjcf.joints, self._forces
+        model, rest_state, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
+        space, joints, (limits, clipped) = self.dynamics.state_coordinates, self.mjcf.joints, self._forces
         losses = zip(space.names, space.units, model.dof_frictionloss.tolist(), strict=False)
         tendons = ((model.tendon(i).name, "m", loss) for i, loss in enumerate(model.tendon_frictionloss.tolist()))
         units, obstacle_of = {"rad": "N m", "m": "N"}, dict(zip(self.scene.geoms, self.scene.world.names, strict=True))
         past = [
-            f"{names[joint.dof]} {rest[joint.dof]:.4g} (want {joint.limits[0]:.4g} to {joint.limits[1]:.4g})"
+            f"{names[joint.dof]} {rest_state[joint.dof]:.4g} (want {joint.limits[0]:.4g} to {joint.limits[1]:.4g})"
             for joint in joints
-            if joint.limits is not None and not joint.limits[0] <= rest[joint.dof] <= joint.limits[1]
+            if joint.limits is not None and not joint.limits[0] <= rest_state[joint.dof] <= joint.limits[1]
         ]
         mounts = [
             f"{obstacle_of[obstacle]} ({self.scene.model.body(int(self.scene.model.geom_bodyid[mount])).name})"
@@ -469,7 +469,7 @@ class MjcfRobot(Robot):
         ]
         return {
             "force limits, constraints of plans": [
-                f"{limit.name.partition(' ')[2]} {limit.low:.4g} to {limit.high:.4g} {limit.unit}" for limit in kept
+                f"{limit.name.partition(' ')[2]} {limit.low:.4g} to {limit.high:.4g} {limit.unit}" for limit in limits
             ],
             "force limits, clipped in plans as in runs": [name.partition(" ")[2] for name in clipped],
             "dry friction, in plans and runs": [
@@ -481,7 +481,7 @@ class MjcfRobot(Robot):
                 if np.isfinite(joint.speed)
             ],
             "past their limits at rest": past,
-            "touching at rest": [" and ".join(pair) for pair in contacts_of(model, self.configuration(rest)[0])],
+            "touching at rest": [" and ".join(pair) for pair in contacts_of(model, self.configuration(rest_state)[0])],
             "obstacles": list(self.scene.world.names) or ["none"],
             "carried, without contacts, by": list(dict.fromkeys(mounts)),
         }

@@ -49,7 +49,7 @@ class MjcfGeoms(CollisionGeoms):
         return float(self.scene.model.geom_rbound[geoms].max(initial=0.0))
 
     def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
-        own, numbers = self._bound(dynamics, world)
+        mjcf_dynamics, numbers = self._bound(dynamics, world)
         if world.moving:
             raise InputError("geoms: got obstacles that move, want balls=robot.balls for them")
         chosen = np.flatnonzero(np.isin(self._number, numbers))
@@ -64,13 +64,13 @@ class MjcfGeoms(CollisionGeoms):
             source=source_of(mjcf_distances, ROWS=max(1, len(rows))), data=data,
             parts=tuple(self.scene.model.body(body).name for body, _ in rows),
             obstacles=tuple(number for _, number in rows), moved=self.scene.model.nv,
-            functions=(MjcfMemory.of(own),),
+            functions=(MjcfMemory.of(mjcf_dynamics),),
         )  # fmt: skip
 
     def clearances(
         self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
     ) -> Array:
-        own, numbers = self._bound(dynamics, world)
+        mjcf_dynamics, numbers = self._bound(dynamics, world)
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(numbers)
         moved = displaced is not None and bool(displaced.any())
@@ -78,28 +78,28 @@ class MjcfGeoms(CollisionGeoms):
         per_displacement = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
         out, which, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
         if count:
-            _, data = self._to_each(own, numbers)
+            _, data = self._to_each(mjcf_dynamics, numbers)
             self._module(dynamics).distances_of(
                 len(flat), flat, per_displacement, away, int(moved), data, out, which, segments
             )
         return out[: len(flat) * count].reshape(*states.shape[:-1], count)
 
     def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
-        own, numbers = self._bound(dynamics, world)
+        mjcf_dynamics, numbers = self._bound(dynamics, world)
         flat, count = in_c_order(vectors_of("states", states, len(dynamics.state_coordinates))), len(numbers)
         out, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
         which, segments = np.empty(count + 1), np.empty((count + 1, 6))
         if count:
-            _, data = self._to_each(own, numbers)
+            _, data = self._to_each(mjcf_dynamics, numbers)
             self._module(dynamics).slopes_of(len(flat), flat, data, out, slopes, which, segments)
         shape = len(flat), count
         return out[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
 
     def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
-        own, numbers = self._bound(dynamics, world)
+        mjcf_dynamics, numbers = self._bound(dynamics, world)
         flat, count = in_c_order(np.asarray(state, dtype=np.float64)[None]), len(numbers)
         out, which, segments = np.empty(count), np.empty(count + 1), np.empty((count + 1, 6))
-        chosen, data = self._to_each(own, numbers)
+        chosen, data = self._to_each(mjcf_dynamics, numbers)
         self._module(dynamics).distances_of(1, flat, 1, np.zeros(1), 0, data, out, which, segments)
         pair = self._pairs[chosen[int(which[int(out.argmin())])]]
         first, second = (self.scene.model.body(body).name for body in self.scene.model.geom_bodyid[pair].tolist())
@@ -114,10 +114,10 @@ class MjcfGeoms(CollisionGeoms):
 
     def _bound(self, dynamics: Dynamics, world: World) -> tuple[MjcfDynamics, npt.NDArray[np.int64]]:
         """MuJoCo's dynamics, and the index in the scene of each obstacle of the world. Raises InputError."""
-        if not isinstance(own := dynamics.calling, MjcfDynamics):
+        if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
             raise InputError(f"geoms: got an MJCF's geoms for {dynamics.name}, want its own dynamics, robot.dynamics")
         if world is self.scene.world:
-            return own, np.arange(len(world))
+            return mjcf_dynamics, np.arange(len(world))
         known = {obstacle.name: (number, obstacle) for number, obstacle in enumerate(self.scene.world.obstacles)}
         numbers = []
         for obstacle in world.obstacles:
@@ -128,7 +128,7 @@ class MjcfGeoms(CollisionGeoms):
                     f" robot.scene.world: {', '.join(known) or 'there are none'}; or balls=robot.balls"
                 )
             numbers.append(number)
-        return own, np.array(numbers, dtype=np.int64)
+        return mjcf_dynamics, np.array(numbers, dtype=np.int64)
 
     def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
         """The kernel's data, except the address of p."""
@@ -176,7 +176,7 @@ class SelfClearance(Constraint):
         return self
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        if not isinstance(own := dynamics.calling, MjcfDynamics):
+        if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
             raise InputError(f"SelfClearance: got dynamics {dynamics.name}, want the robot's own, robot.dynamics")
         model = self._mjcf.model
         reach = self.margin + SEEN * float(model.geom_rbound[self._pairs].max(initial=0.0))
@@ -189,7 +189,7 @@ class SelfClearance(Constraint):
         count = max(1, len(described))
         distances = Residual(
             source_of(mjcf_distances, ROWS=count), mjcf_obstacles.distance_data(model, self._pairs, rows, count, reach),
-            parts=tuple(described), moved=model.nv, functions=(MjcfMemory.of(own),),
+            parts=tuple(described), moved=model.nv, functions=(MjcfMemory.of(mjcf_dynamics),),
         )  # fmt: skip
 
         def describe(row: int) -> str:
@@ -237,10 +237,10 @@ class MjcfBalls(CollisionSpheres):
         return "MuJoCo's kinematics"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
-        if not isinstance(own := dynamics.calling, MjcfDynamics):
+        if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
             raise InputError(f"balls: got an MJCF's balls for {dynamics.name}, want its own dynamics, robot.dynamics")
-        memory = MjcfMemory.of(own)
-        positions = tuple(range(own.physics.model.nv))
+        memory = MjcfMemory.of(mjcf_dynamics)
+        positions = tuple(range(mjcf_dynamics.physics.model.nv))
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
         source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_distances))
         return SphereCenters(source, data, positions, functions=(memory,))

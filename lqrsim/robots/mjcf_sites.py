@@ -68,9 +68,9 @@ class _Pose:
 
     def bind(self, dynamics: Dynamics) -> Residual:
         """The errors, for a system. Raises InputError."""
-        if not isinstance(own := dynamics.calling, MjcfDynamics):
+        if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
             raise InputError(f"{self.what}: got {dynamics.name}, want the dynamics of an MjcfRobot")
-        model = own.physics.model
+        model = mjcf_dynamics.physics.model
         names = [model.site(number).name for number in range(model.nsite)]
         number = names.index(check_name(f"{self.what}: site", self.site, [name for name in names if name]))
         position = np.zeros(3) if self.position is None else self.position
@@ -78,7 +78,7 @@ class _Pose:
         source = source_of(__name__, PLACED=int(self.position is not None), TURNED=int(self.axes is not None))
         axes = axes_of(model.site_quat[number]).ravel()
         data = np.concatenate([[model.site_bodyid[number]], model.site_pos[number], axes, position, wanted.ravel()])
-        return Residual(source, data, tuple(self.rows), model.nv, functions=(MjcfMemory.of(own),))
+        return Residual(source, data, tuple(self.rows), model.nv, functions=(MjcfMemory.of(mjcf_dynamics),))
 
 
 class SiteCost(Cost):
@@ -107,8 +107,8 @@ class SiteCost(Cost):
     ) -> None:
         self.pose = _Pose("SiteCost", site, position, orientation)
         self.weights = tuple(
-            check_weights(f"SiteCost: {name}", given, 3)
-            for name, given in (("weight", weight), ("turn_weight", turn_weight))
+            check_weights(f"SiteCost: {name}", values, 3)
+            for name, values in (("weight", weight), ("turn_weight", turn_weight))
         )
 
     def with_added_state(self, dynamics: Dynamics) -> Self:

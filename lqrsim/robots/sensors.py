@@ -73,14 +73,14 @@ class RobotSensors:
 
     @checked
     def __init__(self, robot: Robot, scene: Scene, sensors: Sequence[Sensor]) -> None:
-        given = check_items("sensors", sensors, Sensor, "a list of Sensor")
-        if not given or len({sensor.name for sensor in given}) < len(given):
-            raise InputError(f"sensors: got {[sensor.name for sensor in given]}, want at least one, each at most once")
+        stated = check_items("sensors", sensors, Sensor, "a list of Sensor")
+        if not stated or len({sensor.name for sensor in stated}) < len(stated):
+            raise InputError(f"sensors: got {[sensor.name for sensor in stated]}, want at least one, each at most once")
         self._robot, self._scene = robot, scene
         self.drag = robot.drag
         model, sensors, places, far = scene.model, list[Sensor](), list[npt.NDArray[np.intp]](), list[Array]()
         columns, names, quaternions, count = list[slice](), list[str](), list[bool](), 0
-        for sensor in given:
+        for sensor in stated:
             number = _number_of(model, sensor.name)
             kind, size = _TYPES(model.sensor_type[number]), int(model.sensor_dim[number])
             interval = float(model.sensor_interval[number, 0])  # 0 for each physics step
@@ -112,8 +112,8 @@ class RobotSensors:
 
     def check_robot(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these are sensors of the robot with these dynamics."""
-        own, others = self._robot.dynamics.state_coordinates, dynamics.state_coordinates
-        if own.names != others.names:
+        coordinates, others = self._robot.dynamics.state_coordinates, dynamics.state_coordinates
+        if coordinates.names != others.names:
             raise InputError(f"sensors: got those of robot {self._robot.name}, want those of the problem's robot")
 
     def each(self, field: str) -> Array:

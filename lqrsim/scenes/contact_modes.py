@@ -151,10 +151,10 @@ class ContactModes:
             distances = (seen.efc_pos - seen.efc_margin)[limits] + _NEAR
             found.append((first + _limits(self._ahead, seen, limits), distances))
         if seen.ncon:
-            geoms, wide, own = seen.contact.geom, self._ahead.geom_margin, model.geom_margin
+            geoms, wide_margin, geom_margin = seen.contact.geom, self._ahead.geom_margin, model.geom_margin
             # Versions of MuJoCo differ in whether the margin of two geoms is their sum or their maximum.
-            summed = np.abs(seen.contact.includemargin - wide[geoms].sum(axis=1)) < 1e-9
-            margins = np.where(summed, own[geoms].sum(axis=1), own[geoms].max(axis=1))
+            summed = np.abs(seen.contact.includemargin - wide_margin[geoms].sum(axis=1)) < 1e-9
+            margins = np.where(summed, geom_margin[geoms].sum(axis=1), geom_margin[geoms].max(axis=1))
             found.append((first + _contacts(geoms), seen.contact.dist - margins))
         data = self._data
         if data.nefc == 0:
@@ -166,9 +166,9 @@ class ContactModes:
         if limits.any():
             found.append((first + _FORCE + _limits(model, data, limits), excess[limits]))
         if contacts.any():
-            which = data.efc_id[contacts]
-            edges = np.arange(len(which)) - np.searchsorted(which, which)
-            names = first + _FORCE + _contacts(data.contact.geom)[which] + edges
+            numbers = data.efc_id[contacts]
+            edges = np.arange(len(numbers)) - np.searchsorted(numbers, numbers)
+            names = first + _FORCE + _contacts(data.contact.geom)[numbers] + edges
             found.append((names, excess[contacts]))
 
     def linearize(self, state: Array, control: Array) -> Period:
@@ -207,11 +207,11 @@ def _among(types: npt.NDArray[np.int32], kinds: npt.NDArray[np.int64]) -> npt.ND
 
 def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.bool_]) -> Names:
     """Names of the limits in these rows: a joint or a tendon, its number, and which of its two limits."""
-    which, joints = data.efc_id[rows].astype(np.int64), data.efc_type[rows] == _LIMITS[0]
+    numbers, joints = data.efc_id[rows].astype(np.int64), data.efc_type[rows] == _LIMITS[0]
     lower = data.efc_J.reshape(data.nefc, -1)[rows].sum(axis=1) > 0  # of a joint
-    ropes = which[~joints]
-    lower[~joints] = np.isclose(data.efc_pos[rows][~joints], data.ten_length[ropes] - model.tendon_range[ropes, 0])
-    return 4 * which + 2 * joints + lower
+    tendons = numbers[~joints]
+    lower[~joints] = np.isclose(data.efc_pos[rows][~joints], data.ten_length[tendons] - model.tendon_range[tendons, 0])
+    return 4 * numbers + 2 * joints + lower
 
 
 def _contacts(geoms: npt.NDArray[np.int32]) -> Names:

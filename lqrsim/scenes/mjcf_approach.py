@@ -155,8 +155,8 @@ class Approaches:
         """The point of a tool, in its own axes, that is to touch: on its long axis, nearest to a place."""
         middle, half = np.split(self._model.geom_aabb[tool], 2)
         reach = np.where(half == half.max(), half - np.sort(half)[1], 0.0)
-        own = self._axes(tool).T @ (place - self._data.geom_xpos[tool])
-        return np.clip(own, middle - reach, middle + reach)
+        local = self._axes(tool).T @ (place - self._data.geom_xpos[tool])
+        return np.clip(local, middle - reach, middle + reach)
 
     def _axes(self, tool: int) -> Array:
         return self._data.geom_xmat[tool].reshape(3, 3)

@@ -237,21 +237,21 @@ class _Search:
                 score = np.inf
                 continue
             first = False
-            before, shorter = score, False
+            last_score, shorter = score, False
             for share in 0.5 ** np.arange(_HALVES):
-                which = np.flatnonzero((self._modes == 0) & ~self._idle)
-                tried = rest.rested(np.clip(z + share * (aim - z), low, high), which).clip(low, high)
-                if (then := self._score(tried)) < score:
-                    z, score, shorter = tried, then, share < 1
+                resting = np.flatnonzero((self._modes == 0) & ~self._idle)
+                trial = rest.rested(np.clip(z + share * (aim - z), low, high), resting).clip(low, high)
+                if (trial_score := self._score(trial)) < score:
+                    z, score, shorter = trial, trial_score, share < 1
                     break
-            if score <= _EXACT**2 or (score > _PROGRESS * before and not shorter and not self._turn(z[model.nu :])):
+            if score <= _EXACT**2 or (score > _PROGRESS * last_score and not shorter and not self._turn(z[model.nu :])):
                 break
         z = np.clip(np.where(np.abs(z) * self._weights < _EXACT, 0.0, z), low, high)  # rounding
-        left, moving = self._left(z)
+        missing, moving = self._left(z)
         missed, drifting = np.zeros(model.nv), np.zeros(model.nactuator, dtype=bool)
-        missed[self._kept] = left
+        missed[self._kept] = missing
         drifting[rest.of[model.nu :][np.abs(moving) > _HELD * np.maximum(1.0, np.abs(z[model.nu :]))]] = True
-        held = bool((np.abs(left) <= _HELD * rest.largest).all()) and not drifting.any()
+        held = bool((np.abs(missing) <= _HELD * rest.largest).all()) and not drifting.any()
         return Holding(z[: model.nu], z[model.nu :], missed, drifting, held)
 
     def _turn(self, act: Array) -> bool:
@@ -320,9 +320,9 @@ class _Search:
             acts = acts[(self._modes[acts] == 0) & ~self._idle[acts]]
             now = linear.rates[acts] / self._steepness[acts]
             rates = linear.rates_by[np.ix_(acts, entries)] / self._steepness[acts, None]
-            off, left_out = _unmet(rates, now, (self._low - z)[entries], (self._high - z)[entries])
-            end = np.where(off > 0, self._high[nu + acts], self._low[nu + acts])
-            modes = np.where(np.isfinite(end), np.where(off > 0, 1, -1), _DRIFTS)
+            remaining, left_out = _unmet(rates, now, (self._low - z)[entries], (self._high - z)[entries])
+            end = np.where(remaining > 0, self._high[nu + acts], self._low[nu + acts])
+            modes = np.where(np.isfinite(end), np.where(remaining > 0, 1, -1), _DRIFTS)
             self._modes[acts[left_out]] = modes[left_out]
             any_left = any_left or bool(left_out.any())
         return any_left
@@ -336,31 +336,35 @@ def _unmet(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, np
     from scipy.optimize import lsq_linear
 
     tight = np.where(low == high, _TIGHT, 0.0)  # lsq_linear refuses such bounds
-    every, off = range(len(now)), now
-    for left in itertools.chain.from_iterable(itertools.combinations(every[::-1], count) for count in range(len(now))):
-        out = np.isin(every, left)
-        weights = np.where(out, _TIGHT, 1.0)
-        off = now + rates @ lsq_linear(weights[:, None] * rates, -weights * now, (low - tight, high + tight)).x
-        if (np.abs(off[~out]) < _REST).all():
-            return off, out
-    return off, np.ones(len(now), dtype=bool)
+    rows, remaining = range(len(now)), now
+    for left in itertools.chain.from_iterable(itertools.combinations(rows[::-1], count) for count in range(len(now))):
+        left_out = np.isin(rows, left)
+        weights = np.where(left_out, _TIGHT, 1.0)
+        remaining = now + rates @ lsq_linear(weights[:, None] * rates, -weights * now, (low - tight, high + tight)).x
+        if (np.abs(remaining[~left_out]) < _REST).all():
+            return remaining, left_out
+    return remaining, np.ones(len(now), dtype=bool)
 
 
 def _force_limits(model: mujoco.MjModel, forces: Array, now: Array) -> Iterator[tuple[Array, Array, Array]]:
     """Limits of forces (nout,), with slopes (nout, k), of actuators and tendons: rows, least and largest change."""
     limited, single = model.actuator_forcelimited.astype(bool), model.actuator_outnum == 1
     outs, least, most = model.actuator_outadr, *model.actuator_forcerange.T
-    some = np.flatnonzero(limited & single)
-    yield forces[outs[some]], least[some] - now[outs[some]], most[some] - now[outs[some]]
+    actuators = np.flatnonzero(limited & single)
+    yield forces[outs[actuators]], least[actuators] - now[outs[actuators]], most[actuators] - now[outs[actuators]]
     for number in np.flatnonzero(limited & ~single).tolist():  # a torque, whose size is limited
-        own = slice(outs[number], outs[number] + model.actuator_outnum[number])
-        largest = float(np.linalg.norm(now[own]))
+        outputs = slice(outs[number], outs[number] + model.actuator_outnum[number])
+        largest = float(np.linalg.norm(now[outputs]))
         if largest > 0:
-            yield (now[own] / largest @ forces[own])[None], np.array([-np.inf]), np.array([most[number] - largest])
+            yield (
+                (now[outputs] / largest @ forces[outputs])[None],
+                np.array([-np.inf]),
+                np.array([most[number] - largest]),
+            )
     for tendon in np.flatnonzero(model.tendon_actfrclimited).tolist():
-        own = outs[_pulls(model, tendon)]
-        least, most = model.tendon_actfrcrange[tendon, :, None] - now[own].sum()
-        yield forces[own].sum(axis=0)[None], least, most
+        outputs = outs[_pulls(model, tendon)]
+        least, most = model.tendon_actfrcrange[tendon, :, None] - now[outputs].sum()
+        yield forces[outputs].sum(axis=0)[None], least, most
 
 
 def _pulls(model: mujoco.MjModel, tendon: int) -> npt.NDArray[np.bool_]:

@@ -142,11 +142,11 @@ def position_of(mjcf: MjcfModel, body: int) -> Axes:
     exact, shifted = dict[int, int](), dict[int, tuple[int, float]]()
     for dof, number in candidates.items():
         for axis in range(3):
-            away = origins[:, axis] - positions[:, number]
-            if np.abs(away).max() < 1e-9:
+            offset = origins[:, axis] - positions[:, number]
+            if np.abs(offset).max() < 1e-9:
                 exact[dof] = axis
-            elif np.ptp(away) < 1e-9:
-                shifted[dof] = (axis, float(away.mean()))
+            elif np.ptp(offset) < 1e-9:
+                shifted[dof] = (axis, float(offset.mean()))
     return Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))
 
 
@@ -175,10 +175,10 @@ def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
     """The body of a tree's geom that is farthest out at rest, the geom's place (3,) on it and bounding radius in m."""
     data = placed(model)
     moves = (model.body_rootid[model.geom_bodyid] == model.body_rootid[body]) & (model.geom_rbound > 0)
-    own = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))
-    if not len(own):
+    geoms = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))
+    if not len(geoms):
         return body, np.zeros(3), 0.0
-    geom = int(own[np.argmax(np.linalg.norm(data.geom_xpos[own] - data.xpos[body], axis=1))])
+    geom = int(geoms[np.argmax(np.linalg.norm(data.geom_xpos[geoms] - data.xpos[body], axis=1))])
     return int(model.geom_bodyid[geom]), model.geom_pos[geom].copy(), float(model.geom_rbound[geom])
 
 

@@ -344,7 +344,7 @@ class MjcfModel:
         Names are `unnamed_<kind>_<number>`, counted from 0; of several free joints without one, each gets its body's.
         """
         root = ElementTree.fromstring(self.xml)
-        taken = {element.get("name") for element in root.iter()}
+        used_names = {element.get("name") for element in root.iter()}
         # An MJCF has its own section worldbody, and one from each file that it includes.
         placed = [element for world in root.iter("worldbody") for element in world.iter()]
         kinds = {"body": ("body",), "joint": ("joint", "freejoint"), "geom": ("geom",)}
@@ -364,7 +364,7 @@ class MjcfModel:
             kind: [element for element in elements if element.get("name") is None] for kind, elements in parts.items()
         }
         for kind, elements in unnamed.items():
-            names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in taken)
+            names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in used_names)
             for element in elements:
                 element.set("name", next(names))
         changed = len(free) > 1 or any(unnamed.values())
@@ -453,13 +453,13 @@ class MjcfModel:
         for name, body in elements["body"].items():  # the compiled masses, in the place of what they came from
             for inertial in body.findall("inertial"):
                 body.remove(inertial)
-            heavy, scale = model.body(name), scales.get(name, 1.0)
-            if heavy.mass[0] > 0:
+            compiled_body, scale = model.body(name), scales.get(name, 1.0)
+            if compiled_body.mass[0] > 0:
                 inertial = ElementTree.Element("inertial")
-                _set(inertial, "pos", heavy.ipos)
-                _set(inertial, "quat", heavy.iquat)
-                _set(inertial, "mass", [scale * heavy.mass[0]])
-                _set(inertial, "diaginertia", scale * heavy.inertia)
+                _set(inertial, "pos", compiled_body.ipos)
+                _set(inertial, "quat", compiled_body.iquat)
+                _set(inertial, "mass", [scale * compiled_body.mass[0]])
+                _set(inertial, "diaginertia", scale * compiled_body.inertia)
                 body.insert(0, inertial)
         compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
         ElementTree.SubElement(root, "compiler", compiler)
@@ -468,13 +468,13 @@ class MjcfModel:
     def with_obstacles(self, world: World) -> "MjcfModel":
         """The same with these obstacles as further geoms, fixed to the world, which nothing touches."""
         root = ElementTree.fromstring(self.xml)
-        taken = {element.get("name") for element in root.iter("geom")}
+        geom_names = {element.get("name") for element in root.iter("geom")}
         section = ElementTree.SubElement(root, "worldbody")
         for obstacle in world.obstacles:
             drawn = [kind for kind in KINDS if kind != "mesh"]
             if obstacle.kind not in drawn:
                 raise InputError(f"moving: got {obstacle.name}, a {obstacle.kind}, want one of: {', '.join(drawn)}")
-            if obstacle.name in taken:
+            if obstacle.name in geom_names:
                 raise InputError(f"moving: got {obstacle.name}, which is a geom of the robot's MJCF, want another name")
             turn = np.zeros(4)
             mujoco.mju_mat2Quat(turn, obstacle.rotation.ravel())

@@ -51,8 +51,8 @@ def touchable(model: mujoco.MjModel, candidates: list[int], body: int) -> list[i
     """
     data, touched = placed(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
     pairs = touching_pairs(model, candidates)
-    own = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
-    ground = (_ground(model, data) if _sinks(model, data, body) else set[int]()) | _supports(model, pairs[own])
+    of_robot = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
+    ground = (_ground(model, data) if _sinks(model, data, body) else set[int]()) | _supports(model, pairs[of_robot])
     return [geom for geom in candidates if geom in touched and geom not in ground]
 
 

@@ -119,10 +119,10 @@ def _flatten(path: Path) -> str:
     folders = {kind: str(main / settings.get(kind, common)) for kind in ("meshdir", "texturedir")}
     files = [(element, key) for element in root.iter() for key in element.attrib if key.startswith("file")]
     for element, key in files:  # the same rule, but from the folder of their kind, of which an <attach> has none
-        kind, own = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir"), beside[element]
-        if kind and own == folder:
+        kind, file_folder = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir"), beside[element]
+        if kind and file_folder == folder:
             continue
-        first, second = (start / element.attrib[key] for start in (main / folders.get(kind, ""), own.resolve()))
+        first, second = (start / element.attrib[key] for start in (main / folders.get(kind, ""), file_folder.resolve()))
         nested = not os.path.isfile(first) and os.path.isfile(second)
         if nested or not kind:
             element.set(key, str(second if nested else first))
@@ -155,8 +155,8 @@ def spec_of(xml: str) -> mujoco.MjSpec:
     for kind, elements in (
         ("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms), ("actuator", spec.actuators),
     ):  # fmt: skip
-        taken = {element.name for element in elements}
-        names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in taken)
+        used_names = {element.name for element in elements}
+        names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in used_names)
         for element in elements:
             element.name = element.name or next(names)
     return spec
@@ -206,17 +206,17 @@ def _check_elements(xml: str, what: str) -> None:
 
 def _check_sizes(element: ElementTree.Element, what: str) -> None:
     """Raises InputError for a size beyond MOST, or a texture of more than MOST_PIXELS."""
-    given = element.attrib
+    attributes = element.attrib
     most = MOST.get(element.tag, {})
-    for key, text in given.items() if most else ():
+    for key, text in attributes.items() if most else ():
         largest = MOST_USER if key.startswith("nuser_") else most.get(key)
         if largest is not None and _size(text) > largest:
             got = f"{key}={excerpt(text)} in <{element.tag}>"
             raise InputError(f"{what}: got {got}, want {largest:,} at most")
-    if element.tag == "texture" and "builtin" in given:
-        width, height = _size(given.get("width", "0")), _size(given.get("height", "0"))
-        if max(width * height, 6 * width**2 if given.get("type", "cube") == "cube" else 0) > MOST_PIXELS:
-            got = f"{excerpt(given.get('width'))} x {excerpt(given.get('height'))} pixels in <texture>"
+    if element.tag == "texture" and "builtin" in attributes:
+        width, height = _size(attributes.get("width", "0")), _size(attributes.get("height", "0"))
+        if max(width * height, 6 * width**2 if attributes.get("type", "cube") == "cube" else 0) > MOST_PIXELS:
+            got = f"{excerpt(attributes.get('width'))} x {excerpt(attributes.get('height'))} pixels in <texture>"
             raise InputError(f"{what}: got {got}, want {MOST_PIXELS:,} at most")
 
 

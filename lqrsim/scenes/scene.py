@@ -170,14 +170,14 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
 def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: Collection[str]) -> list[Obstacle]:
     data, text = placed(model), model.names
     names = [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
-    taken, types = set(names), model.geom_type.tolist()
+    used_names, types = set(names), model.geom_type.tolist()
     kind_of = {number: mujoco.mjtGeom(number).name.removeprefix("mjGEOM_").lower() for number in set(types)}
     places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
     sizes, still, none = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
     obstacles: list[Obstacle] = []
     for geom in geoms:
         kind = kind_of[types[geom]]
-        name = names[geom] or free_name(f"{kind} {geom}", taken)
+        name = names[geom] or free_name(f"{kind} {geom}", used_names)
         if kind not in kinds:
             raise InputError(
                 f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"

@@ -159,15 +159,15 @@ def _read(root: ElementTree.Element, name: str, compiler: Mapping[str, str]) -> 
             _ = [body.joints for body in spec.bodies]  # MuJoCo says here whether two have the same name
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"URDF: got {name}, which MuJoCo refuses: {' '.join(str(error).split())}") from None
-    taken = {geom.name for geom in spec.geoms}
+    used_names = {geom.name for geom in spec.geoms}
     dense = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for geom in spec.geoms:
         geom.density = geom.density if dense else 0.0  # a link without <inertial> has no mass
         if not geom.name:
             first = f"{geom.parent.name}_{'collision' if geom.contype else 'visual'}"
             names = itertools.chain([first], (f"{first}_{number}" for number in itertools.count(1)))
-            geom.name = next(candidate for candidate in names if candidate not in taken)
-            taken.add(geom.name)
+            geom.name = next(candidate for candidate in names if candidate not in used_names)
+            used_names.add(geom.name)
     return spec
 
 
@@ -234,11 +234,11 @@ def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
     drawn = any(not geom.contype for geom in body.geoms)
     for geom in body.geoms:
         collides, kind = bool(geom.contype), _kind(geom)
-        own = {"name": geom.name, "type": kind, "group": str(_HIDDEN if collides and drawn else geom.group)}
-        own |= {"mesh": geom.meshname} if geom.meshname else {}
-        own |= {} if collides else {"contype": "0", "conaffinity": "0"}
+        attributes = {"name": geom.name, "type": kind, "group": str(_HIDDEN if collides and drawn else geom.group)}
+        attributes |= {"mesh": geom.meshname} if geom.meshname else {}
+        attributes |= {} if collides else {"contype": "0", "conaffinity": "0"}
         numbers = {"size": geom.size[: _SIZES[kind]]} if _SIZES[kind] else {}
-        _add(element, "geom", own, **numbers, pos=geom.pos, quat=geom.quat, rgba=geom.rgba, density=geom.density)
+        _add(element, "geom", attributes, **numbers, pos=geom.pos, quat=geom.quat, rgba=geom.rgba, density=geom.density)
     for child in body.bodies:
         _add_body(_add(element, "body", {"name": child.name}, pos=child.pos, quat=child.quat), child)
 
@@ -290,11 +290,11 @@ def _add_actuators(
     joints = {
         joint.name: joint for joint in spec.joints if _kind(joint) in ("slide", "hinge") and joint.name not in followers
     }
-    given = check_kind(f"{name}: efforts", efforts or {}, Mapping, "numbers by joint: {'shoulder': 20.0}")
-    for joint, effort in given.items():
+    effort_of = check_kind(f"{name}: efforts", efforts or {}, Mapping, "numbers by joint: {'shoulder': 20.0}")
+    for joint, effort in effort_of.items():
         check_name(f"{name}: efforts", joint, joints)
         check_number(f"{name}: efforts of {joint}", effort, at_least=0.0)
-    limits = {joint: float(given.get(joint, element.actfrcrange[1])) for joint, element in joints.items()}
+    limits = {joint: float(effort_of.get(joint, element.actfrcrange[1])) for joint, element in joints.items()}
     if not isinstance(servos, Mapping):
         servos = {} if servos is None else dict.fromkeys((joint for joint in joints if limits[joint] > 0), servos)
     gains = {
@@ -311,7 +311,7 @@ def _add_actuators(
             _add(section, "position", attributes, kp=stiffness, kv=damping, **numbers)
         elif effort > 0:
             _add(section, "motor", attributes, **({"ctrlrange": force} if force else {}))
-    if bare := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *given)]:
+    if bare := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *effort_of)]:
         _log.warning(
             "%s: no motor for %s: want an effort in <limit>, or efforts={%r: 10.0}, with 0.0 if there is none",
             name, listed(bare, _LISTED), bare[0],
