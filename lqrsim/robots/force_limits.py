@@ -115,12 +115,12 @@ class ForceLimits(Constraint):
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
         mjcf_dynamics, n, m = dynamics.calling, len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         assert isinstance(mjcf_dynamics, MjcfDynamics)
-        if more := n - len(mjcf_dynamics.state_coordinates):
+        if added := n - len(mjcf_dynamics.state_coordinates):
             limits = [
-                limit._replace(slopes=np.delete(limit.slopes, np.s_[1 + n - more : 1 + n])) for limit in self.limits
+                limit._replace(slopes=np.delete(limit.slopes, np.s_[1 + n - added : 1 + n])) for limit in self.limits
             ]
-            narrow = ForceLimits(limits)._refined(mjcf_dynamics, replace(plan, states=plan.states[:, : n - more]))
-            return None if narrow is None else narrow._widened(m, more)
+            narrow = ForceLimits(limits)._refined(mjcf_dynamics, replace(plan, states=plan.states[:, : n - added]))
+            return None if narrow is None else narrow._widened(m, added)
         dynamics = mjcf_dynamics
         count, pairs = round(plan.dt / dynamics.period), zip(plan.states, plan.controls, strict=False)
         later = np.stack([self._ahead(dynamics, x, u, count) for x, u in pairs])

@@ -140,17 +140,17 @@ class MjcfRobot(Robot):
         self.actuators = tuple(actuator.name for actuator in mjcf.actuators)
         self.activations = len(mjcf.activations)
         names, units = zip(*mjcf.states, strict=True)
-        turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
-        rotations = tuple(joint.dof + turned[joint.kind] for joint in mjcf.joints if joint.kind in turned)
+        starts = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
+        rotations = tuple(joint.dof + starts[joint.kind] for joint in mjcf.joints if joint.kind in starts)
         if turns_about is not None and not rotations:
             raise InputError(f"{who}: turns_about: got {turns_about!r} without a free or ball joint, want None")
         turns = [] if turns_about is None else [first + AXES.index(turns_about) for first in rotations]
         self._axes = position_of(mjcf, number)
-        place, plane = self._position(position, names, who)
-        ends = {joint.dof: joint.limits for joint in mjcf.joints if joint.limits is not None}
-        low, high = zip(*(ends.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
+        dofs, plane = self._position(position, names, who)
+        limits = {joint.dof: joint.limits for joint in mjcf.joints if joint.limits is not None}
+        low, high = zip(*(limits.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
         states = Coordinates(
-            names=names, units=units, position=place, plane=plane, low=low, high=high, rotation_vectors=rotations,
+            names=names, units=units, position=dofs, plane=plane, low=low, high=high, rotation_vectors=rotations,
             angles=(*(joint.dof for joint in mjcf.joints if joint.kind == "hinge" and joint.limits is None), *turns),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
@@ -165,7 +165,7 @@ class MjcfRobot(Robot):
         reach = reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
         outline_balls = outline_of(model)
-        many = not place and len(outline_balls.radii) > 0 if outline is None else outline
+        many = not dofs and len(outline_balls.radii) > 0 if outline is None else outline
         self.balls = MjcfBalls(outline_balls, mjcf) if many else None
 
     @cached_property
@@ -208,9 +208,9 @@ class MjcfRobot(Robot):
     def _shifted(self, names: tuple[str, ...]) -> list[str]:
         """Of each slide that moves the body along an axis, but from another zero: what makes it part of a position."""
         return [
-            f"{names[dof]} is the body's {AXES[axis]} minus {away:.6g} m, and would be its {AXES[axis]}"
-            f' with ref="{away:.6g}" in the <joint>'
-            for dof, (axis, away) in self._axes.shifted.items()
+            f"{names[dof]} is the body's {AXES[axis]} minus {offset:.6g} m, and would be its {AXES[axis]}"
+            f' with ref="{offset:.6g}" in the <joint>'
+            for dof, (axis, offset) in self._axes.shifted.items()
         ]
 
     @property
@@ -279,16 +279,16 @@ class MjcfRobot(Robot):
         """
         state = check_array("state", state, (len(self.dynamics.state_coordinates),))
         model = self.dynamics.physics.model
-        place, left = settled(self.mjcf, model, self.configuration(state)[0])
-        if left > _REST * float(model.body_mass.sum()):
+        qpos, residual = settled(self.mjcf, model, self.configuration(state)[0])
+        if residual > _REST * float(model.body_mass.sum()):
             names = self.scene.world.names
-            apart = f"; obstacles such as {names[0]} carry nothing: obstacles= chooses others" if names else ""
+            hint = f"; obstacles such as {names[0]} carry nothing: obstacles= chooses others" if names else ""
             raise InputError(
-                f"state: got no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
-                f" robot touches its support, or is above it{apart}"
+                f"state: got no state of rest nearby: {residual:.3g} N or N m are left, want a state in which the"
+                f" robot touches its support, or is above it{hint}"
             )
         rested = state.copy()
-        rested[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
+        rested[: 2 * model.nv] = self.state(qpos, np.zeros(model.nv), near=state)
         held = self._held(rested)
         for drifting in self._drifting(held)[:1]:
             raise InputError(f"state: got one at which {drifting}, want activations that come to rest")
@@ -303,9 +303,9 @@ class MjcfRobot(Robot):
             controls = list(zip(self.mjcf.controls[actuator.controls], held.controls[actuator.controls], strict=True))
             ends = [(control, "least", control.low) for control, value in controls if value <= control.low]
             ends += [(control, "most", control.high) for control, value in controls if value >= control.high]
-            its = "its control" if len(controls) == 1 else "{}"
-            why = "".join(f": {its.format(control.name)} is at {end} {side:g}" for control, end, side in ends[:1])
-            reasons.append(f"the activation of {actuator.name} drifts{why}")
+            subject = "its control" if len(controls) == 1 else "{}"
+            cause = "".join(f": {subject.format(control.name)} is at {end} {side:g}" for control, end, side in ends[:1])
+            reasons.append(f"the activation of {actuator.name} drifts{cause}")
         return reasons
 
     def _held(self, state: Array) -> Holding:
@@ -361,23 +361,23 @@ class MjcfRobot(Robot):
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
         bounds = self._bounds(start, goal)
-        first, last = self._held(start), self._held(goal)
-        about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
-        spent = efforts(self.mjcf) ** -2.0 if effort is None else effort
-        cost: Cost = ControlCost(_weights("effort", spent, len(controls)), about=about)
+        at_start, at_goal = self._held(start), self._held(goal)
+        about = (at_start.controls + at_goal.controls) / 2 if at_start.held and at_goal.held else at_start.controls
+        effort_weights = efforts(self.mjcf) ** -2.0 if effort is None else effort
+        cost: Cost = ControlCost(_weights("effort", effort_weights, len(controls)), about=about)
         damping, attitude = (
             check_number(*field, at_least=0.0) for field in (("damping", damping), ("attitude", attitude))
         )
-        calm, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
+        state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
         for joint in self.mjcf.joints:
             if joint.kind != "free":
-                calm[model.nv : 2 * model.nv][joint.dofs] = damping
+                state_weights[model.nv : 2 * model.nv][joint.dofs] = damping
             elif model.dof_bodyid[joint.dof] == root:  # not of something that the robot handles
-                turned = slice(joint.dof + 3, joint.dof + 6)
-                calm[turned], about_state[turned] = attitude, goal[turned]
-                calm[model.nv : 2 * model.nv][turned] = 0.5 * attitude
-        if calm.any():
-            cost = cost + QuadraticCost(calm, about=about_state)
+                rotation = slice(joint.dof + 3, joint.dof + 6)
+                state_weights[rotation], about_state[rotation] = attitude, goal[rotation]
+                state_weights[model.nv : 2 * model.nv][rotation] = 0.5 * attitude
+        if state_weights.any():
+            cost = cost + QuadraticCost(state_weights, about=about_state)
         if limits > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
         period = dynamics.period_near(_PERIOD) or dynamics.period if dt is None else dt
@@ -385,17 +385,17 @@ class MjcfRobot(Robot):
         if clearance is not None:
             constraints.append(Clearance(self.scene.world, **self.shape, margin=clearance))
         if self_clearance is not None:
-            apart = self.self_clearance(self_clearance)
+            constraint = self.self_clearance(self_clearance)
             for field, state in (("start", start), ("goal", goal)):
-                apart.check(field, dynamics, state)
-            constraints.append(apart)
-        sides = np.array([controls.low, controls.high])
-        forces = ForceLimits([limit for limit in self._forces[0] if limit.can_be_kept(start, *sides)])
+                constraint.check(field, dynamics, state)
+            constraints.append(constraint)
+        control_range = np.array([controls.low, controls.high])
+        forces = ForceLimits([limit for limit in self._forces[0] if limit.can_be_kept(start, *control_range)])
         if force_limits and forces.limits:
-            free = forces.removed_from(dynamics)
-            if _is_stable(free, start, first.controls, period):
-                dynamics = free
-                constraints.append(forces.within(dynamics, start, first.controls, period))
+            unlimited = forces.removed_from(dynamics)
+            if _is_stable(unlimited, start, at_start.controls, period):
+                dynamics = unlimited
+                constraints.append(forces.within(dynamics, start, at_start.controls, period))
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
@@ -417,17 +417,17 @@ class MjcfRobot(Robot):
             if joint.limits is None:
                 continue
             begin, end = start[joint.dof], goal[joint.dof]
-            stated = [model.qpos0[joint.qpos.start], *model.key_qpos[:, joint.qpos.start]]
-            if not np.isclose(begin, stated, rtol=0, atol=1e-9).any() and (
+            positions = [model.qpos0[joint.qpos.start], *model.key_qpos[:, joint.qpos.start]]
+            if not np.isclose(begin, positions, rtol=0, atol=1e-9).any() and (
                 complaint := joint.past_limits(begin, FAR_PAST)
             ):
                 raise InputError(f"start: {complaint}")
             if end != begin and (complaint := joint.past_limits(end, _PAST)):
                 raise InputError(f"goal: {complaint}")
             least, most = joint.limits
-            room = min(_ROOM[0], _ROOM[1] * (most - least))
-            low[names[joint.dof]] = max(least, min(least + room, begin, end))
-            high[names[joint.dof]] = min(most, max(most - room, begin, end))
+            margin = min(_ROOM[0], _ROOM[1] * (most - least))
+            low[names[joint.dof]] = max(least, min(least + margin, begin, end))
+            high[names[joint.dof]] = min(most, max(most - margin, begin, end))
         return low, high
 
     def __str__(self) -> str:
@@ -436,9 +436,9 @@ class MjcfRobot(Robot):
         commands = [f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True)]
         worst = int(np.argmax(np.abs(held.missed)))
         unit = "N m" if space.units[worst] == "rad" else "N"
-        short = "".join(f"; {drifting}" for drifting in self._drifting(held))
-        if not held.held and not short:
-            short = f"; {space.names[worst]} is not held: {abs(held.missed[worst]):.3g} {unit} are missing"
+        shortfall = "".join(f"; {drifting}" for drifting in self._drifting(held))
+        if not held.held and not shortfall:
+            shortfall = f"; {space.names[worst]} is not held: {abs(held.missed[worst]):.3g} {unit} are missing"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",
@@ -446,7 +446,7 @@ class MjcfRobot(Robot):
             if space.position
             else f"  body: {self.body}, whose position is not among the states",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
-            f"  held at rest by: {listed(commands)}{short}",
+            f"  held at rest by: {listed(commands)}{shortfall}",
             *(f"  {title}: {listed(entries)}" for title, entries in self._remarks().items() if entries),
         ]
         return "\n".join(lines)

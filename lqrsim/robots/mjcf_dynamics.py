@@ -142,8 +142,8 @@ class MjcfPhysics:
             kernel.XPOS: data.xpos, kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos,
             kernel.GEOM_XMAT: data.geom_xmat, kernel.MASSES: model.body_mass,
         }  # fmt: skip
-        for place, array in fields.items():
-            row[place] = array.ctypes.data
+        for column, array in fields.items():
+            row[column] = array.ctypes.data
         row[kernel.DATA], row[kernel.OWN_MODEL] = data._address, model._address
         return row.tolist()
 
@@ -230,13 +230,13 @@ class MjcfDynamics(Dynamics):
     def _set_mjcf(self, mjcf: MjcfModel) -> None:
         self.mjcf, self.fixed, self._physics = mjcf, sha256(mjcf.xml, mjcf.turns_about or "", repr(self._stated)), None
         model = mjcf.model
-        refused = {
+        refusals = {
             "actuators": (model.nu == 0, "got none", "at least one <actuator> that has a control"),
             "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),
             "plugins": (model.npluginstate > 0, "got plugins with their own states", "none"),
             "delays": (model.actuator_history.any(), "got actuators with a delay", "none"),
         }
-        for part, (present, got, wanted) in refused.items():
+        for part, (present, got, wanted) in refusals.items():
             if present:
                 raise InputError(f"{self._name}: {part}: {got}, want {wanted}")
         for geom in np.intersect1d(self._stated["obstacles"], [model.pair_geom1, model.pair_geom2])[:1]:
@@ -262,9 +262,9 @@ class MjcfDynamics(Dynamics):
 
     def __copy__(self) -> "MjcfDynamics":
         """A copy that shares MuJoCo's memory, if there is any yet."""
-        other = object.__new__(type(self))
-        vars(other).update({name: value for name, value in vars(self).items() if name != "disturbed"})
-        return other
+        copied = object.__new__(type(self))
+        vars(copied).update({name: value for name, value in vars(self).items() if name != "disturbed"})
+        return copied
 
     @property
     def name(self) -> str:
@@ -282,9 +282,9 @@ class MjcfDynamics(Dynamics):
     def disturbed(self) -> "MjcfDynamics":
         if self.parameters:
             return self
-        other = self.stating()  # with its own models, which carry the loads
-        other.parameters = dict(self.disturbances)
-        return other
+        dynamics = self.stating()  # with its own models, which carry the loads
+        dynamics.parameters = dict(self.disturbances)
+        return dynamics
 
     @property
     def data(self) -> Array:
@@ -307,10 +307,10 @@ class MjcfDynamics(Dynamics):
         `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, the largest number if there
         are several; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
-        passed = {self.mjcf.model.geom(geom).name for geom in self._stated["obstacles"]}  # which do not collide here
+        obstacles = {self.mjcf.model.geom(geom).name for geom in self._stated["obstacles"]}  # which do not collide here
         numbers = self.mjcf.numbers.items()
         return {
-            name: number.value for name, number in numbers if number.what != "friction" or number.part not in passed
+            name: number.value for name, number in numbers if number.what != "friction" or number.part not in obstacles
         }
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
@@ -322,13 +322,13 @@ class MjcfDynamics(Dynamics):
         numbers = self.numbers
         for name in values:
             check_name(f"{self.name}: parameters", name, [*self.parameters, *numbers])
-        other = copy.copy(self)
-        pushed = {name: check_number(name, value) for name, value in values.items() if name in self.parameters}
-        other.parameters = self.parameters | pushed
-        stated = {name: value for name, value in values.items() if name not in pushed}
-        if stated:
-            other._set_mjcf(self.mjcf.with_numbers(stated, self.name))
-        return other
+        dynamics = copy.copy(self)
+        disturbances = {name: check_number(name, value) for name, value in values.items() if name in self.parameters}
+        dynamics.parameters = self.parameters | disturbances
+        mjcf_numbers = {name: value for name, value in values.items() if name not in disturbances}
+        if mjcf_numbers:
+            dynamics._set_mjcf(self.mjcf.with_numbers(mjcf_numbers, self.name))
+        return dynamics
 
     @cached_property
     def curvature_source(self) -> Source | None:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -348,11 +348,11 @@ class MjcfDynamics(Dynamics):
         if dof < 0:
             return ""
         body = int(model.dof_bodyid[dof])
-        roots = model.body_weldid
+        welds = model.body_weldid
         for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
             for pair in data.contact.geom:
-                first, second = (int(roots[model.geom_bodyid[geom]]) for geom in pair)
-                if int(roots[body]) in (first, second) and first and second:
+                first, second = (int(welds[model.geom_bodyid[geom]]) for geom in pair)
+                if int(welds[body]) in (first, second) and first and second:
                     return ""
         return model.body(body).name
 
@@ -371,21 +371,21 @@ class MjcfDynamics(Dynamics):
 
     def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
         nv = self.physics.model.nv
-        wanted = moves[:nv] if moves[:nv].any() else moves[nv : 2 * nv]  # a velocity points the way
-        if not wanted.any():
+        motion = moves[:nv] if moves[:nv].any() else moves[nv : 2 * nv]  # a velocity points the way
+        if not motion.any():
             return
-        approaches = Approaches(self.mjcf, states, wanted)
+        approaches = Approaches(self.mjcf, states, motion)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
-            other = self.stating(obstacles=(*self._stated["obstacles"], *approaches.thing))
+            dynamics = self.stating(obstacles=(*self._stated["obstacles"], *approaches.thing))
             for words, positions in approaches:
-                yield words, other, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
+                yield words, dynamics, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
 
     def stating(self, **stated: Any) -> "MjcfDynamics":
         """The same with other arguments of its `MjcfPhysics`."""
-        other = copy.copy(self)
-        other._stated = self._stated | stated
-        other._set_mjcf(self.mjcf)
-        return other
+        dynamics = copy.copy(self)
+        dynamics._stated = self._stated | stated
+        dynamics._set_mjcf(self.mjcf)
+        return dynamics
 
     def contact_modes(self, dt: float) -> ContactModes | None:
         known = not self.parameters and ContactModes.known_for(self.physics.model)
@@ -442,20 +442,20 @@ class MjcfDynamics(Dynamics):
         """As in `Dynamics`; NaN if it overflows."""
         x, u = self._check(state, control)
         self.check_period(dt)
-        out = np.empty(len(x))
+        next_state = np.empty(len(x))
         with unlogged():
-            self.compiled.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
-        return out
+            self.compiled.advance(in_c_order(x), in_c_order(u), self.data, float(dt), next_state)
+        return next_state
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
         x, u = self._check(state, control)
         self.check_period(dt)
         n, m = len(x), len(u)
-        out, jacobian = np.empty(n), np.empty((n, n + m))
+        next_state, jacobian = np.empty(n), np.empty((n, n + m))
         with unlogged():
-            self.compiled.step_jacobian(in_c_order(x), in_c_order(u), self.data, float(dt), out, jacobian)
+            self.compiled.step_jacobian(in_c_order(x), in_c_order(u), self.data, float(dt), next_state, jacobian)
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
-        return a, b, out - a @ x - b @ u
+        return a, b, next_state - a @ x - b @ u
 
     def quiet(self) -> contextlib.AbstractContextManager[None]:
         return unlogged()

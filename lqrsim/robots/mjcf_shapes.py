@@ -74,34 +74,34 @@ class MjcfGeoms(CollisionGeoms):
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(numbers)
         moved = displaced is not None and bool(displaced.any())
-        away = in_c_order(displaced.reshape(-1)) if moved and displaced is not None else np.zeros(1)
+        displacements = in_c_order(displaced.reshape(-1)) if moved and displaced is not None else np.zeros(1)
         per_displacement = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
-        out, which, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
+        distances, pairs, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
         if count:
             _, data = self._to_each(mjcf_dynamics, numbers)
             self._module(dynamics).distances_of(
-                len(flat), flat, per_displacement, away, int(moved), data, out, which, segments
+                len(flat), flat, per_displacement, displacements, int(moved), data, distances, pairs, segments
             )
-        return out[: len(flat) * count].reshape(*states.shape[:-1], count)
+        return distances[: len(flat) * count].reshape(*states.shape[:-1], count)
 
     def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
         mjcf_dynamics, numbers = self._bound(dynamics, world)
         flat, count = in_c_order(vectors_of("states", states, len(dynamics.state_coordinates))), len(numbers)
-        out, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
-        which, segments = np.empty(count + 1), np.empty((count + 1, 6))
+        distances, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
+        pairs, segments = np.empty(count + 1), np.empty((count + 1, 6))
         if count:
             _, data = self._to_each(mjcf_dynamics, numbers)
-            self._module(dynamics).slopes_of(len(flat), flat, data, out, slopes, which, segments)
+            self._module(dynamics).slopes_of(len(flat), flat, data, distances, slopes, pairs, segments)
         shape = len(flat), count
-        return out[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
+        return distances[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
 
     def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
         mjcf_dynamics, numbers = self._bound(dynamics, world)
         flat, count = in_c_order(np.asarray(state, dtype=np.float64)[None]), len(numbers)
-        out, which, segments = np.empty(count), np.empty(count + 1), np.empty((count + 1, 6))
+        distances, pairs, segments = np.empty(count), np.empty(count + 1), np.empty((count + 1, 6))
         chosen, data = self._to_each(mjcf_dynamics, numbers)
-        self._module(dynamics).distances_of(1, flat, 1, np.zeros(1), 0, data, out, which, segments)
-        pair = self._pairs[chosen[int(which[int(out.argmin())])]]
+        self._module(dynamics).distances_of(1, flat, 1, np.zeros(1), 0, data, distances, pairs, segments)
+        pair = self._pairs[chosen[int(pairs[int(distances.argmin())])]]
         first, second = (self.scene.model.body(body).name for body in self.scene.model.geom_bodyid[pair].tolist())
         return first, second
 
@@ -201,12 +201,12 @@ class SelfClearance(Constraint):
         """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m."""
         states = vectors_of("states", states, len(dynamics.state_coordinates))
         flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(self.links)
-        out, which, segments = np.empty(len(flat) * count + 1), np.empty(count + 1), np.empty((count + 1, 6))
+        distances, pairs, segments = np.empty(len(flat) * count + 1), np.empty(count + 1), np.empty((count + 1, 6))
         data = mjcf_obstacles.distance_data(self._mjcf.model, self._pairs, self._rows, count, 1.0)
         data = np.concatenate([[float(dynamics.physics.address())], data])
         module = module_of(source_of(mjcf_distances), "MuJoCo's distances", N=flat.shape[1])
-        module.distances_of(len(flat), flat, max(1, len(flat)), np.zeros(1), 0, data, out, which, segments)
-        return out[:-1].reshape(*states.shape[:-1], count)
+        module.distances_of(len(flat), flat, max(1, len(flat)), np.zeros(1), 0, data, distances, pairs, segments)
+        return distances[:-1].reshape(*states.shape[:-1], count)
 
     def check(self, field: str, dynamics: MjcfDynamics, state: Array) -> None:
         """Raises InputError if links are nearer to each other than the margin at a state (n,), named `field`."""

@@ -113,9 +113,9 @@ class ContactModes:
             if self._four:
                 self._runge_kutta(4 * step, observed)
             else:
-                before = data.qpos.copy()
+                qpos = data.qpos.copy()
                 mujoco.mj_step(self._model, data)
-                self._observe(step, before, observed)
+                self._observe(step, qpos, observed)
         names = np.concatenate([np.zeros(0, np.int64), *(switch_names for switch_names, _ in observed)])
         values, order = (
             np.concatenate([np.zeros(0), *(switch_values for _, switch_values in observed)]),
@@ -181,22 +181,22 @@ class ContactModes:
         jacobian, slopes = np.empty((n, len(point))), np.empty((len(switches.names), len(point)))
         certain = True
         for k in range(len(point)):
-            both, sides, moved = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
+            ends, sides, width = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
             for share in _SMALLER:
-                moved = share * 1e-6 * max(1.0, abs(point[k]))
+                width = share * 1e-6 * max(1.0, abs(point[k]))
                 for sign in (1, -1):
-                    other = point.copy()
-                    other[k] += sign * moved
-                    both[sign] = self.step(other[:n], other[n:])
-                sides = {sign: side for sign, side in both.items() if side[1].same_mode(switches)}
+                    shifted = point.copy()
+                    shifted[k] += sign * width
+                    ends[sign] = self.step(shifted[:n], shifted[n:])
+                sides = {sign: side for sign, side in ends.items() if side[1].same_mode(switches)}
                 if sides:
                     break
             else:
-                sides, certain = both, False
+                sides, certain = ends, False
             high, low = sides.get(1, (end, switches)), sides.get(-1, (end, switches))
-            moved *= len(sides)
-            jacobian[:, k] = (high[0] - low[0]) / moved
-            slopes[:, k] = (high[1].at(switches.names) - low[1].at(switches.names)) / moved
+            width *= len(sides)
+            jacobian[:, k] = (high[0] - low[0]) / width
+            slopes[:, k] = (high[1].at(switches.names) - low[1].at(switches.names)) / width
         return Period(end, jacobian, switches, slopes, certain)
 
 

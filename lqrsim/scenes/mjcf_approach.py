@@ -108,8 +108,8 @@ class Approaches:
             parts = [np.interp(knots, range(len(directions)), part) for part in np.transpose(directions)]
             mixed = np.stack(parts, axis=1)
             spots[: begin + 1] = centre + radii[:, None] * (mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
-            positions, off = self._follow([tool], [point], spots[:, None])
-            if off[:begin].max(initial=0.0) <= _OFF * touching:
+            positions, misses = self._follow([tool], [point], spots[:, None])
+            if misses[:begin].max(initial=0.0) <= _OFF * touching:
                 yield f"a push by {self._model.geom(tool).name}{words}", positions
 
     def _grasp(self, pair: tuple[int, int], pressed: float, way: Array, begin: int, end: int) -> tuple[str, Array]:
@@ -170,17 +170,17 @@ class Approaches:
         The tool comes from afar, by its distance from the body at each step, as it then cannot pass through.
         """
         model, places = self._model, self._data.geom_xpos
-        before, off = places[tool].copy(), self._spot(tool, point) - places[tool]
+        place, offset = places[tool].copy(), self._spot(tool, point) - places[tool]
         bounds = float(model.geom_rbound[tool] + np.linalg.norm(point) + model.geom_rbound[self.thing].max())
-        middle, far = places[self.thing].mean(axis=0), 2 * bounds
+        middle, distance = places[self.thing].mean(axis=0), 2 * bounds
         for _ in range(_SEARCHES):
-            places[tool] = middle + far * side - off
+            places[tool] = middle + distance * side - offset
             gap = self._gap(tool)
             if gap < _TOUCHING:
                 break
-            far -= gap
-        places[tool] = before
-        return max(far, _TOUCHING)
+            distance -= gap
+        places[tool] = place
+        return max(distance, _TOUCHING)
 
     def _follow(self, tools: Sequence[int], points: Sequence[Array], targets: Array) -> tuple[Array, Array]:
         """Positions (T+1, nv) with points of k tools at targets (T+1, k, 3), or near them, and how far off (T+1,)."""

@@ -125,9 +125,9 @@ class _AtRest:
                 return float(self._unlimited(z)[place - len(z)])
 
             begin = float(z[place])
-            if (now := rate(begin)) != 0:
-                tried = (begin + np.sign(now) * far for far in _FAR)
-                end = next((end for end in tried if rate(end) * now <= 0), None)
+            if (first_rate := rate(begin)) != 0:
+                ends = (begin + np.sign(first_rate) * distance for distance in _FAR)
+                end = next((end for end in ends if rate(end) * first_rate <= 0), None)
                 z[place] = begin if end is None else float(brentq(rate, begin, end, xtol=1e-15))  # pyright: ignore[reportArgumentType]
         return z
 
@@ -386,20 +386,20 @@ def _least_squares(
     start = np.linalg.lstsq(*equal, rcond=None)[0]
     if np.abs(equal[0] @ start - equal[1]).max(initial=0.0) > _REST * (1 + np.abs(equal[1]).max(initial=0.0)):
         return None
-    ways = null_space(equal[0]) if len(equal[0]) else np.eye(rows.shape[1])
-    turned, corner = np.linalg.qr(rows @ ways)
-    nearest = turned.T @ (aims - rows @ start)
+    basis = null_space(equal[0]) if len(equal[0]) else np.eye(rows.shape[1])
+    orthogonal, triangle = np.linalg.qr(rows @ basis)
+    nearest = orthogonal.T @ (aims - rows @ start)
     above = [(block[np.isfinite(least)], least[np.isfinite(least)]) for block, least, _ in sides]
     below = [(-block[np.isfinite(most)], -most[np.isfinite(most)]) for block, _, most in sides]
     bound, least = (np.concatenate(part) for part in zip(*above, *below, strict=True))
     least = least - bound @ start
-    bound = solve_triangular(corner, (bound @ ways).T, trans=1).T
+    bound = solve_triangular(triangle, (bound @ basis).T, trans=1).T
     least = least - bound @ nearest
-    sizes = np.linalg.norm(bound, axis=1)
-    fixed = sizes <= 1e-12 * sizes.max(initial=0.0)
+    norms = np.linalg.norm(bound, axis=1)
+    fixed = norms <= 1e-12 * norms.max(initial=0.0)
     if (least[fixed] > _REST).any():
         return None
-    bound, least = bound[~fixed] / sizes[~fixed, None], least[~fixed] / sizes[~fixed]
+    bound, least = bound[~fixed] / norms[~fixed, None], least[~fixed] / norms[~fixed]
     farthest = float(least.max(initial=0.0))
     aim = np.append(np.zeros(len(bound.T)), 1.0)
     for distance in farthest * _SCALES if farthest > 0 else ():
@@ -411,7 +411,7 @@ def _least_squares(
     else:
         if farthest > 0:
             return None
-    return start + ways @ solve_triangular(corner, nearest)
+    return start + basis @ solve_triangular(triangle, nearest)
 
 
 def without_limits(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -452,26 +452,26 @@ def settled(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
         return qpos.copy(), 0.0
 
     def missing(moved: Array) -> tuple[Array, Array]:
-        place, motion = qpos.copy(), np.zeros(model.nv)
+        positions, motion = qpos.copy(), np.zeros(model.nv)
         motion[free] = moved
-        mujoco.mj_integratePos(model, place, motion, 1.0)
-        data.qpos[:], data.qvel[:], data.qacc[:] = place, 0, 0
+        mujoco.mj_integratePos(model, positions, motion, 1.0)
+        data.qpos[:], data.qvel[:], data.qacc[:] = positions, 0, 0
         mujoco.mj_inverse(model, data)
-        return place, data.qfrc_inverse[free].copy()
+        return positions, data.qfrc_inverse[free].copy()
 
     moved = np.zeros(len(free))
-    place, left = missing(moved)
+    positions, forces = missing(moved)
     for _ in range(_NEWTON):
         slopes = [missing(moved + change)[1] - missing(moved - change)[1] for change in _SMALL * np.eye(len(free))]
-        step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), left, rcond=1e-6)[0]
+        step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), forces, rcond=1e-6)[0]
         for share in 0.5 ** np.arange(_HALVES):
-            tried, then = missing(moved + share * step)
-            if np.linalg.norm(then) < np.linalg.norm(left):
-                moved, place, left = moved + share * step, tried, then
+            trial, trial_forces = missing(moved + share * step)
+            if np.linalg.norm(trial_forces) < np.linalg.norm(forces):
+                moved, positions, forces = moved + share * step, trial, trial_forces
                 break
         else:
             break
-    return place, float(np.abs(left).max(initial=0.0))
+    return positions, float(np.abs(forces).max(initial=0.0))
 
 
 def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
@@ -513,8 +513,8 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
     from scipy.linalg import qr
 
     _, slopes = Equalities(model).at(qpos)
-    _, corner, order = qr(slopes * np.where(driven, 1.0, _RATHER), mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
-    rank = int((np.abs(np.diagonal(corner)) > _RANK * np.abs(slopes).max(initial=0.0)).sum())
+    _, triangle, order = qr(slopes * np.where(driven, 1.0, _RATHER), mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
+    rank = int((np.abs(np.diagonal(triangle)) > _RANK * np.abs(slopes).max(initial=0.0)).sum())
     follow, free = (np.sort(dofs).astype(np.intp) for dofs in (order[:rank], order[rank:]))
     moves = np.eye(model.nv)[:, free]
     moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, free], rcond=None)[0]

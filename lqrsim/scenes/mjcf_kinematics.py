@@ -81,34 +81,34 @@ class Equalities:
           qpos: to begin with. aim: where the fixed degrees of freedom, (nv,), go. The others follow them in small
             steps, so that a loop does not flip over.
         """
-        place, move, model = qpos.copy(), np.zeros(self.model.nv), self.model
+        positions, move, model = qpos.copy(), np.zeros(self.model.nv), self.model
         mujoco.mj_differentiatePos(model, move, 1.0, qpos, aim)
         move[~fixed] = 0.0
         steps = max(1, int(np.ceil(np.abs(move).max(initial=0.0) / _STRIDE)))
-        off = np.zeros(0)
+        residual = np.zeros(0)
         for _ in range(steps):
-            mujoco.mj_integratePos(model, place, move / steps, 1.0)
+            mujoco.mj_integratePos(model, positions, move / steps, 1.0)
             for _ in range(_NEWTON):
-                off, slopes = self.at(place)
+                residual, slopes = self.at(positions)
                 within_reach = slopes[:, ~fixed].any(axis=1)  # others need to be met at the aim only
-                if np.abs(off[within_reach]).max(initial=0.0) < _MET:
+                if np.abs(residual[within_reach]).max(initial=0.0) < _MET:
                     break
                 step = np.zeros(model.nv)
-                step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=_RANK)[0]
-                mujoco.mj_integratePos(model, place, step, 1.0)
+                step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], residual, rcond=_RANK)[0]
+                mujoco.mj_integratePos(model, positions, step, 1.0)
                 if np.abs(step).max() < _MET:  # as near as it gets on the way: only the aim is to be consistent
                     break
             else:
                 return None
-        return place if np.abs(off).max(initial=0.0) < _TYPED else None
+        return positions if np.abs(residual).max(initial=0.0) < _TYPED else None
 
     def closed(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Positions (nq,) and velocities (nv,) near those given at which they are met; None if none were found."""
-        place = self.met(qpos, qpos, np.zeros(self.model.nv, dtype=bool))
-        if place is None:
+        positions = self.met(qpos, qpos, np.zeros(self.model.nv, dtype=bool))
+        if positions is None:
             return None
-        _, slopes = self.at(place)
-        return place, qvel - np.linalg.lstsq(slopes, slopes @ qvel, rcond=_RANK)[0]
+        _, slopes = self.at(positions)
+        return positions, qvel - np.linalg.lstsq(slopes, slopes @ qvel, rcond=_RANK)[0]
 
 
 @dataclass(frozen=True)

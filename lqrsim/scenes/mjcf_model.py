@@ -174,13 +174,13 @@ class MjcfModel:
             qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
             single = kind in ("slide", "hinge")
             limited = model.jnt_limited[number] and single
-            stated = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{name}{SPEED_LIMIT}") if single else -1
+            numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{name}{SPEED_LIMIT}") if single else -1
             joints.append(
                 Joint(
                     name=name, kind=kind, qpos=qpos, dofs=dofs,
                     limits=_side(limited, model.jnt_range[number]) if limited else None,
                     forces=_side(model.jnt_actfrclimited[number], model.jnt_actfrcrange[number]),
-                    speed=math.inf if stated < 0 else float(model.numeric(stated).data[0]),
+                    speed=math.inf if numeric < 0 else float(model.numeric(numeric).data[0]),
                 )
             )  # fmt: skip
         return tuple(joints)
@@ -218,14 +218,14 @@ class MjcfModel:
                 low[actuator.controls], high[actuator.controls] = (
                     side[actuator.controls].clip(0, 1) for side in (low, high)
                 )
-            for place, name in zip(
+            for entry, name in zip(
                 range(actuator.controls.start, actuator.controls.stop), actuator.inputs, strict=True
             ):
                 full, unit = (
                     f"{actuator.name}_{name}" if len(actuator.inputs) > 1 else actuator.name,
                     _unit(actuator, joints, name),
                 )
-                controls.append(Control(full, unit, float(low[place]), float(high[place])))
+                controls.append(Control(full, unit, float(low[entry]), float(high[entry])))
         return tuple(controls)
 
     @cached_property
@@ -233,27 +233,27 @@ class MjcfModel:
         """The names of the states of actuators, (na,): `<actuator>_activation`, numbered if an actuator has several."""
         names = [""] * int(self.model.na)
         for actuator in self.actuators:
-            places = range(actuator.activations.start, actuator.activations.stop)
-            for i, place in enumerate(places):
-                names[place] = f"{actuator.name}_activation" + (f"_{i}" if len(places) > 1 else "")
+            entries = range(actuator.activations.start, actuator.activations.stop)
+            for i, entry in enumerate(entries):
+                names[entry] = f"{actuator.name}_activation" + (f"_{i}" if len(entries) > 1 else "")
         return tuple(names)
 
     @cached_property
     def states(self) -> tuple[tuple[str, str], ...]:
         """The names and units of a robot's states: positions, velocities, states of actuators; as `MjcfRobot` says."""
-        turned = [("rx", "rad"), ("ry", "rad"), ("rz", "rad")], [("wx", "rad/s"), ("wy", "rad/s"), ("wz", "rad/s")]
-        moved = [(axis, "m") for axis in "xyz"], [(f"v{axis}", "m/s") for axis in "xyz"]
-        loose = [joint for joint in self.joints if joint.kind == "free" and joint.name.startswith(UNNAMED)]
+        rotational = [("rx", "rad"), ("ry", "rad"), ("rz", "rad")], [("wx", "rad/s"), ("wy", "rad/s"), ("wz", "rad/s")]
+        translational = [(axis, "m") for axis in "xyz"], [(f"v{axis}", "m/s") for axis in "xyz"]
+        unnamed = [joint for joint in self.joints if joint.kind == "free" and joint.name.startswith(UNNAMED)]
         states = list[tuple[str, str]]()
-        for side in (0, 1):
+        for derivative in (0, 1):
             for joint in self.joints:
-                prefix = "" if [joint] == loose else f"{joint.name}_"
+                prefix = "" if [joint] == unnamed else f"{joint.name}_"
                 if joint.kind in ("free", "ball"):
-                    entries = [*(moved[side] if joint.kind == "free" else []), *turned[side]]
+                    entries = [*(translational[derivative] if joint.kind == "free" else []), *rotational[derivative]]
                     states += [(prefix + name, unit) for name, unit in entries]
                 else:
                     unit = "m" if joint.kind == "slide" else "rad"
-                    states.append((joint.name, unit) if side == 0 else (f"{joint.name}_velocity", f"{unit}/s"))
+                    states.append((joint.name, unit) if derivative == 0 else (f"{joint.name}_velocity", f"{unit}/s"))
         return (*states, *((name, "") for name in self.activations))
 
     def positions_of(self, qpos: Array) -> Array:
@@ -323,9 +323,9 @@ class MjcfModel:
     def keyframe(self, name: str, what: str) -> tuple[Array, Array, Array | None]:
         """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, of which the model has zeros."""
         model, number = self.model, self._key(name, what)
-        if moved := list(_mocap_poses(model, number)):
+        if bodies := list(_mocap_poses(model, number)):
             raise InputError(
-                f"{what}: keyframe: got {name!r}, in which the mocap bodies {', '.join(moved)} are elsewhere, want"
+                f"{what}: keyframe: got {name!r}, in which the mocap bodies {', '.join(bodies)} are elsewhere, want"
                 f" MjcfRobot(..., mocap={name!r}), which has them there"
             )
         stated = model.na > 0 and len(self.spec().keys[number].act) > 0
@@ -370,15 +370,15 @@ class MjcfModel:
         changed = len(free) > 1 or any(unnamed.values())
         xml = ElementTree.tostring(root, encoding="unicode") if changed else self.xml
         named = replace(self, xml=xml) if changed else self
-        lit = any(element.tag == "light" for element in placed)
-        if lit or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
+        has_light = any(element.tag == "light" for element in placed)
+        if has_light or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
             return named
         # The size of the whole is known when it is compiled, and the light is to be in what is compiled.
         model = replace(self, xml=_with_light(xml, np.zeros(3))).model
-        place = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
-        completed = replace(self, xml=_with_light(xml, place))
+        position = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
+        completed = replace(self, xml=_with_light(xml, position))
         for field in (model.light_pos, model.light_pos0, model.light_poscom0):
-            field[-1] += [float(f"{number:.6g}") for number in place]
+            field[-1] += [float(f"{number:.6g}") for number in position]
         vars(completed)["model"] = model
         return completed
 
@@ -563,11 +563,11 @@ def _mocap_poses(model: mujoco.MjModel, key: int) -> dict[str, tuple[Array, Arra
     """Positions and quaternions of the mocap bodies that are elsewhere in a keyframe than in the MJCF, by name."""
     poses = {}
     for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
-        where = int(model.body_mocapid[body])
-        place, quat = (all_of[key].reshape(model.nmocap, -1)[where] for all_of in (model.key_mpos, model.key_mquat))
-        near = np.abs(place - model.body_pos[body]).max() < _SAME
-        if not near or 1 - abs(float(quat @ model.body_quat[body])) > _SAME * np.linalg.norm(quat):
-            poses[model.body(body).name] = (place, quat)
+        mocap = int(model.body_mocapid[body])
+        position, quat = (table[key].reshape(model.nmocap, -1)[mocap] for table in (model.key_mpos, model.key_mquat))
+        same_position = np.abs(position - model.body_pos[body]).max() < _SAME
+        if not same_position or 1 - abs(float(quat @ model.body_quat[body])) > _SAME * np.linalg.norm(quat):
+            poses[model.body(body).name] = (position, quat)
     return poses
 
 

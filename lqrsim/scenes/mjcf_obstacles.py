@@ -98,8 +98,8 @@ def link_pairs(model: mujoco.MjModel, body: int) -> Pairs:
     first, second = welds[model.geom_bodyid[pairs]].T
     joined = first == second
     if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
-        above = welds[model.body_parentid]
-        joined |= (above[first] == second) | (above[second] == first)
+        parents = welds[model.body_parentid]
+        joined |= (parents[first] == second) | (parents[second] == first)
     pairs = pairs[_collide_by_kind(model, pairs) & ~joined | _are_stated(model, pairs)]
     base = np.flatnonzero((welds[model.geom_bodyid] == 0) & np.isin(model.geom_bodyid, [*_base(model)]))
     fixed = touching_pairs(model, base.tolist())
@@ -178,14 +178,14 @@ def levers(model: mujoco.MjModel) -> Array:
         parent = int(model.body_parentid[body])
         reach[parent] = max(reach[parent], reach[body] + spans[body] + float(np.linalg.norm(model.body_pos[body])))
     for joint in range(model.njnt):
-        kind, body, first = model.jnt_type[joint], int(model.jnt_bodyid[joint]), int(model.jnt_dofadr[joint])
-        far = reach[body] + spans[body] + float(np.linalg.norm(model.jnt_pos[joint]))
+        kind, body, dof = model.jnt_type[joint], int(model.jnt_bodyid[joint]), int(model.jnt_dofadr[joint])
+        lever = reach[body] + spans[body] + float(np.linalg.norm(model.jnt_pos[joint]))
         if kind == mujoco.mjtJoint.mjJNT_FREE:
-            arms[first + 3 : first + 6] = far
+            arms[dof + 3 : dof + 6] = lever
         elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            arms[first : first + 3] = far
+            arms[dof : dof + 3] = lever
         elif kind == mujoco.mjtJoint.mjJNT_HINGE:
-            arms[first] = far
+            arms[dof] = lever
     return arms
 
 
@@ -193,14 +193,14 @@ def _base(model: mujoco.MjModel) -> set[int]:
     """The bodies that carry the moving bodies, up to the world, and everything fixed to the last of these."""
     fixed, base, carriers = model.body_weldid == 0, set[int](), set[int]()
     for body in np.flatnonzero(~fixed).tolist():
-        above = int(model.body_parentid[body])
-        if fixed[above] and above:
-            carriers.add(above)
+        parent = int(model.body_parentid[body])
+        if fixed[parent] and parent:
+            carriers.add(parent)
     for body in carriers:
-        above = body
-        while above:
-            base.add(above)
-            above = int(model.body_parentid[above])
+        parent = body
+        while parent:
+            base.add(parent)
+            parent = int(model.body_parentid[parent])
     for body in range(1, model.nbody):  # children come after their parents
         if fixed[body] and int(model.body_parentid[body]) in carriers:
             carriers.add(body)
@@ -277,7 +277,7 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
     floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
     if not moving.any():
         return set()
-    data, supports, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
+    data, supports, reach = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
     for qpos, candidates in (
         (model.qpos0, pairs[moving]),
         *((keyframe, pairs[floating]) for keyframe in model.key_qpos),
@@ -285,9 +285,9 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         for geom, support in candidates[_touch(model, data, candidates)].tolist():
-            before = mujoco.mj_geomDistance(model, data, geom, support, far, None)
+            gap = mujoco.mj_geomDistance(model, data, geom, support, reach, None)
             data.geom_xpos[support, 2] -= _LOWERED
-            if mujoco.mj_geomDistance(model, data, geom, support, far, None) - before > _CARRIES * _LOWERED:
+            if mujoco.mj_geomDistance(model, data, geom, support, reach, None) - gap > _CARRIES * _LOWERED:
                 supports.add(support)
             data.geom_xpos[support, 2] += _LOWERED
     return supports

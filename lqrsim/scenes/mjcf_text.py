@@ -74,7 +74,7 @@ def _flatten(path: Path) -> str:
     """The MJCF at `path` as one text: with includes in place, and other files by their full path."""
     seen: set[Path] = set()
     folder = path.parent
-    beside = dict[ElementTree.Element, Path]()  # elements of included files -> the folder of their file
+    folder_of = dict[ElementTree.Element, Path]()  # elements of included files -> the folder of their file
 
     def read(file: Path) -> ElementTree.Element:
         seen.add(file.resolve())
@@ -99,7 +99,7 @@ def _flatten(path: Path) -> str:
             else:
                 expand(child, own)
                 element.append(child)
-                beside.setdefault(child, own)
+                folder_of.setdefault(child, own)
 
     def find(name: str, own: Path) -> Path:
         # MuJoCo's rule, relative to the main file, then to the file that includes; and then the packaged models.
@@ -119,7 +119,7 @@ def _flatten(path: Path) -> str:
     folders = {kind: str(main / settings.get(kind, common)) for kind in ("meshdir", "texturedir")}
     files = [(element, key) for element in root.iter() for key in element.attrib if key.startswith("file")]
     for element, key in files:  # the same rule, but from the folder of their kind, of which an <attach> has none
-        kind, file_folder = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir"), beside[element]
+        kind, file_folder = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir"), folder_of[element]
         if kind and file_folder == folder:
             continue
         first, second = (start / element.attrib[key] for start in (main / folders.get(kind, ""), file_folder.resolve()))

@@ -173,7 +173,7 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
     used_names, types = set(names), model.geom_type.tolist()
     kind_of = {number: mujoco.mjtGeom(number).name.removeprefix("mjGEOM_").lower() for number in set(types)}
     places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-    sizes, still, none = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
+    sizes, velocity, no_corners = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
     obstacles: list[Obstacle] = []
     for geom in geoms:
         kind = kind_of[types[geom]]
@@ -184,12 +184,12 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
                 ' or contype="0" conaffinity="0" if it is only to be drawn; or obstacles= to choose others; or an'
                 " MjcfRobot, which has MuJoCo's distances"
             )
-        position, size, corners = places[geom], np.zeros(3) if kind == "plane" else sizes[geom], none
+        position, size, corners = places[geom], np.zeros(3) if kind == "plane" else sizes[geom], no_corners
         if kind == "mesh" or kind in OTHER_KINDS:
             middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], FLAT)
             position = position + axes[geom] @ middle
-            corners = _hull_of(model, int(model.geom_dataid[geom])) - middle if kind == "mesh" else none
-        obstacles.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still, corners))
+            corners = _hull_of(model, int(model.geom_dataid[geom])) - middle if kind == "mesh" else no_corners
+        obstacles.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, velocity, corners))
     planes = [obstacle for obstacle in obstacles if obstacle.kind == "plane"]
     for i, obstacle in enumerate(obstacles):
         if obstacle.kind in ("capsule", "cylinder") and all(_walled_off(obstacle, end, planes) for end in (-1, 1)):

@@ -67,8 +67,8 @@ def read_urdf(
     _add_actuators(mjcf, spec, path.name, servos, efforts)
     _add_speed_limits(mjcf, root, path.name)
     with unlogged():
-        model, refused = _compiled(mjcf)
-        if refused:
+        model, refusal = _compiled(mjcf)
+        if refusal:
             _remove_refused_shapes(mjcf, path.name)
             model, _ = _compiled(mjcf)
         if model is not None:  # else what is wrong is said where the model is used
@@ -108,7 +108,7 @@ def _parsed(path: Path) -> ElementTree.Element:
 
 def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, str]) -> None:
     """Write the full paths of meshes, and take out the geometries of which MuJoCo has no file, with a warning."""
-    lost = dict[str, list[str]]()
+    omitted = dict[str, list[str]]()
     for link, kind in itertools.product(root.iterfind("link"), ("visual", "collision")):
         for geometry in link.findall(kind):
             geometry.attrib.pop("name", None)  # they get names later, as most have none, and some the same one
@@ -122,8 +122,8 @@ def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, s
                 mesh.set("filename", mesh_file or "")
                 if mesh_file is None:
                     link.remove(geometry)
-                    lost.setdefault(kind, []).append(name)
-    for kind, names in lost.items():
+                    omitted.setdefault(kind, []).append(name)
+    for kind, names in omitted.items():
         _log.warning(
             "%s: %d %s meshes are left out, such as %s: want .stl, .obj or .msh files, there or of the same name beside"
             " it; ROS_PACKAGE_PATH may name the folders of packages", path.name, len(names), kind, names[0],
@@ -209,8 +209,8 @@ def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> 
     bounded = {
         element.get("name") for element in root.iterfind("joint") if element.get("type") in ("revolute", "prismatic")
     }
-    if endless := [joint.name or "" for joint in spec.joints if joint.name in bounded and not _is_limited(joint)]:
-        _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(endless, _LISTED))
+    if unlimited := [joint.name or "" for joint in spec.joints if joint.name in bounded and not _is_limited(joint)]:
+        _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(unlimited, _LISTED))
 
 
 def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
@@ -250,8 +250,8 @@ def _moments(body: mujoco.MjsBody) -> Array:
     """
     moments = np.zeros((4, 4))
     if body.explicitinertial:
-        stated = body.fullinertia if np.any(body.fullinertia[1:]) else np.zeros(6)  # MuJoCo marks zeros by a NaN
-        xx, yy, zz, xy, xz, yz = stated
+        entries = body.fullinertia if np.any(body.fullinertia[1:]) else np.zeros(6)  # MuJoCo marks zeros by a NaN
+        xx, yy, zz, xy, xz, yz = entries
         inertia, frame = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), _frame(body.ipos, body.iquat)
         moments[:3, :3], moments[3, 3] = np.trace(inertia) / 2 * np.eye(3) - inertia, body.mass
         moments = frame @ moments @ frame.T
@@ -311,10 +311,10 @@ def _add_actuators(
             _add(section, "position", attributes, kp=stiffness, kv=damping, **numbers)
         elif effort > 0:
             _add(section, "motor", attributes, **({"ctrlrange": force} if force else {}))
-    if bare := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *effort_of)]:
+    if motorless := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *effort_of)]:
         _log.warning(
             "%s: no motor for %s: want an effort in <limit>, or efforts={%r: 10.0}, with 0.0 if there is none",
-            name, listed(bare, _LISTED), bare[0],
+            name, listed(motorless, _LISTED), motorless[0],
         )  # fmt: skip
 
 
@@ -351,23 +351,23 @@ def _compiled(mjcf: ElementTree.Element) -> tuple[mujoco.MjModel | None, str]:
 def _remove_refused_shapes(mjcf: ElementTree.Element, name: str) -> None:
     """Take out the geoms that MuJoCo refuses, such as boxes and meshes without a volume, with a warning."""
     meshes = {element.get("name"): element for element in mjcf.iterfind("asset/mesh")}
-    lost, used = dict[str, str](), set[str | None]()
+    omitted, used_meshes = dict[str, str](), set[str | None]()
     shapes = [(body, geom) for body in mjcf.iter("body") for geom in body.findall("geom")]
     for body, geom in shapes:
         alone, mesh = ElementTree.Element("mujoco"), geom.get("mesh")
         _add(alone, "asset").extend([meshes[mesh]] if mesh else [])
         _add(alone, "worldbody").append(geom)
-        if refused := _compiled(alone)[1]:
+        if refusal := _compiled(alone)[1]:
             body.remove(geom)
-            lost[geom.get("name", "")] = refused
+            omitted[geom.get("name", "")] = refusal
         else:
-            used.add(mesh)
+            used_meshes.add(mesh)
     for assets, (mesh, element) in itertools.product(mjcf.iterfind("asset"), meshes.items()):
-        if mesh not in used:
+        if mesh not in used_meshes:
             assets.remove(element)
-    if lost:
-        (first, why), *_ = lost.items()
-        _log.warning("%s: %d shapes are left out, such as %s: %s", name, len(lost), first, why)
+    if omitted:
+        (first, reason), *_ = omitted.items()
+        _log.warning("%s: %d shapes are left out, such as %s: %s", name, len(omitted), first, reason)
 
 
 def _exclude_overlaps(mjcf: ElementTree.Element, model: mujoco.MjModel, name: str) -> None:

@@ -158,15 +158,15 @@ class World:
         In place of its size the row of a mesh has the place of its corners, from the row on, their number, and inf for
         a prism, else 0.
         """
-        moved = self.displacements(times) if self.moving else np.zeros((1, len(self), 3))
+        shifts = self.displacements(times) if self.moving else np.zeros((1, len(self), 3))
         rows = np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
-        tables = np.repeat(rows[None], len(moved), axis=0)
-        tables[:, :, 1:4] += moved
-        first = tables.size + np.cumsum([0, *(obstacle.corners.size for obstacle in self.obstacles)])[:-1]
+        tables = np.repeat(rows[None], len(shifts), axis=0)
+        tables[:, :, 1:4] += shifts
+        corner_starts = tables.size + np.cumsum([0, *(obstacle.corners.size for obstacle in self.obstacles)])[:-1]
         meshes = [number for number, obstacle in enumerate(self.obstacles) if len(obstacle.corners)]
-        begin = ROW * np.arange(len(moved) * len(self)).reshape(tables.shape[:2])
-        tables[:, meshes, 13] = (first - begin)[:, meshes]
-        return np.concatenate([tables.ravel(), *(obstacle.corners.ravel() for obstacle in self.obstacles)]), len(moved)
+        row_starts = ROW * np.arange(len(shifts) * len(self)).reshape(tables.shape[:2])
+        tables[:, meshes, 13] = (corner_starts - row_starts)[:, meshes]
+        return np.concatenate([tables.ravel(), *(obstacle.corners.ravel() for obstacle in self.obstacles)]), len(shifts)
 
     @checked
     def moved(self, seconds: Finite) -> "World":
@@ -208,9 +208,9 @@ class World:
             raise InputError(
                 f"offset: got none for the plane {plane!r}, want its coordinate along the third axis, in metres"
             )
-        seen = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
+        obstacles = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
         if plane == "xy" and offset is None:
-            return World([obstacle for obstacle in seen if not _parallel(obstacle, 2)])
+            return World([obstacle for obstacle in obstacles if not _parallel(obstacle, 2)])
         first, second = (SPACE.index(letter) for letter in plane)
         across = 3 - first - second
         turn = np.zeros((3, 3))  # to the plane's axes: a rotation, which only exchanges the world's axes
@@ -226,7 +226,7 @@ class World:
                     rotation=turn @ obstacle.rotation,
                     velocity=turn @ obstacle.velocity,
                 )
-                for obstacle in seen
+                for obstacle in obstacles
                 if not _parallel(obstacle, across)
             ]
         )
@@ -253,16 +253,16 @@ class World:
     def distance(self, points: npt.ArrayLike) -> Array:
         """The signed distance in m to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
         points = _places("points", points)
-        flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
-        return np.array(flat).reshape(points.shape[:-1])
+        distances = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
+        return np.array(distances).reshape(points.shape[:-1])
 
     def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """The index of the nearest obstacle, (...), at points (..., 2 or 3)."""
         if not self.obstacles:
             raise InputError("nearest: got a world without obstacles, want at least one")
         points = _places("points", points)
-        flat = [int(self.distances(point).argmin()) for point in points.reshape(-1, points.shape[-1])]
-        return np.array(flat, dtype=np.int64).reshape(points.shape[:-1])
+        indices = [int(self.distances(point).argmin()) for point in points.reshape(-1, points.shape[-1])]
+        return np.array(indices, dtype=np.int64).reshape(points.shape[:-1])
 
 
 def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
