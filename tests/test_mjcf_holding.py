@@ -129,7 +129,7 @@ def test_a_robot_above_its_ground_is_told_how_to_stand_on_it() -> None:
             "cart",
         )
     )
-    assert f"; z is not held: {2.1 * 9.81:.3g} N are missing; start a robot that stands" in str(robot)
+    assert f"; z is not held: {2.1 * 9.81:.3g} N are missing; what stands on the ground starts" in str(robot)
     assert robot._held(robot.settled(robot.at())).held  # what the text names helps
 
 

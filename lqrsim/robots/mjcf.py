@@ -440,7 +440,7 @@ class MjcfRobot(Robot):
         if not held.held and not shortfall:
             shortfall = f"; {space.names[worst]} is not held: {abs(held.missed[worst]):.3g} {unit} are missing"
             if any(joint.kind == "free" and joint.dof <= worst < joint.dof + 6 for joint in self.mjcf.joints):
-                shortfall += "; start a robot that stands on the ground from robot.settled(robot.at())"
+                shortfall += "; what stands on the ground starts from robot.settled(robot.at())"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",
