@@ -30,6 +30,8 @@ def on_files(files: Any, config: Any) -> Any:
         files.append(File.generated(config, f"videos/{path.name}", abs_src_path=str(path)))
         if path.suffix == ".gif":
             files.append(File.generated(config, f"videos/{path.stem}.mp4", content=_mp4(path)))
+    for path in sorted((ROOT / "docs" / "figures").glob("*.gif")):
+        files.append(File.generated(config, f"figures/{path.stem}.mp4", content=_mp4(path)))
     return files
 
 
