@@ -74,7 +74,7 @@ def test_fitting_to_data_as_on_the_page(tmp_path: Path, monkeypatch: pytest.Monk
     pytest.importorskip("tabulate", reason="needs the `sysid` extra")
     monkeypatch.chdir(tmp_path)
     names = run_page("mjcf_robots.md")
-    (block,) = blocks_for_an_extra("mjcf_robots.md")
+    (block,) = blocks_for_an_extra("mjcf_robots.md", "sysid")
     exec(compile(block, "mjcf_robots.md", "exec"), names)
     fitted = {name: one.value[0] for name, one in names["fitted"].items()}
     # The plant has 1.5 kg in place of 1.2, in cart and pole alike.
