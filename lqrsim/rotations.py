@@ -148,8 +148,9 @@ def _three(field: str, vector: Vector) -> tuple[Any, ...]:
     if len(parts) != 3 or too_large or any(isinstance(part, str) for part in parts):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
     if all(_numeric(part) for part in parts):
-        for raw in parts:
-            check_memory(field, np.size(raw), 32, "arrays made from it")  # a broadcast array takes little memory itself
+        for part in parts:
+            if isinstance(part, np.ndarray):  # a broadcast array takes little memory itself
+                check_memory(field, part.size, 32, "arrays made from it")
         return parts
     import sympy
 
