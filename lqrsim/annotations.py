@@ -147,12 +147,12 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
             who = getattr(kind, "_prefix", f"{kind.__name__}: ")
         placed, (places, sized) = list(given), wanted()
         sizes = Sizes() if sized else None
-        take = _owned if makes else _checked
+        check = _owned if makes else _checked
         for name, place, said in places:
             if name in named:
-                named[name] = take(who + name, named[name], said, sizes)
+                named[name] = check(who + name, named[name], said, sizes)
             elif place < len(placed):
-                placed[place] = take(who + name, placed[place], said, sizes)
+                placed[place] = check(who + name, placed[place], said, sizes)
         return function(*placed, **named)
 
     return call

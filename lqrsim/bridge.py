@@ -133,7 +133,7 @@ def run(
             while not lockstep and (left := due - time.monotonic()) > 0:
                 time.sleep(left)
             began = time.monotonic()
-            held += not inlet.take() and step > 0
+            held += not inlet.receive() and step > 0
             if (age := began - inlet.arrived) > longest:
                 reason = f"no state for {age:.3g} s, after {step} periods"
                 break
@@ -222,7 +222,7 @@ class SimulatedRobot:
             outlet.write(compose(values, t))
         _wait(lambda: inlet.wait(SLICE), self._patience, lambda: "got no command")
         self.round_trips.append(time.monotonic() - begun)
-        (message,) = inlet.take()
+        (message,) = inlet.receive()
         return check_array("command", message.data, (len(self._controls),))
 
     def summary(self) -> str:
@@ -323,17 +323,17 @@ class _Inlet:
         return all(reader.writers() for reader in self._readers.values())
 
     def complete(self) -> bool:
-        self.take()
+        self.receive()
         return not self._lacking
 
     def lacking(self) -> str:
         return f"states: got no {', '.join(sorted(self._lacking))} from {', '.join(self._topics.values())}"
 
-    def take(self) -> bool:
+    def receive(self) -> bool:
         """Receive new messages. Returns whether all parts of the state are new."""
         now = time.monotonic()
         for kind, reader in self._readers.items():
-            for message in reader.take():
+            for message in reader.receive():
                 try:
                     values = (self._of_odometry if kind == "Odometry" else _of_joints)(message)
                     used = values.keys() & self._wanted.keys()
@@ -462,7 +462,7 @@ class _Reader:
         """Wait for a message until the time is over. Returns whether a message is there."""
         return self._waits.wait(self._ros.duration(seconds=seconds)) > 0
 
-    def take(self) -> list[Any]:
+    def receive(self) -> list[Any]:
         """The oldest message, in a list; an empty list if there is none."""
         return self._reader.take(N=1)
 

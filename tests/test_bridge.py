@@ -190,7 +190,7 @@ def test_by_the_clock_commands_are_those_of_the_law(topics: dict[str, Any]) -> N
     with bridge.SimulatedRobot(law, **where) as robot:
         got = [robot(states[0], 0.0)]
         thread.join(60)
-        got += [message.data for _ in range(10) for message in robot._inlet.take()]  # pyright: ignore[reportOptionalMemberAccess]
+        got += [message.data for _ in range(10) for message in robot._inlet.receive()]  # pyright: ignore[reportOptionalMemberAccess]
     assert ran[0].completed
     assert ran[0].held == 9  # there was one state only, which the laws of all periods were for
     np.testing.assert_allclose(ran[0].commands, [law(states[0], k * law.dt) for k in range(10)], rtol=0, atol=1e-15)
@@ -206,7 +206,7 @@ def test_it_stops_when_states_stay_away(topics: dict[str, Any]) -> None:
     with bridge.SimulatedRobot(law, **where) as robot:
         got = [robot([0.1, 0.2], 0.0).tolist()]
         thread.join(60)
-        got += [message.data for _ in range(9) for message in robot._inlet.take()]  # pyright: ignore[reportOptionalMemberAccess]
+        got += [message.data for _ in range(9) for message in robot._inlet.receive()]  # pyright: ignore[reportOptionalMemberAccess]
     assert not ran[0].completed
     assert ran[0].reason.startswith("no state for 0.")
     assert len(ran[0].commands) <= 4  # three periods, and the one in which the state arrived
@@ -249,7 +249,7 @@ def test_ctrl_c_leaves_the_safe_command(topics: dict[str, Any], tmp_path: Path) 
         process.send_signal(signal.SIGINT)
         assert robot._inlet is not None
         assert robot._inlet.wait(60)
-        (last,) = robot._inlet.take()
+        (last,) = robot._inlet.receive()
         printed, _ = process.communicate(timeout=60)
     assert last.data == [-1.5]
     assert process.returncode == 130
@@ -321,7 +321,7 @@ def test_what_is_not_there_is_named(topics: dict[str, Any]) -> None:
     with pytest.raises(ls.InputError, match=r"states: got no slider, slider_velocity from /test_.* within 0.5 s"):
         bridge.run(policy(), safe=[0.0], patience=0.5, **where)
     assert silent.get_matched_subscriptions() is not None
-    assert not listening.take()
+    assert not listening.receive()
 
 
 def test_a_message_without_a_joint_that_was_there_is_not_used(topics: dict[str, Any]) -> None:
@@ -336,7 +336,7 @@ def test_a_message_without_a_joint_that_was_there_is_not_used(topics: dict[str, 
         values = {"slider": 0.1, "slider_velocity": 0.2} if k != 4 else {"another": 3.0, "another_velocity": 4.0}
         outlet.write(node.joints(values, 0.0))
         assert inlet.wait(60)
-        inlet.take()
+        inlet.receive()
     thread.join(60)
     assert ran[0].refused == (1, f"{where['joints']}: got a message without slider, slider_velocity")
     assert ran[0].held == 1

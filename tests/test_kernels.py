@@ -159,7 +159,7 @@ DIVIDED = {
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
-    "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "take_step", "judge",
+    "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "follow_step", "judge",
     "value_functions_at_plan", "convex_value_functions", "optimality", "roll_out_and_keep",
 )  # fmt: skip
 
@@ -232,7 +232,7 @@ def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, bu
             shape = sizes["N"], sizes["W"]
             function, types = writing_out(function, len(given)), (*types, Pointer(shape[1:]))
             before, after, value = (*before, np.zeros(shape)), (*after, np.array(returned[: shape[0]])), None
-        if function.node.name == "take_slot":
+        if function.node.name == "claim_slot":
             let_go(given[0], int(returned))
         calls.append(Recorded(name, function, types, before, after, snapshot(value, {})))
         if at_once:

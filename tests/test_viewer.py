@@ -219,8 +219,8 @@ def test_a_hand_is_only_so_strong(quadrotor: ls.Scenario, quadrotor_solution: ls
     screen = Recorder(1, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))
     screen.drag(np.full((screen.model.nbody, 6), 1e4))
     weight = 0.5 * 9.81
-    assert np.linalg.norm(screen.take_wrench(0.1)[:3]) == pytest.approx(2 * weight)
-    assert np.linalg.norm(screen.take_wrench(0.1)[3:]) == pytest.approx(2 * weight * quadrotor.robot.radius)
+    assert np.linalg.norm(screen.pop_wrench(0.1)[:3]) == pytest.approx(2 * weight)
+    assert np.linalg.norm(screen.pop_wrench(0.1)[3:]) == pytest.approx(2 * weight * quadrotor.robot.radius)
 
 
 def test_who_is_lost_starts_again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:

@@ -244,7 +244,7 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
     first = screen.goal
     assert screen.hold(0) == screen.robot
     screen.press(PUSHES["PageUp"], 0.0)
-    assert screen.take_wrench(1.0)[2] > 0
+    assert screen.pop_wrench(1.0)[2] > 0
     np.testing.assert_array_equal(screen.goal, first)
     assert screen.hold(screen.other()) == screen.goal_body  # Enter
     for key, azimuth, way in (
@@ -255,7 +255,7 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
         before = screen.goal
         screen.press(PUSHES[key], azimuth)
         np.testing.assert_allclose(screen.goal - before, 0.1 * np.array(way), atol=1e-12)
-    assert not screen.take_wrench(1.0).any()
+    assert not screen.pop_wrench(1.0).any()
     assert screen.hold(0) == screen.goal_body  # a click on nothing
     assert screen.hold(screen.robot) == screen.robot  # a double click on the robot
     assert screen.other() == screen.goal_body

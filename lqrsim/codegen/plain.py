@@ -126,18 +126,16 @@ def _quietly(function: Callable[[float], float]) -> Callable[[float], float]:
     return run
 
 
-def _taken_apart(arguments: Sequence[Any]) -> list[Any]:
+def _flattened(arguments: Sequence[Any]) -> list[Any]:
     return [
-        part
-        for argument in arguments
-        for part in (_taken_apart(argument) if isinstance(argument, tuple) else [argument])
+        part for argument in arguments for part in (_flattened(argument) if isinstance(argument, tuple) else [argument])
     ]
 
 
 def _c_call(returns: Any, address: float, arguments: Sequence[Any]) -> Any:
     """Call a C function; arrays are passed by their addresses."""
     kinds, numbers = list[Any](), list[Any]()
-    for argument in _taken_apart(arguments):
+    for argument in _flattened(arguments):
         number = argument.item() if isinstance(argument, np.generic) else argument
         if isinstance(argument, np.ndarray):
             kinds.append(ctypes.c_void_p)

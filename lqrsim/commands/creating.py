@@ -19,7 +19,7 @@ TEMPLATE, CLASS = "my_robot", "MyRobot"
 OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
 TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
 # Names with another meaning: those used in the written files, MuJoCo's first body, pytest's own file, Windows' devices.
-TAKEN = {
+RESERVED = {
     "any", "path", "self", "world", "conftest", "con", "prn", "aux", "nul",
     *(f"{port}{number}" for port in ("com", "lpt") for number in range(10)),
 }  # fmt: skip
@@ -169,7 +169,7 @@ def check_robot_name(name: str) -> None:
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
         raise ls.InputError(f"name: got {excerpt(name)}, want {wanted}")
-    reserved = TAKEN | {word.lower() for word in (*dir(builtins), *keyword.kwlist)}
+    reserved = RESERVED | {word.lower() for word in (*dir(builtins), *keyword.kwlist)}
     if name in reserved:
         raise ls.InputError(f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another")
     spec = importlib.util.find_spec(name)

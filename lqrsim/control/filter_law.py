@@ -101,13 +101,13 @@ class FilterRun(ControllerRun):
         self._commands = [np.tile(controls[min(i, len(controls) - 1)], (trials, 1)) for i in range(self._delay)]
 
     def control(self, step: int, measured: Array) -> Array:
-        self.take_in(step, measured)
+        self.update(step, measured)
         return self.command(step)
 
     def estimator_diverged(self) -> Mapping[int, str]:
         return self._diverged
 
-    def take_in(self, step: int, measured: Array) -> None:
+    def update(self, step: int, measured: Array) -> None:
         """Predict the estimate to the knot of a step's measurement, and correct it."""
         if step < self._latency:  # no measurement has arrived
             return

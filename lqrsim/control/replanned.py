@@ -57,7 +57,7 @@ class ReplannedRun(ControllerRun):
     def control(self, step: int, measured: Array) -> Array:
         commands: list[Array] = []
         for k, run in enumerate(self._runs):
-            run.take_in(step, measured[k : k + 1])
+            run.update(step, measured[k : k + 1])
             if self._rule.due(step, max(step - 1, 0)) and not run.estimator_diverged():
                 self._replan(run, k, step)
             commands.append(run.command(step))

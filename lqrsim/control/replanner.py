@@ -115,7 +115,7 @@ class LiveReplanner:
         state = check_array("state", state, (len(self.active.plan.policy.state_coordinates),))
         dt = self.problem.dt
         step = int(t / dt + 1e-9)
-        self._take(step)
+        self._adopt_answer(step)
         if self._solve is None and self._rule.due(step, self._asked):
             self._ask(state, t, step)
         policy = self.active.plan.policy
@@ -137,7 +137,7 @@ class LiveReplanner:
         self._solve = solve
         self._queue.put(solve)
 
-    def _take(self, step: int) -> None:
+    def _adopt_answer(self, step: int) -> None:
         """Put an answer into force at its deadline. A late answer is not used."""
         solve = self._solve
         if solve is None or step < solve.request.first:

@@ -243,9 +243,9 @@ class SensorRun(FilterRun):
         self.innovations = None  # readings of one knot arrive at several
         self.estimate = self._kept = filter_.start(trials, law.nominal[0])
         self._first = 0  # the first knot after that of `_kept`, whose readings have all arrived
-        self._taken, self._acting = dict[int, Array](), dict[int, Array]()
+        self._readings, self._acting = dict[int, Array](), dict[int, Array]()
 
-    def take_in(self, step: int, measured: Array) -> None:
+    def update(self, step: int, measured: Array) -> None:
         """Run the filter again, with the readings (K, Y) that arrive at a step."""
         shape, sensors = (self._trials, len(self._filter.sensors.names)), self._filter.sensors
         if measured.shape != shape:
@@ -256,16 +256,16 @@ class SensorRun(FilterRun):
         self._acting[step] = np.tile(self.model.plan.controls[0], (self._trials, 1))  # before the first period
         if step:
             self._acting[step] = self._commands.pop(0)
-        self._taken[step] = np.full(shape, np.nan)
+        self._readings[step] = np.full(shape, np.nan)
         for at, late in zip(sensors.columns, self._filter.late, strict=True):
             if step >= late:
-                self._taken[step - late][:, at] = measured[:, at]
+                self._readings[step - late][:, at] = measured[:, at]
         now, slowest = self._kept, max(self._filter.late)
         for knot in range(self._first, step + 1):
             now = self._advance(now.copy(), knot)
             if knot == step - slowest:
                 self._kept, self._first = now, knot + 1
-                del self._taken[knot], self._acting[knot]
+                del self._readings[knot], self._acting[knot]
         self.estimate, self.z = now, now.z
         if self.estimates is not None and step < len(self.estimates):
             self.estimates[step] = self.z
@@ -280,11 +280,11 @@ class SensorRun(FilterRun):
         states = in_c_order(z[None, :, : model.n])
         turn_to_nearest(model.dynamics.state_coordinates, states, near)
         z[:, : model.n] = states[0]
-        known = ~np.isnan(self._taken[knot])
+        known = ~np.isnan(self._readings[knot])
         if known.any():
             expected = self._read(states[0], *filter_.acting(z, self._acting[knot]))
             expected[:, filter_.biased] += bias
-            off = filter_.difference(self._taken[knot], expected)
+            off = filter_.difference(self._readings[knot], expected)
             moved = filter_.correct(covariance, knot, known & np.isfinite(off), off)
             z += moved[:, : model.size]
             bias += moved[:, model.size :]

@@ -69,7 +69,7 @@ def active_set(task, violation, stages, work, memory):
     elif task == PREPARE:
         prepare_step(stages, work, mem)
     elif task == TAKE:
-        take_step(violation, stages, work, mem)
+        apply_step(violation, stages, work, mem)
     else:
         roll_out(stages, work, mem)
     return RUNNING
@@ -233,7 +233,7 @@ def change_row(at, rows, work):
 
 
 @compact
-def take_step(violation, stages, work, mem):
+def apply_step(violation, stages, work, mem):
     """Take the step that pivoting has found; compute the models and measures there."""
     rows, changes = stages.rows, stages.changes
     for at in range(rows.size * (stages.steps + 1)):

@@ -95,7 +95,7 @@ def descend(first, last, settings, model, work, memory, log):
                 return done + 1, CONVERGED, False, -1
         merit, cost, fraction = memory.merit, memory.plan_cost, 0.0
         if memory.failed < 0:
-            merit, cost, fraction = take_step(settings, model, work, memory)
+            merit, cost, fraction = follow_step(settings, model, work, memory)
         improvement, gap, method = 0.0, 0.0, how.method
         settled, exhausted, full = how.changes == 0, False, done + 1 == settings.max_iterations
         if fraction > 0:
@@ -215,7 +215,7 @@ def update_plan_cost(steps, model, work, memory):
     memory.plan_cost, memory.merit = cost, cost + added
 
 
-def take_step(settings, model, work, memory):
+def follow_step(settings, model, work, memory):
     """Follow the step as far as it lowers the merit; return the new merit and cost, and the fraction, 0 for none."""
     how, shift, bound = settings.descent, stack(N), memory.merit + RISE * abs(memory.merit)
     for i in range(N):

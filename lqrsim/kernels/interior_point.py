@@ -27,10 +27,10 @@ from lqrsim.kernels.active_set import (
     HELD,
     PAID,
     SOFTNESS,
+    apply_step,
     measure_plan,
     pivot,
     prepare_step,
-    take_step,
 )
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy, copy_matrix
@@ -171,7 +171,7 @@ def begin(begun, stages, work, mem):
         if rows.live[at] != 0:
             begin_row(at, begun, stages, work, mem)
     adjoint(stages, work.costates, work.other.changes.controls)
-    take_measures(stages, work, mem)
+    measure_iterate(stages, work, mem)
     violated = off(now, stages)
     forget(stages)
     mem.before = mem.cost
@@ -336,7 +336,7 @@ def iterate(done, tolerance, stages, work, mem):
         part = force_step(stages, work, mem)
     if part < 0:
         return False
-    take(part, stages, work, mem)
+    accept_step(part, stages, work, mem)
     return True
 
 
@@ -709,7 +709,7 @@ def force_step(stages, work, mem):
 
 
 @compact
-def take(part, stages, work, mem):
+def accept_step(part, stages, work, mem):
     """Go to the trial, with that fraction of the step in multipliers and costates."""
     rows, step, count = stages.rows, work.step, int(mem.filtered)
     work.filter[count, 0] = (1 - MARGIN) * mem.violated
@@ -872,7 +872,7 @@ def go_to(point, cost, least, stages, work, mem):
     mem.cost = cost
     copy_matrix(point.arrived, stages.steps, N, stages.models.arrived)
     look(stages, work.now.plan, work.costates, least)
-    take_measures(stages, work, mem)
+    measure_iterate(stages, work, mem)
 
 
 @compact
@@ -880,7 +880,7 @@ def renew(stages, work, mem):
     """Compute the derivatives of the dynamics anew, about the iterate."""
     stages.keeps[0], mem.age = 0.0, 0.0
     look(stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
-    take_measures(stages, work, mem)
+    measure_iterate(stages, work, mem)
 
 
 @compact
@@ -902,7 +902,7 @@ def keep_point(stages, work, mem):
 
 
 @compact
-def take_measures(stages, work, mem):
+def measure_iterate(stages, work, mem):
     """Compute the measures of the iterate, about which the models are."""
     rows, slacks = stages.rows, work.now.slacks
     steepest, missing, unequal, widest, product = measure(stages, work.now.plan, work.now.numbers, work.gaps)
@@ -986,7 +986,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
             outcome = pivot(softness, stages, active, memory)
         if outcome == STALLED:
             break
-        take_step(violation, stages, active, memory)
+        apply_step(violation, stages, active, memory)
         if not isfinite(memory.cost):
             return False
         far = farthest_from_target(rows, stages.steps)
@@ -999,7 +999,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
     copy(rows.numbers, rows.size * (stages.steps + 1), work.now.numbers)
     copy_matrix(active.costates, stages.steps + 1, N, work.costates)
     mem.cost = memory.cost
-    take_measures(stages, work, mem)
+    measure_iterate(stages, work, mem)
     return True
 
 

@@ -36,7 +36,7 @@ from lqrsim.kernels.mjcf_dynamics import (
     TABLE,
     XMAT,
     XPOS,
-    take_slot,
+    claim_slot,
     write_positions,
 )
 from lqrsim.kernels.rotation_ratios import cosine_ratio, cubic_ratio, sine_ratio
@@ -80,7 +80,7 @@ def slopes_of(count, states, data, out, slopes, which, segments):
 def places(x, data, out):
     """Write the coordinates of the balls, ball by ball."""
     p = at(data[0])
-    slot = take_slot(p)
+    slot = claim_slot(p)
     one = at(p[SLOTS] + 8 * SLOT * slot)
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
@@ -104,7 +104,7 @@ def find_one(x, displaced, moved, data, first, out, which, segments):
 def find(x, displaced, moved, data, first, out, which, segments):
     """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
     p = at(data[0])
-    slot = take_slot(p)
+    slot = claim_slot(p)
     one = at(p[SLOTS] + 8 * SLOT * slot)
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
@@ -118,7 +118,7 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     If the other moves too, it is the difference of both speeds.
     """
     p = at(data[0])
-    slot, nv = take_slot(p), int(p[NV])
+    slot, nv = claim_slot(p), int(p[NV])
     one = at(p[SLOTS] + 8 * SLOT * slot)
     moves, others, normal, there, nowhere = stack(3 * N), stack(3 * N), stack(3), stack(3), stack(1)
     write_positions(x, p, at(one[QPOS]))

@@ -74,7 +74,7 @@ def advance(x, u, p, h, out):
     if substeps < 1:
         fill(out, N, nan)
         return
-    slot = take_slot(p)
+    slot = claim_slot(p)
     run(z, p, substeps, at(p[SLOTS] + 8 * SLOT * slot), out)
     store(p[FLAGS], slot, 0)
 
@@ -92,7 +92,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
         for i in range(N):
             fill(jacobian[i], W, nan)
         return
-    team, slot = p[TEAM], take_slot(p)
+    team, slot = p[TEAM], claim_slot(p)
     together = team != 0 and load(team, HELPERS) > 0 and claim(team, BUSY) == 1
     one, before, accelerations, arrived = at(p[SLOTS] + 8 * SLOT * slot), zeros(N), zeros(N), stack(N)
     columns, other_side = stack(N, W), stack(N, W)
@@ -199,7 +199,7 @@ def help_out(p):
 
     A thread takes a column first, and reads its job afterwards. Until the column is done, no other job is written.
     """
-    team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
+    team, slot, known, patience = p[TEAM], claim_slot(p), -1, 0
     one, job, columns = at(p[SLOTS] + 8 * SLOT * slot), at(p[JOB]), job_columns(p)
     z, wrench, before, accelerations, arrived = stack(W), stack(6), stack(N), zeros(N), stack(N)
     while load(team, STOP) == 0:
@@ -280,7 +280,7 @@ def steps_in(x, u, p, h, z):
     return int(h / p[TIMESTEP] + 0.5) if h > 0 else 0
 
 
-def take_slot(p):
+def claim_slot(p):
     """Claim a free slot."""
     slot, count = 0, int(p[COUNT])
     while claim(p[FLAGS], slot) == 0:

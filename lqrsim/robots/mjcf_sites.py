@@ -25,7 +25,7 @@ from lqrsim.kernels.mjcf_dynamics import (
     SLOTS,
     XMAT,
     XPOS,
-    take_slot,
+    claim_slot,
     write_positions,
 )
 from lqrsim.kernels.rotation_ratios import cotangent_ratio
@@ -168,7 +168,7 @@ BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # layout of data
 def residual(x, data, out):
     """Write the rows."""
     p = at(data[0])
-    slot = take_slot(p)
+    slot = claim_slot(p)
     one, point = at(p[SLOTS] + 8 * SLOT * slot), stack(3)
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
@@ -179,7 +179,7 @@ def residual(x, data, out):
 def residual_jacobian(x, data, out, slopes):
     """Write the rows and their derivatives in the states (any, N), which are zero on entry."""
     p = at(data[0])
-    slot, nv, body = take_slot(p), int(p[NV]), int(data[BODY])
+    slot, nv, body = claim_slot(p), int(p[NV]), int(data[BODY])
     one, point, moves, turns = at(p[SLOTS] + 8 * SLOT * slot), stack(3), stack(3 * N), stack(3 * N)
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))

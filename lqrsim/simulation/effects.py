@@ -155,7 +155,7 @@ class Readings:
         if not isinstance(physics, MujocoPhysics):
             raise InputError("controller: got one that reads sensors of the MJCF, want a plant moved by MuJoCo")
         self._sensors, self._effects, self._physics, self._dt = sensors, effects, physics, dt
-        self._late, self._taken = sensors.late(dt), dict[int, Array]()
+        self._late, self._readings = sensors.late(dt), dict[int, Array]()
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """The exact readings that arrive at a knot of the plan, before the run begins; as `arriving`."""
@@ -172,13 +172,13 @@ class Readings:
     def _columns(self) -> zip:
         return zip(self._sensors.sensors, self._sensors.columns, strict=True)
 
-    def _arriving(self, step: int, taken: Array) -> Array:
-        self._taken[step] = taken
-        self._taken.pop(step - max(self._late) - 1, None)
-        out = np.full(taken.shape, np.nan)
+    def _arriving(self, step: int, readings: Array) -> Array:
+        self._readings[step] = readings
+        self._readings.pop(step - max(self._late) - 1, None)
+        out = np.full(readings.shape, np.nan)
         for i, (at, late) in enumerate(zip(self._sensors.columns, self._late, strict=True)):
-            if step - late in self._taken and self._sensors.due(step - late, self._dt)[i]:
-                out[:, at] = self._taken[step - late][:, at]
+            if step - late in self._readings and self._sensors.due(step - late, self._dt)[i]:
+                out[:, at] = self._readings[step - late][:, at]
         return out
 
 
@@ -189,7 +189,7 @@ class BeliefReadings:
     """
 
     def __init__(self, belief: Belief, effects: Effects) -> None:
-        self.belief, self._effects, self._taken = belief, effects, list[Array]()
+        self.belief, self._effects, self._readings = belief, effects, list[Array]()
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """The exact readings (K, Y) that arrive at a knot of the plan, before the run begins."""
@@ -200,10 +200,10 @@ class BeliefReadings:
         exact, deviations = self.belief.read(states)
         return self._late(self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS])
 
-    def _late(self, taken: Array) -> Array:
-        self._taken.append(taken)
-        arrived = len(self._taken) > self.belief.sensors.delay
-        return self._taken.pop(0) if arrived else np.full_like(taken, np.nan)
+    def _late(self, readings: Array) -> Array:
+        self._readings.append(readings)
+        arrived = len(self._readings) > self.belief.sensors.delay
+        return self._readings.pop(0) if arrived else np.full_like(readings, np.nan)
 
 
 class _Streams(Sequence[np.random.Generator]):

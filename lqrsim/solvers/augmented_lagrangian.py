@@ -177,7 +177,7 @@ def _damped(
         lagrangian.evaluate(*plan)
         merits.append(cost + lagrangian.added())
     plan, cost = plans[int(np.argmin(merits))]
-    work.take(*plan, cost)
+    work.set_best(*plan, cost)
     return _rounds(run, lagrangian, "the undamped method failed with the constraints")
 
 

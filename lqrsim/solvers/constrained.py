@@ -120,7 +120,7 @@ class Ladder:
             return None
         best = best.kept()
         self._point.without_multipliers()
-        self._run.work.take(*best.plan, best.cost)
+        self._run.work.set_best(*best.plan, best.cost)
         result = self._run.newton(detail=best.detail, patient=True)
         if not result.success or result.violation > 0:
             return None

@@ -95,7 +95,7 @@ def _gains(
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
     guess = InitialGuess(gain, controls, multipliers=multipliers)
     run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
-    run.work.take(states, controls, float(compiled.costs_of(problem, states[None], controls[None])[0]))
+    run.work.set_best(states, controls, float(compiled.costs_of(problem, states[None], controls[None])[0]))
     with problem.dynamics.quiet():
         if np.isfinite(run.linearize_about_plan()):
             gain = run.work.arrays.policy.gain.copy()

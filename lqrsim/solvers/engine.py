@@ -774,8 +774,8 @@ class Workspace:
         """The cost of the best plan; infinite where there is none."""
         return float(self.memory["plan_cost"])
 
-    def take(self, states: Array, controls: Array, cost: float = np.inf) -> None:
-        """Take a plan for the best one; its cost is infinite where it is not known."""
+    def set_best(self, states: Array, controls: Array, cost: float = np.inf) -> None:
+        """Make a plan the best one; its cost is infinite where it is not known."""
         self.best.states[...], self.best.controls[...] = states, controls
         self.memory["plan_cost"] = cost
 

@@ -155,8 +155,8 @@ class InteriorRun:
         states, controls = work.roll_out(*law, found.plan.states[0])
         if not np.isfinite(states).all():
             return None
-        self._take_multipliers(found, work.constraint_values(states, controls), FIRMNESS)
-        work.take(states, controls, cost := self._run.stages.trial(Motion(states, controls))[0])
+        self._set_multipliers(found, work.constraint_values(states, controls), FIRMNESS)
+        work.set_best(states, controls, cost := self._run.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
         with self._budget.joined_with_last(NAME):
@@ -168,7 +168,7 @@ class InteriorRun:
                     lagrangian.update(growth=1.0)
                     result = self._newton(lagrangian, found.scale)
                 if not (result.success and lagrangian.kept):  # as where no other plan takes as little time
-                    work.take(states, controls, cost)
+                    work.set_best(states, controls, cost)
                     result = self._ended_inside(lagrangian, found)
             else:
                 result = self._ended_inside(lagrangian, found)
@@ -188,7 +188,7 @@ class InteriorRun:
         """
         work, laps = self._run.work, Laps(self._budget)
         result = self._run.about_plan(Status.CONVERGED)
-        self._take_multipliers(found, work.constraint_values(*work.best), FAINT * FIRMNESS)
+        self._set_multipliers(found, work.constraint_values(*work.best), FAINT * FIRMNESS)
         lagrangian.evaluate(*work.best)
         found.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
         return result
@@ -204,7 +204,7 @@ class InteriorRun:
             gain[pressed] = 0.0
         return controls, gain
 
-    def _take_multipliers(self, found: Found, values: list[Array], firmness: float) -> None:
+    def _set_multipliers(self, found: Found, values: list[Array], firmness: float) -> None:
         """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
         triples = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
         for k, (own, known, numbers) in enumerate(triples):

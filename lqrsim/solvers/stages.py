@@ -80,13 +80,13 @@ class Stages:
         by_step = (array.reshape(steps + 1, rows) for array in stage_rows[4:])
         self._acts, self._live, self.held, self._kinds, self._sizes, self._targets, self._prices, *others = by_step
         self.numbers, self.force = others
-        self._take(problem)
+        self._read_problem(problem)
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign
         if problem.constraint_terms:
             self.prepare()
 
-    def _take(self, problem: Problem) -> None:
+    def _read_problem(self, problem: Problem) -> None:
         """Read a problem's numbers, and determine which rows can act."""
         self.problem, self.steps = problem, problem.steps
         fixed, steps, terms = isinstance(problem.initial, FixedState), problem.steps, problem.constraint_terms
@@ -148,7 +148,7 @@ class Stages:
                 _idle.remove(stages)
         if stages is None:
             return cls(problem)
-        stages._take(problem)
+        stages._read_problem(problem)
         stages.about.rows.support[...] = 0.0
         return stages
 

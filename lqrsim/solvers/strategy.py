@@ -236,7 +236,7 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     beside = point.result(*compiled.rollout(run.problem, *law, plan.states[0].copy()))
     if not beside.cost < saddle.cost:
         return None
-    run.work.take(*beside.plan, beside.cost)
+    run.work.set_best(*beside.plan, beside.cost)
     return run.certified(run.newton(patient=True))
 
 
@@ -263,7 +263,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
     other = other.kept()
     if budget.over:
         return replace(other, status=result.status, detail=result.detail)
-    run.work.take(*other.plan, other.cost)
+    run.work.set_best(*other.plan, other.cost)
     return run.newton(detail=result.detail, patient=True)
 
 

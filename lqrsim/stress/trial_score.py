@@ -36,10 +36,10 @@ class PrescribedDraws:
 
     def standard_normal(self, size: Size = None) -> Any:
         count = 1 if size is None else int(np.prod(size))
-        numbers = self._take(count)
+        numbers = self._draw(count)
         return float(numbers[0]) if size is None else numbers.reshape(size).copy()
 
-    def _take(self, count: int) -> Array:
+    def _draw(self, count: int) -> Array:
         if self.used + count > len(self.numbers):
             raise InputError(f"numbers: got {len(self.numbers)}, want more: a trial draws at least one more")
         self.used += count
@@ -95,7 +95,7 @@ class _CountedDraws(PrescribedDraws):
     def __init__(self) -> None:
         super().__init__(np.zeros(0))
 
-    def _take(self, count: int) -> Array:
+    def _draw(self, count: int) -> Array:
         self.used += count
         return np.zeros(count)
 

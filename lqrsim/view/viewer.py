@@ -268,7 +268,7 @@ class _UserForces(Disturbance):
         wrench = np.zeros(6)
 
         def force(step: int, states: Array) -> Array:
-            wrench[:] = self.viewer.take_wrench(plan.dt)
+            wrench[:] = self.viewer.pop_wrench(plan.dt)
             return wrench[None, :3]
 
         return Effect(force=force, torque=lambda step, states: wrench[None, 3:])

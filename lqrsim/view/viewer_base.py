@@ -172,7 +172,7 @@ class Viewer(abc.ABC):
     def request_restart(self) -> None:
         self._restart = True
 
-    def take_wrench(self, dt: float) -> Array:
+    def pop_wrench(self, dt: float) -> Array:
         """Mean force and torque (6,) of the person over the next `dt` seconds; pushes are used up."""
         push, self._impulse = np.append(self._impulse / dt, np.zeros(3)), np.zeros(3)
         return self.wrench + push
