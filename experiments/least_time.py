@@ -104,7 +104,7 @@ def main(config: Config) -> Result:
         horizon = solution.trajectory.horizon
         plant = scenario.plant().for_period(solution.trajectory.dt)
         # A plan at its limits has no gains there: what is left for feedback a tracking law takes.
-        ordinary = dataclasses.replace(problem.settled(solution), control_limits=None)
+        ordinary = dataclasses.replace(problem.with_duration_of(solution), control_limits=None)
         law = ls.track(ordinary, solution, tolerate=case.tolerate)
         rollout = ls.simulate(plant, dataclasses.replace(solution, policy=law), seed=0)
         space, controls = problem.control_coordinates, solution.trajectory.controls

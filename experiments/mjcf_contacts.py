@@ -61,7 +61,7 @@ def main(config: Config) -> Result:
 def stated(case: Case) -> tuple[ls.MjcfRobot, ls.Problem]:
     """The robot, and the problem that weighs the place of the body alone."""
     robot = ls.MjcfRobot(scene_from_xml(case.xml, "contacts"))
-    start, space = robot.settled(robot.at(None, **dict(case.at))), robot.dynamics.control_coordinates
+    start, space = robot.at_rest(robot.at(None, **dict(case.at))), robot.dynamics.control_coordinates
     names = robot.dynamics.state_coordinates.names
     weighed = {f"body_{axis}": way for axis, way in zip("xyz", case.way, strict=True) if way}
     ends = {name: start[names.index(name)] + way for name, way in weighed.items()}

@@ -66,7 +66,7 @@ def solved(winch: str, load: str, lifted: float, most: int) -> dict[str, Any]:
     """A plan from hanging at rest to hanging at rest, and its run."""
     length = 1.9 if WINCHES[winch] else 1.0
     robot = ls.MjcfRobot(scene_from_xml(CRANE.format(joints=LOADS[load], length=length, winch=WINCHES[winch]), "crane"))
-    start, names = robot.settled(robot.at()), robot.dynamics.state_coordinates.names
+    start, names = robot.at_rest(robot.at()), robot.dynamics.state_coordinates.names
     goal = start.copy()
     for name in ("cart", "x", "load_x"):
         goal[[i for i, one in enumerate(names) if one == name]] += MOVED

@@ -144,7 +144,7 @@ def first_lap(steps: int) -> tuple[ls.Problem, ls.Trajectory]:
 
 def slower_lap(lap: Lap, problem: ls.Problem, first: ls.Solution) -> tuple[ls.Problem, ls.Trajectory]:
     """A lap with a margin, and the first lap, flown more slowly."""
-    plan, knots = first.trajectory, list(problem.settled(first).segments)
+    plan, knots = first.trajectory, list(problem.with_duration_of(first).segments)
     problem = problem_of(lap, plan.steps, seconds=lap.late * plan.horizon, knots=knots)
     states = plan.states.copy()
     states[:, 3:6] /= lap.late
@@ -190,7 +190,7 @@ def misses(paths: Array, knots: list[int]) -> Array:
 
 def check(lap: Lap, problem: ls.Problem, solution: ls.Solution) -> dict[str, Any]:
     """What SciPy says of a plan, beside what the lap may take."""
-    plan, knots = solution.trajectory, list(problem.settled(solution).segments)
+    plan, knots = solution.trajectory, list(problem.with_duration_of(solution).segments)
     states, force = integrated(plan), plan.controls
     rate_x, rate_y = states[:, 10:12].T
     body = np.abs([(rate_x + rate_y) / 2**0.5, (rate_x - rate_y) / 2**0.5, states[:, 12]]).max(axis=1)
@@ -230,8 +230,8 @@ def plant_of(period: float) -> ls.Plant:
 
 def flown(config: Config, problem: ls.Problem, solution: ls.Solution) -> tuple[list[dict[str, Any]], ls.Rollout]:
     """How often laps fail, by law and preset; and the runs of `OffsetFree` under the weakest preset."""
-    plan, knots = solution.trajectory, list(problem.settled(solution).segments)
-    ordinary = problem.settled(solution)
+    plan, knots = solution.trajectory, list(problem.with_duration_of(solution).segments)
+    ordinary = problem.with_duration_of(solution)
     policy = dataclasses.replace(solution.policy, control_coordinates=ROBOT.dynamics.control_coordinates)
     solution = dataclasses.replace(solution, policy=policy)  # feedback has all of the force
     plant, rows, shown = plant_of(plan.dt), list[dict[str, Any]](), list[ls.Rollout]()

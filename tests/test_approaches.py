@@ -68,7 +68,7 @@ SIDES = [(-0.2, 0.0), (0.0, 0.2), (0.2, 0.0), (0.15, 0.15), (-0.1, 0.15), (-0.15
 @pytest.mark.parametrize("mass", rarely(0.5, 0.2, 1.0))
 def test_a_disc_pushes_a_box_to_any_side(x: float, y: float, mass: float) -> None:
     robot = robot_of(DISC, mass)
-    problem = stated(robot, robot.settled(robot.at()), 50, body_x=x, body_y=y)
+    problem = stated(robot, robot.at_rest(robot.at()), 50, body_x=x, body_y=y)
     check_moved(robot, problem, (x, y, 0.0))
 
 
@@ -85,7 +85,7 @@ def test_an_arm_pushes_a_puck_away_and_back(mass: float) -> None:
 @pytest.mark.parametrize("mass", rarely(0.2, 0.4, 0.8))  # sixteen states, of which no other test has as many
 def test_a_foot_kicks_a_ball(mass: float) -> None:
     robot = robot_of(LEG, mass)
-    problem = stated(robot, robot.settled(robot.at(hip=0.3, knee=0.3)), 40, 1e-4, body_x=1.0)
+    problem = stated(robot, robot.at_rest(robot.at(hip=0.3, knee=0.3)), 40, 1e-4, body_x=1.0)
     check_moved(robot, problem, (1.0, 0.0, 0.0), 30)
 
 
@@ -94,7 +94,7 @@ def test_a_foot_kicks_a_ball(mass: float) -> None:
 @pytest.mark.parametrize("mass", [0.1, *rarely(0.05, 0.2)])
 def test_a_gripper_picks_up_a_cube(mass: float, place: str) -> None:
     robot = robot_of(GRIPPER.replace("0 0 0.35", f"{place} 0.35"), mass)
-    problem = stated(robot, robot.settled(robot.at()), 60, body_z=0.15)
+    problem = stated(robot, robot.at_rest(robot.at()), 60, body_z=0.15)
     check_moved(robot, problem, (0.0, 0.0, 0.15))
 
 
@@ -131,7 +131,7 @@ def test_a_push_goes_round_the_body_to_its_far_side(start: float, goal: float, f
 @pytest.mark.usefixtures("no_further")
 def test_what_is_missing_is_said() -> None:
     robot = robot_of(DISC.replace('name="disc"', 'name="disc" contype="0" conaffinity="0"'))
-    state = robot.settled(robot.at())
+    state = robot.at_rest(robot.at())
     solution = ls.smooth(stated(robot, state, 30, body_x=0.2), max_iterations=10)
     assert solution.status is ls.Status.STALLED
     assert "nothing that moves touches body" in solution.detail
@@ -142,7 +142,7 @@ def test_what_is_missing_is_said() -> None:
 def test_a_push_that_does_not_pay_is_named() -> None:
     robot = robot_of(DISC)
     # With ten times the weight, relative to the controls', it pays: that is a case of the disc above.
-    problem = stated(robot, robot.settled(robot.at()), 50, 1 / 40, body_y=0.2)
+    problem = stated(robot, robot.at_rest(robot.at()), 50, 1 / 40, body_y=0.2)
     solution = ls.smooth(problem, max_iterations=4)
     assert solution.status is ls.Status.STALLED
     assert "a push by disc" in solution.detail

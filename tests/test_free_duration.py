@@ -22,7 +22,7 @@ from lqrsim import cli
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.references import resolve
 from lqrsim.solvers import budget, free_duration, strategy
-from lqrsim.solvers.free_duration import settled
+from lqrsim.solvers.free_duration import at_duration
 from lqrsim.solvers.settings import SmootherSettings
 
 
@@ -161,7 +161,7 @@ def test_no_other_duration_costs_less(price: float) -> None:
     best, plan = solution.trajectory.horizon, solution.trajectory
     costs = []
     for share in (0.998, 1.0, 1.002):
-        other = settled(free, share * best)
+        other = at_duration(free, share * best)
         found = ls.smooth(other, start=ls.Trajectory(plan.states, plan.controls, other.dt))
         assert found.status is Status.CONVERGED
         costs.append(found.cost + price * share * best)
@@ -431,16 +431,16 @@ def test_segments_take_the_times_that_they_need(places: list[float], knots: list
     turns = np.array([0.0, *(place - 0.01 * np.sign(place) for place in places), end])
     seconds = 2 * np.sqrt(np.abs(np.diff(turns)))
     assert seconds.sum() * (1 - 1e-6) <= solution.trajectory.horizon <= 1.005 * seconds.sum()
-    settled = by_waypoints(places, knots, end).settled(solution)
-    assert settled.duration is None
-    assert settled.dt == pytest.approx(solution.trajectory.dt)
+    fixed = by_waypoints(places, knots, end).with_duration_of(solution)
+    assert fixed.duration is None
+    assert fixed.dt == pytest.approx(solution.trajectory.dt)
     ends = np.cumsum(seconds)[:-1]
-    np.testing.assert_allclose(np.array(settled.segments) * settled.dt, ends, rtol=0, atol=settled.dt)
-    # The waypoints moved along: the plan keeps the settled problem, and is its optimum.
-    passed = solution.trajectory.states[list(settled.segments), 0]
+    np.testing.assert_allclose(np.array(fixed.segments) * fixed.dt, ends, rtol=0, atol=fixed.dt)
+    # The waypoints moved along: the plan keeps the fixed problem, and is its optimum.
+    passed = solution.trajectory.states[list(fixed.segments), 0]
     np.testing.assert_allclose(passed, turns[1:-1], rtol=0, atol=1e-5)
-    assert settled.digest == solution.problem_digest
-    again = ls.smooth(settled, start=solution)
+    assert fixed.digest == solution.problem_digest
+    again = ls.smooth(fixed, start=solution)
     assert again.status is Status.CONVERGED
     assert again.cost == pytest.approx(solution.cost, rel=1e-6)
 
@@ -485,7 +485,7 @@ def test_segments_that_make_no_sense_are_refused(changes: dict[str, Any], said: 
 def test_a_plan_of_other_segments_does_not_settle_a_problem() -> None:
     solution = ls.smooth(problem())
     with pytest.raises(ls.InputError, match="segments"):
-        by_waypoints([2.0], [20], -1.0).settled(solution)
+        by_waypoints([2.0], [20], -1.0).with_duration_of(solution)
 
 
 def through(stated: ls.Problem, places: npt.ArrayLike) -> ls.Trajectory:
@@ -563,7 +563,7 @@ def test_a_planar_quadrotor_races_through_waypoints(places: list[tuple[float, fl
     solution = ls.smooth(stated, start=through(stated, [(0.0, 0.0), *places, (0.0, 0.0)]))
     assert solution.status is Status.CONVERGED, solution.detail
     plan, state = solution.trajectory, np.zeros(6)
-    passed = dict(zip(stated.settled(solution).segments, places, strict=True))
+    passed = dict(zip(stated.with_duration_of(solution).segments, places, strict=True))
     for knot, control in enumerate(plan.controls):
         if knot in passed:
             assert np.hypot(*(state[:2] - passed[knot])) <= 0.1 + 1e-3

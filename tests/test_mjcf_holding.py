@@ -130,7 +130,7 @@ def test_a_robot_above_its_ground_is_told_how_to_stand_on_it() -> None:
         )
     )
     assert f"; z is not held: {2.1 * 9.81:.3g} N are missing; what stands on the ground starts" in str(robot)
-    assert robot._held(robot.settled(robot.at())).held  # what the text names helps
+    assert robot._held(robot.at_rest(robot.at())).held  # what the text names helps
 
 
 @pytest.mark.parametrize(

@@ -354,7 +354,7 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
 @settings(max_examples=examples(5))
 @given(seed=SEEDS)
 def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) -> None:
-    """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `settled` return."""
+    """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `at_rest` return."""
     rng = np.random.default_rng(seed)
     bodies = (
         f'<body pos="{{}} 0 0"><joint name="{name}" axis="0 1 0" damping="0.5" armature="0.05"/>'
@@ -368,7 +368,7 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
     robot = ls.MjcfRobot(scene_from_xml(xml, "arm"))
     model, angles = robot.scene.model, dict(zip(("upper", "fore"), rng.uniform(-1, 1, 2), strict=True))
     state = robot.at(None, **angles)
-    np.testing.assert_array_equal(robot.settled(state), state)
+    np.testing.assert_array_equal(robot.at_rest(state), state)
     data = mujoco.MjData(model)
     data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], robot.hold(state)
     mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
@@ -641,7 +641,7 @@ def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
         "stand",
     )
     robot = ls.MjcfRobot(scene, obstacles=False)
-    state = robot.settled(robot.at(z=top + rng.uniform(0.33, 0.8), rz=rng.uniform(-3, 3)))
+    state = robot.at_rest(robot.at(z=top + rng.uniform(0.33, 0.8), rz=rng.uniform(-3, 3)))
     model = robot.scene.model
     data = mujoco.MjData(model)
     data.qpos[:], data.ctrl[:] = robot.configuration(state)[0], robot.hold(state)
@@ -650,9 +650,9 @@ def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
     # The feet carry 2.6 kg without moving; the contacts' springs settle by micrometres.
     np.testing.assert_allclose(data.qpos, place, rtol=0, atol=2e-5)
     with pytest.raises(InputError, match="touches its support, or is above it"):
-        robot.settled(robot.at(z=top - 2))
+        robot.at_rest(robot.at(z=top - 2))
     with pytest.raises(InputError, match="obstacles such as table carry nothing: obstacles= chooses others"):
-        ls.MjcfRobot(scene).settled(robot.at(z=top + 1))
+        ls.MjcfRobot(scene).at_rest(robot.at(z=top + 1))
 
 
 @settings(max_examples=examples(8))
@@ -703,7 +703,7 @@ def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], held
     mujoco.mj_forward(robot.scene.model, data)
     np.testing.assert_allclose(data.qacc, 0, rtol=0, atol=1e-6)
-    np.testing.assert_array_equal(robot.settled(state)[:2], state[:2])  # winches drive it
+    np.testing.assert_array_equal(robot.at_rest(state)[:2], state[:2])  # winches drive it
 
 
 @settings(max_examples=examples(10))
@@ -751,7 +751,7 @@ def test_an_integrator_whose_control_is_never_zero_rests_at_the_end_of_its_range
     said = f"the activation of drive drifts: its control is at {'least' if above else 'most'} {control:g}"
     assert said in str(drifting)
     with pytest.raises(InputError, match="got one at which the activation of drive drifts"):
-        drifting.settled(state)
+        drifting.at_rest(state)
     # With the range of its activation, one angle can be held: where its end balances the weight.
     reached = f'actrange="{-end if above else -0.9} {0.9 if above else end}"'
     resting = ls.MjcfRobot(scene_from_xml(xml.format(reached), "rest"))
@@ -997,7 +997,7 @@ def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
         )
     )
     bent = robot.at(None, base_z=0.03 + 0.3 * np.cos(bend) - 1e-4, **{f"leg{i}": bend for i in range(4)})
-    state = robot.settled(bent)
+    state = robot.at_rest(bent)
     np.testing.assert_array_equal(state[6:10], bent[6:10])  # the legs keep their angles
     held, model = robot.hold(state), robot.scene.model
     data = mujoco.MjData(model)
@@ -1007,7 +1007,7 @@ def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
     np.testing.assert_allclose(moved, 0, atol=1e-6)  # MuJoCo's solver ends at 1e-8 of the forces
     above = bent.copy()
     above[2] = 0.6
-    np.testing.assert_allclose(robot.settled(above), state, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(robot.at_rest(above), state, rtol=0, atol=1e-5)
 
 
 def elbow(gear: float, least: float, *, collides: int = 0) -> ls.MjcfRobot:
@@ -1287,7 +1287,7 @@ def test_a_load_that_hangs_from_a_winch_is_at_rest() -> None:
       <position name="winch" tendon="rope" kp="3000" kv="300" forcelimited="true" forcerange="-500 0"/></actuator>
       </mujoco>""", "crane"))  # fmt: skip
     state = robot.at()
-    np.testing.assert_array_equal(robot.settled(state), state)
+    np.testing.assert_array_equal(robot.at_rest(state), state)
     data = mujoco.MjData(robot.scene.model)
     data.ctrl[:] = robot.hold(state)
     mujoco.mj_step(robot.scene.model, data, 250)

@@ -86,7 +86,7 @@ class FamilyTask:
         start, nv = robot.at(self.keyframe), robot.scene.model.nv
         start[: len(self.start)] = self.start
         if self.ends:
-            start = robot.settled(start)
+            start = robot.at_rest(start)
         goal = start.copy()
         for joint, move in self.moves.items():
             goal[joint] += move

@@ -151,7 +151,7 @@ def load_with_scenario(path: Path, named: str | None) -> "tuple[ls.Solution, ls.
     solution = ls.load(path, ls.Solution)
     if not named and not solution.scenario:
         raise ls.InputError("--scenario: got none, and the solution names none, want the one with robot and scene")
-    return solution, resolve(named or solution.scenario, registered_only=not named).settled(solution)
+    return solution, resolve(named or solution.scenario, registered_only=not named).with_duration_of(solution)
 
 
 def bar(**options: Any) -> "tqdm[Any]":

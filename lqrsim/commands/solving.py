@@ -123,8 +123,8 @@ class Solve:
             from lqrsim.problem.belief import Belief
             from lqrsim.simulation.uncertainty_of import tube_under
 
-            settled = scenario.settled(solution)
-            tube, remark = tube_under(settled.problem, solution, settled.plant(), settled.disturbances)
+            fixed = scenario.with_duration_of(solution)
+            tube, remark = tube_under(fixed.problem, solution, fixed.plant(), fixed.disturbances)
             if remark:
                 console.say(remark)
             world, robot = scenario.scene.world, scenario.robot

@@ -189,7 +189,7 @@ class View:
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
             solution = console.solve(scenario) if self.solution is None else self._given(scenario, self.solution)
-            scenario = scenario.settled(solution)
+            scenario = scenario.with_duration_of(solution)
             plant = scenario.plant()
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             arguments = viewer.arguments_for_plant(plant, solution, goal)

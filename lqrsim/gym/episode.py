@@ -74,7 +74,7 @@ class Task:
                 raise InputError(f"scenario: got control {name} within {low:g} to {high:g}, want finite limits")
         self._disturbances = self.disturbances_of(disturbances, strength)
         if scenario.problem.duration is not None:  # the control period is part of the solution
-            self.scenario = scenario.settled(self.solution)
+            self.scenario = scenario.with_duration_of(self.solution)
             self.plant = self.scenario.plant()
 
     @cached_property

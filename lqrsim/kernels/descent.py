@@ -97,7 +97,7 @@ def descend(first, last, settings, model, work, memory, log):
         if memory.failed < 0:
             merit, cost, fraction = follow_step(settings, model, work, memory)
         improvement, gap, method = 0.0, 0.0, how.method
-        settled, exhausted, full = how.changes == 0, False, done + 1 == settings.max_iterations
+        cost_converged, exhausted, full = how.changes == 0, False, done + 1 == settings.max_iterations
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, memory.negligible)
             if reach > 0:
@@ -110,14 +110,14 @@ def descend(first, last, settings, model, work, memory, log):
             small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
             memory.small_changes = memory.small_changes + 1 if small else 0.0
             memory.idle = memory.idle + 1 if improvement < ROUNDING else 0.0
-            settled, exhausted = memory.small_changes >= how.changes, memory.idle >= how.idle
+            cost_converged, exhausted = memory.small_changes >= how.changes, memory.idle >= how.idle
             relax(how, memory, fraction)
         else:
             exhausted, method = tighten(how, memory), REJECTED
             gap = nan if damped else 0.0
         write_row(log[done], memory.plan_cost, improvement, gap, nan, nan, method)
-        if settled or exhausted or full:
-            outcome = judge(settings, settled or exhausted, exhausted or full, model, work, memory, log[done])
+        if cost_converged or exhausted or full:
+            outcome = judge(settings, cost_converged or exhausted, exhausted or full, model, work, memory, log[done])
             if outcome == RUNNING and (exhausted or full):
                 outcome = STALLED if exhausted else MAX_ITERATIONS
             if outcome != RUNNING:
@@ -263,7 +263,7 @@ def turn_to_ilqr(memory):
     memory.ilqr_next *= 2
 
 
-def judge(settings, settled, ending, model, work, memory, row):
+def judge(settings, cost_converged, ending, model, work, memory, row):
     """Measure the plan's optimality; compute policy and value functions about it. CONVERGED if optimal, else RUNNING.
 
     Newton's pass that measures it is the next step's, and value functions are computed at its end alone: as in
@@ -283,7 +283,7 @@ def judge(settings, settled, ending, model, work, memory, row):
     if memory.failed >= 0:
         return RUNNING
     row.cost, row.optimality = memory.plan_cost, memory.promised
-    optimal = settled and memory.promised < settings.tolerance
+    optimal = cost_converged and memory.promised < settings.tolerance
     if how.method == DAMPED:
         value_functions_at_plan(settings, model, work, memory, row)
     elif optimal or ending:

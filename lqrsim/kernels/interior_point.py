@@ -78,7 +78,7 @@ SWITCH, SWITCHED = 2.3, 1.1  # powers of the predicted decrease and of the viola
 FORCED, SOME = 6, 0.1  # largest number of steps that are taken although the filter rejects them; the fraction of these
 WIDE = 1e10  # factor by which slack times multiplier may differ from the barrier parameter
 CROSSINGS = 8  # largest number of final steps without a barrier
-SETTLED = 1e-3  # fraction of the tolerances at which these end
+POLISHED = 1e-3  # fraction of the tolerances at which these end
 FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if these fail, and its least value
 CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
 CRAWL = 0.5  # factor by which stationarity falls too little, so that the Hessians need what is learned of them
@@ -107,7 +107,7 @@ SURVEY, BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3, 4
 
 @compact
 def interior_point(task, first, last, tolerance, violation, begun, stages, work, memory, log):
-    """Begin an interior point, settle at a known optimum, or run the iterations `first` to `last` - 1.
+    """Begin an interior point, polish a known optimum, or run the iterations `first` to `last` - 1.
 
     All code that a solve can need is compiled together, before it begins.
 
@@ -128,7 +128,7 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
         begin(begun, stages, work, memory[0])
         return 0, RUNNING
     if task == SETTLE:
-        return first, CONVERGED if settle(tolerance, violation, begun, stages, work, memory[0]) else RUNNING
+        return first, CONVERGED if polish(tolerance, violation, begun, stages, work, memory[0]) else RUNNING
     return iterations(first, last, task == CLOSE, tolerance, violation, stages, work, memory[0], log)
 
 
@@ -275,7 +275,7 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
         row.gap, row.complementarity = mem.gap, mem.complementarity
         done += 1
         mem.since += 1
-        ended = creeping(violation, mem) or (stages.learns == 1 and settled(violation, mem))
+        ended = creeping(violation, mem) or (stages.learns == 1 and cost_is_flat(violation, mem))
 
 
 def creeping(violation, mem):
@@ -288,7 +288,7 @@ def creeping(violation, mem):
     return mem.short >= CREEPING
 
 
-def settled(violation, mem):
+def cost_is_flat(violation, mem):
     """Whether the cost no longer changes at the least barrier, though the plan is not stationary."""
     kept = mem.violation <= violation and mem.stationarity > STEEP
     if kept and abs(mem.cost - mem.level) <= FLAT * abs(mem.level):
@@ -926,7 +926,7 @@ def measure_iterate(stages, work, mem):
 
 
 @compact
-def settle(tolerance, violation, begun, stages, work, mem):
+def polish(tolerance, violation, begun, stages, work, mem):
     """Take steps without a barrier from the given plan and multipliers; return whether they converge."""
     rows, plan = stages.rows, work.active.plan
     keep_point(stages, work, mem)
@@ -942,7 +942,7 @@ def settle(tolerance, violation, begun, stages, work, mem):
                 rows.force[at] = AT_LIMIT * mem.scale / size
     if isfinite(cost):
         look_with_own_costates(stages, plan, work.active.costates)
-        if settle_rows(tolerance, violation, stages, work, mem):
+        if polish_rows(tolerance, violation, stages, work, mem):
             return True
     go_back(stages, work, mem)
     return False
@@ -959,14 +959,14 @@ def cross(tolerance, violation, stages, work, mem):
     copy_plan(stages.steps, work.now.plan, work.active.plan)
     copy(work.now.numbers, stages.rows.size * (stages.steps + 1), stages.rows.numbers)
     copy_matrix(work.costates, stages.steps + 1, N, work.active.costates)
-    if settle_rows(tolerance, violation, stages, work, mem):
+    if polish_rows(tolerance, violation, stages, work, mem):
         return True
     go_back(stages, work, mem)
     return False
 
 
 @compact
-def settle_rows(tolerance, violation, stages, work, mem):
+def polish_rows(tolerance, violation, stages, work, mem):
     """Take steps with the rows that press held at their targets, and go where they converge; return whether they do."""
     rows, active, memory = stages.rows, work.active, work.active_memory[0]
     for at in range(rows.size * (stages.steps + 1)):
@@ -990,7 +990,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
         if not isfinite(memory.cost):
             return False
         far = farthest_from_target(rows, stages.steps)
-        if max(memory.stationarity, memory.gap) < SETTLED * tolerance and far < SETTLED * violation:
+        if max(memory.stationarity, memory.gap) < POLISHED * tolerance and far < POLISHED * violation:
             break
     kept = mem.elastic != 0 or memory.violation <= violation
     if not kept or not max(memory.stationarity, memory.gap) < tolerance:

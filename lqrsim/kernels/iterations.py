@@ -108,17 +108,18 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         cost = roll_out_and_keep(steps, x_hat, model, work, memory)
         improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, negligible)
         gap = largest_gap(steps, work.x_hats, work.last.states)
-        settled = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
+        met = gap < settings.gap_tolerance or not settings.optimal
+        cost_converged = abs(improvement) < settings.tolerance and met
         full = done + 1 == settings.max_iterations
         left, residual = nan, nan
         if gap < settings.valley and improvement >= 0 and not full:
             write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
             return done + 1, IN_VALLEY, False, -1
-        if settled or full:
+        if cost_converged or full:
             left = optimality(settings, work.last, model, cost, negligible)
             residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.last.states)
         write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
-        outcome = outcome_of(settled, settings, left, cost, full)
+        outcome = outcome_of(cost_converged, settings, left, cost, full)
         if outcome == RUNNING and cycling(log, done):
             outcome = CYCLING
         if outcome == RUNNING and memory.watched > 0 and (no_progress(log, done) or lingering(log, done, settings)):
@@ -226,11 +227,11 @@ def relative_optimality(failed, decrease, cost, negligible):
     return decrease / max(abs(cost), negligible, 1e-300)
 
 
-def outcome_of(settled, settings, left, cost, full):
+def outcome_of(cost_converged, settings, left, cost, full):
     """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last."""
-    if settled and not settings.optimal:
+    if cost_converged and not settings.optimal:
         return COST_CONVERGED
-    if settled and left < settings.tolerance:
+    if cost_converged and left < settings.tolerance:
         return CONVERGED
     if full:
         return MAX_ITERATIONS if abs(cost) < inf else DIVERGED
@@ -274,16 +275,16 @@ def ilqr_iterations(first, last, settings, model, work, memory, log):
         if fraction > 0:
             copy_plan(steps, work.last, plan)
         improvement = relative_improvement(old, cost, 0.0)
-        settled = abs(improvement) < settings.tolerance
+        cost_converged = abs(improvement) < settings.tolerance
         left = nan
-        if settled or done + 1 == settings.max_iterations:
+        if cost_converged or done + 1 == settings.max_iterations:
             failed, _, left = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
         memory.plan_cost, memory.weight = cost, damping
         write_row(log[done], cost, improvement, 0.0, left, 0.0, ILQR)
-        outcome = outcome_of(settled, settings, left, cost, done + 1 == settings.max_iterations)
+        outcome = outcome_of(cost_converged, settings, left, cost, done + 1 == settings.max_iterations)
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED
         if outcome != RUNNING:

@@ -28,7 +28,7 @@ from lqrsim.kernels.stages import (
 )
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; factor
-SETTLED = 0.1  # predicted decrease per row, relative to the parameter, below which the parameter falls
+LEAST_DECREASE = 0.1  # predicted decrease per row, relative to the parameter, below which the parameter falls
 LAST = 1e-6  # predicted decrease over all rows at the end: multipliers are accurate to its square root
 ARMIJO, SHORTEST = 1e-4, 1e-6
 ROUNDING = 1e-13  # relative difference of merits that may be rounding
@@ -141,7 +141,7 @@ def descend(price, stages, work, mem):
         if regularised_direction(stages, work.plan, work.gaps, weight, each, work.curves, rows.force) < 0:
             return False
         mem.decrease = -slope_of_merit(stages)
-        if mem.decrease > SETTLED * mem.parameter * mem.rows or mem.parameter <= mem.least:
+        if mem.decrease > LEAST_DECREASE * mem.parameter * mem.rows or mem.parameter <= mem.least:
             break
         mem.parameter = max(FALL * mem.parameter, mem.least)
     copy_matrix(stages.to_go.gradient, steps + 1, N, work.costates)
@@ -256,8 +256,8 @@ def judge(stages, work, mem):
             missed = abs(rows.numbers[at]) if rows.kinds[at] == EQUALITY else -rows.numbers[at]
             mem.violation, relative = larger(mem.violation, missed), larger(relative, missed / rows.sizes[at])
     mem.near = 1.0 if relative < CLOSE else 0.0
-    settled = relative < CLOSE and abs(mem.before - mem.cost) < SLOW * abs(mem.cost)
-    mem.close = mem.close + 1 if settled else 0.0
+    still = relative < CLOSE and abs(mem.before - mem.cost) < SLOW * abs(mem.cost)
+    mem.close = mem.close + 1 if still else 0.0
     mem.before, mem.promised = mem.cost, 0.5 * mem.decrease / max(abs(mem.merit), 1e-300)
     return mem.close >= PATIENCE
 

@@ -128,8 +128,8 @@ class Problem(OneVersion):
       time_weight: cost per second of a free duration. The cost of a solution does not include it.
       segments: knots that divide a plan into segments, such as those of waypoints. With a free duration, that of each
         segment is free, too: whatever has numbers by knot moves with these knots. The steps of a solution are equally
-        long; `settled` has its knots. The steps of each segment last as those of a plan between the shortest and the
-        longest duration.
+        long; `with_duration_of` has its knots. The steps of each segment last as those of a plan between the shortest
+        and the longest duration.
       accuracy: largest error of a plan's steps, as `BetweenKnots.step_error`: `smooth` then takes as many Runge-Kutta
         steps in a period as that needs. By default it takes one.
       between_knots: whether inequalities are to hold between the knots, too; by default they hold at the knots. The
@@ -290,7 +290,7 @@ class Problem(OneVersion):
         return other._bound_anew() if self.moving else other
 
     @checked
-    def settled(self, plan: Solution) -> "Problem":
+    def with_duration_of(self, plan: Solution) -> "Problem":
         """The problem with the duration of a plan: of fixed steps, and with its segments where they are in the plan."""
         knots = plan.options.get("segments", self.segments)
         if plan.trajectory.steps != self.steps or not isinstance(knots, Sequence) or len(knots) != len(self.segments):
@@ -510,7 +510,7 @@ class Problem(OneVersion):
             want = f"knots in order, with 2 steps in each segment of the {self.steps} at least"
             raise InputError(f"segments: got {brief(self.segments)}, want {want}")
         if self.segments and self.duration is not None and (self.accuracy is not None or self.between_knots):
-            want = "one of the two; those for problem.settled(solution)"
+            want = "one of the two; those for problem.with_duration_of(solution)"
             raise InputError(f"segments: got {brief(self.segments)} with accuracy or between_knots, want {want}")
         if self.duration is None:
             if self.time_weight:

@@ -36,7 +36,7 @@ from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms, SelfClearance
 from lqrsim.rotations import AXES
-from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
+from lqrsim.scenes.mjcf_holding import Holding, at_rest, efforts, holding
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
@@ -270,7 +270,7 @@ class MjcfRobot(Robot):
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
-    def settled(self, state: npt.ArrayLike) -> Array:
+    def at_rest(self, state: npt.ArrayLike) -> Array:
         """A state (n,) near another in which the robot stands at rest; `hold` has the controls for it.
 
         Joints without actuators, such as a free base, move to it. Legs keep their angles. The base moves to where the
@@ -279,7 +279,7 @@ class MjcfRobot(Robot):
         """
         state = check_array("state", state, (len(self.dynamics.state_coordinates),))
         model = self.dynamics.physics.model
-        qpos, residual = settled(self.mjcf, model, self.configuration(state)[0])
+        qpos, residual = at_rest(self.mjcf, model, self.configuration(state)[0])
         if residual > _REST * float(model.body_mass.sum()):
             names = self.scene.world.names
             hint = f"; obstacles such as {names[0]} carry nothing: obstacles= chooses others" if names else ""
@@ -440,7 +440,7 @@ class MjcfRobot(Robot):
         if not held.held and not shortfall:
             shortfall = f"; {space.names[worst]} is not held: {abs(held.missed[worst]):.3g} {unit} are missing"
             if any(joint.kind == "free" and joint.dof <= worst < joint.dof + 6 for joint in self.mjcf.joints):
-                shortfall += "; what stands on the ground starts from robot.settled(robot.at())"
+                shortfall += "; what stands on the ground starts from robot.at_rest(robot.at())"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",

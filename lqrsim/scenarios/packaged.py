@@ -98,14 +98,14 @@ class Scenario(OneVersion):
         return vars(self)["_plant"]
 
     @checked
-    def settled(self, plan: Solution) -> "Scenario":
+    def with_duration_of(self, plan: Solution) -> "Scenario":
         """The scenario in which a plan runs: if its problem has a free duration, that with the duration of the plan.
 
         The physics step of its plant then divides the control period of the plan.
         """
         if self.problem.duration is None:
             return self
-        return replace(self, problem=self.problem.settled(plan), fit_timestep=True)
+        return replace(self, problem=self.problem.with_duration_of(plan), fit_timestep=True)
 
 
 def names() -> list[str]:

@@ -99,7 +99,7 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
     lines: list[str] = []
     if not solution.success:
         lines.append(f"did not converge ({solution.status.name}); its plan is run as it is")
-    problem = scenario.settled(solution).problem
+    problem = scenario.with_duration_of(solution).problem
     if solution.problem_digest != problem.digest:
         solved = f" (solved as {solution.scenario})" if solution.scenario else ""
         other = difference(solution, problem)

@@ -439,7 +439,7 @@ def _integrals(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
 
 
 @unlogged()
-def settled(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
+def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
     A free body that touches nothing is let down first. Then Newton's method with steps of least norm: contacts are

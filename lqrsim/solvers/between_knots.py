@@ -222,12 +222,12 @@ def solve_between_knots(
             ]
         solution = again(solution)
         rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
-    settled = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)
+    ordinary = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)
     substeps = at_knots.dynamics.substeps
     return replace(
         solution, iterations=iterations, multipliers=solution.multipliers[: len(problem.constraints)],
         options=dict(solution.options) | ({"substeps": substeps} if substeps > problem.dynamics.substeps else {}),
-        problem_digest=settled.digest, **ended,
+        problem_digest=ordinary.digest, **ended,
     )  # fmt: skip
 
 

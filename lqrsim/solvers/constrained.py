@@ -130,8 +130,8 @@ class Ladder:
         run = self._run
         run.smooth(GUIDED if self.guided else OPENING)
         ending = run.checked_ending()
-        settled = ending.success or ending.outcome == declarations.IN_VALLEY
-        plan = run.work.arrays.last if settled else run.work.best  # the plan of least cost so far
+        converged = ending.success or ending.outcome == declarations.IN_VALLEY
+        plan = run.work.arrays.last if converged else run.work.best  # the plan of least cost so far
         if ending is not run.ending or not np.isfinite(run.work.cost):
             return None
         self.smoothed = copied(plan)
@@ -216,7 +216,7 @@ class Ladder:
                 return None
             plan = priced.plan
             self._remember(self._point.result(*plan))
-            if priced.settled:
+            if priced.stationary:
                 return None
             if priced.near or price == PRICES[-1]:
                 result = self._interior(plan, MUCH)

@@ -70,7 +70,7 @@ _DETAILS = {
 # less than NEARLY, twice, with a gap below NEAR.
 VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
 # The squares that the interior point's margins leave of a cost of zero, relative to those that rounding leaves.
-SETTLED = 1e8
+MARGIN_SQUARES = 1e8
 ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 _idle: "list[SolveRun]" = []
 _lending = threading.Lock()
@@ -594,7 +594,7 @@ class SolveRun:
         rounding, too: a given optimum may be on its bounds. Where both plans cost nothing but rounding, as a goal that
         is met, only the size of what cancels says what that is.
         """
-        rounding = ROUNDING * abs(other.cost) + SETTLED * float(self.work.memory["negligible"])
+        rounding = ROUNDING * abs(other.cost) + MARGIN_SQUARES * float(self.work.memory["negligible"])
         for multipliers, pressing in zip(self.work.multipliers, found.multipliers, strict=False):
             rounding += float(np.abs(pressing.values).sum()) * (multipliers.margin + other.violation)
         return not found.cost <= other.cost + rounding

@@ -105,7 +105,7 @@ class DurationSearch:
     def follow_ways(self) -> None:
         """Sketch the ways, and go on from the sketches that keep the constraints, the cheapest first."""
         problem, stop = self._problem, self._stop
-        stated = settled(problem, problem.steps * problem.dt)
+        stated = at_duration(problem, problem.steps * problem.dt)
         with stop.not_counting():  # compiling
             stages = Stages(stated)
             free = with_duration(problem)
@@ -140,7 +140,7 @@ class DurationSearch:
         """What a few iterations make of a way in a share of the stated duration, which is free or fixed."""
         problem = self._problem
         duration = float(np.clip(share * problem.steps * problem.dt, *self._range))
-        fixed = settled(problem, duration)
+        fixed = at_duration(problem, duration)
         result = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
         if free is not None:
             return result._replace(name=way.name, way=way.name)
@@ -163,9 +163,9 @@ class DurationSearch:
         """
         if self.best is not None or any(solution.success for solution in self._fixed) or self._budget.over:
             return
-        self._fixed.append(self._solved(settled(self._problem, self._range[1]), self._settings))
+        self._fixed.append(self._solved(at_duration(self._problem, self._range[1]), self._settings))
         if self._fixed[-1].success:
-            self._settle(self._fixed[-1].trajectory, self._settings)
+            self._refine(self._fixed[-1].trajectory, self._settings)
 
     def _follow(self, name: str, plan: Trajectory) -> None:
         """Go on from a plan that is one of the candidates."""
@@ -193,15 +193,15 @@ class DurationSearch:
         by_ways, before = self.best, self._total
         if by_ways is not None:
             settings = replace(settings, safeguard=False)
-        first = begin or self._solved(settled(problem, problem.steps * problem.dt), settings)
+        first = begin or self._solved(at_duration(problem, problem.steps * problem.dt), settings)
         self._fixed.append(first)
         shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
         tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
         if by_ways is None or first.success:
-            self._settle(first.trajectory, settings)
+            self._refine(first.trajectory, settings)
         while self.best is not None and shorter and not self._budget.over:
             shorter, plan = shorter - 1, self.best[0]
-            less = self._solved(settled(problem, max(SHORTER * plan.steps * plan.dt, self._range[0])), tries)
+            less = self._solved(at_duration(problem, max(SHORTER * plan.steps * plan.dt, self._range[0])), tries)
             if not (less.success and not self._budget.over and self._find(less.trajectory, self._budget)[0]):
                 break
         if self.candidates:
@@ -213,7 +213,7 @@ class DurationSearch:
             name = f"the nominal control, {first.trajectory.horizon:g} s"
             self.candidates.append(Candidate(name, cost, self._total - before, status, plan))
 
-    def _settle(self, begin: Trajectory, settings: SmootherSettings) -> None:
+    def _refine(self, begin: Trajectory, settings: SmootherSettings) -> None:
         """Find the best duration near a plan's.
 
         A search that ends elsewhere may only have ended far from the constraints. It goes on from a plan of the
@@ -228,7 +228,7 @@ class DurationSearch:
             for share in PART_WAY if least[0] == 0 else PART_WAY[:1]:
                 dt = begin.dt + share * (end.dt - begin.dt)
                 start = end if share == 1 else replace(begin, dt=dt)
-                fixed = settled(self._problem, dt * self._problem.steps)
+                fixed = at_duration(self._problem, dt * self._problem.steps)
                 again = self._solved(fixed, replace(settings, start=start, starts=None))
                 self._fixed.append(again)
                 missed, cost = self._rank(again)
@@ -268,7 +268,7 @@ class DurationSearch:
         problem, plan, price = self._problem, solution.trajectory, self._settings.price
         missed, paid = 0.0 if solution.success else solution.violation, 0.0
         if np.isfinite(price):
-            stages = Stages(problem.settled(solution))
+            stages = Stages(problem.with_duration_of(solution))
             paid = _paid(stages, Motion(in_c_order(plan.states), in_c_order(plan.controls)), price)
         return missed, solution.cost + problem.time_weight * plan.horizon + paid
 
@@ -398,7 +398,7 @@ def find_duration(
         measures=result.measures._replace(cost=cost),
         sizes=result.sizes._replace(rows=rows),
     )  # fmt: skip
-    return settled(problem, duration), result
+    return at_duration(problem, duration), result
 
 
 def _searched(
@@ -468,7 +468,7 @@ def _with_found_segments(
     return replace(problem._with_segments(new[1:-1].tolist()), dt=dt), Trajectory(*plan, dt)
 
 
-def settled(problem: Problem, duration: float) -> Problem:
+def at_duration(problem: Problem, duration: float) -> Problem:
     """The problem with a fixed duration, in seconds."""
     return problem._of_duration(duration)
 

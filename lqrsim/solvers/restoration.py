@@ -17,10 +17,10 @@ from lqrsim.solvers.stages import Sizes, Stages
 
 @dataclass(frozen=True)
 class Restored:
-    """A trajectory; whether its violation is stationary (`settled`), and whether it is nearly feasible (`near`)."""
+    """A trajectory; whether its violation is stationary (`stationary`), and whether it is nearly feasible (`near`)."""
 
     plan: Motion
-    settled: bool
+    stationary: bool
     near: bool
 
 
@@ -54,7 +54,7 @@ def restore(
         return stages.call("restoration", first, last, price, stages.about, work, memory, log)
 
     run(0, 0)
-    done, outcome, ended, settled, bite = 0, RUNNING, False, False, 1
+    done, outcome, ended, at_minimum, bite = 0, RUNNING, False, False, 1
     while outcome in (RUNNING, NO_PROGRESS) and not ended and done < most:
         first, clock = done, time.perf_counter()
         done, outcome = run(first, min(first + bite, most))
@@ -66,11 +66,11 @@ def restore(
         if outcome == NO_PROGRESS and not ended:
             shares = work.shares.reshape(stages.live.shape)
             terms = range(len(stages.problem.constraint_terms))
-            settled = ended = stationary(
+            at_minimum = ended = stationary(
                 Motion(*map(np.copy, work.plan)), [shares[:, stages.owners == k].copy() for k in terms]
             )
         if not hurried and not functions:
             bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
     if outcome == NOT_FINITE:
         return None
-    return Restored(Motion(*map(np.copy, work.plan)), settled, bool(memory["near"][0]))
+    return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["near"][0]))

@@ -109,7 +109,7 @@ def solve(
         for line in solving.remarks(scenario, plan) if remark else []:
             _log.warning("the solution of %s %s", solver, line)
     if "track" in policies:
-        problem = scenario.settled(solutions["track"]).problem
+        problem = scenario.with_duration_of(solutions["track"]).problem
         law = track(problem, solutions["track"], uncertainty=design_uncertainty(scenario, design))
         solutions["track"] = replace(solutions["track"], policy=law)
     return solutions
@@ -142,9 +142,13 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
         others = (name for name, kind in POLICY_KINDS.items() if kind.controller != "feedback" or kind.designed)
         impossible |= dict.fromkeys(others, "which is of states, while the scenario is planned in belief space")
     replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
-    if replanned is not None and replanned.problem_digest != (stated := scenario.settled(replanned).problem).digest:
-        other = solving.difference(replanned, stated)
-        impossible["replan"] = f"which re-plans the scenario's problem, while the solution is of another problem{other}"
+    if replanned is not None:
+        stated = scenario.with_duration_of(replanned).problem
+        if replanned.problem_digest != stated.digest:
+            other = solving.difference(replanned, stated)
+            impossible["replan"] = (
+                f"which re-plans the scenario's problem, while the solution is of another problem{other}"
+            )
     return impossible
 
 
@@ -163,7 +167,7 @@ def make_controller(
         "offset_free" are `lqrsim.track` and `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
     """
-    problem = scenario.settled(solution).problem
+    problem = scenario.with_duration_of(solution).problem
     if isinstance(problem.dynamics, Belief):
         if name != "feedback":
             raise InputError(f"controller: got {name} for a plan in belief space, want feedback")

@@ -172,7 +172,8 @@ class Study(Setup):
         remark = not isinstance(self.solution, Solution)
         solution = solve((policy,), scenario, design, self.given, remark=remark)[policy]
         controller = make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)
-        return {"plant": scenario.settled(solution).plant(), "solution": solution, "controller": controller, **goal}
+        plant = scenario.with_duration_of(solution).plant()
+        return {"plant": plant, "solution": solution, "controller": controller, **goal}
 
 
 @checked

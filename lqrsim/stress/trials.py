@@ -25,7 +25,8 @@ class Trials:
 
     def __init__(self, campaign: Campaign, solutions: Mapping[str, Solution]) -> None:
         self.campaign, self.solutions = campaign, solutions
-        self.scenario = campaign.resolved.settled(next(iter(solutions.values())))  # all plans have the same duration
+        plan = next(iter(solutions.values()))  # all plans have the same duration
+        self.scenario = campaign.resolved.with_duration_of(plan)
         self.plant = self.scenario.plant()
         self._controllers: dict[str | tuple[str, str, float], Controller | AffinePolicy] = {}
 

@@ -127,7 +127,7 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
         "ReplanRecord": (record,),
         "AffinePolicy.shifted": ({"self": place.solution.policy, "steps": 1, "horizon": "moving"},),
         "Problem.later": ({"self": place.problem, "seconds": 0.5},),
-        "Problem.settled": ({"self": place.problem, "plan": place.solution},),
+        "Problem.with_duration_of": ({"self": place.problem, "plan": place.solution},),
         "Problem.from_state": ({"self": place.problem, "state": state, "after": 1},),
         "Dynamics.period_near": ({"self": place.problem.dynamics, "dt": 0.1},),
         "Replanner": (

@@ -151,7 +151,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "parameters": {"mass": 2.0},
         }, 0.2),
         "MjcfRobot.with_parameters": ({"self": slider, "mass": 2.0, "slider_damping": 0.1},),
-        "MjcfRobot.settled": ({"self": slider, "state": slider.at(slider=0.1)},),
+        "MjcfRobot.at_rest": ({"self": slider, "state": slider.at(slider=0.1)},),
         "MjcfRobot.hold": ({"self": slider, "state": slider.at(slider=0.1)},),
         "MjcfRobot.problem": ({
             "self": slider, "start": slider.at(), "goal": slider.at(slider=0.2), "steps": 5, "dt": 0.02,
@@ -346,7 +346,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "robots.names": ({}, 0.1),
         "robots.get": ({"name": "quadrotor"},),
         "Scenario.near_enough": ({"self": place.scenario, "goal_radius": 0.1, "goal_tolerance": None},),
-        "Scenario.settled": ({"self": place.scenario, "plan": place.solution},),
+        "Scenario.with_duration_of": ({"self": place.scenario, "plan": place.solution},),
         "Scenario.target_radius": ({"self": place.scenario, "goal_radius": 0.1, "goal_tolerance": None},),
         "rotations.quaternion": ({"rotation_vector": [0.1, 0.2, 0.3]},),
         "rotations.rotation_vector": ({"quaternion": [1.0, 0.1, 0.2, 0.3]},),
