@@ -46,27 +46,20 @@ SHARED = 0  # number of values that the rows share; 0 for a constraint on state 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
     """Add the quadratic model at (x, u) to hessian (W, W) and gradient (W,), and return the value."""
-    total = 0.0
-    if multipliers[PENALTY] > 0 and t >= multipliers[FIRST]:
-        if SHARED:
-            shared, jacobian = stack(SHARED), zeros(SHARED, N)
-            places_jacobian(x, data, shared, jacobian)
-            total = augment_at(shared, jacobian, t, data, multipliers, hessian, gradient)
-        else:
-            total = augment_at(x, u, t, data, multipliers, hessian, gradient)
-    return total
-
-
-def augment_at(x, u, t, data, multipliers, hessian, gradient):
-    """Add the quadratic model, and return the value; x and u may be the shared numbers and their Jacobian."""
-    rows, slope, total = int(multipliers[ROWS]), stack(W), 0.0
-    for row in range(rows):
-        force, held, value = force_of(x, u, t, row, data, multipliers)
+    if not multipliers[PENALTY] > 0 or t < multipliers[FIRST]:
+        return 0.0
+    shared, jacobian = stack(SHARED), zeros(SHARED, N)
+    if SHARED:
+        places_jacobian(x, data, shared, jacobian)
+    y, v = (shared, jacobian) if SHARED else (x, u)
+    slope, total = stack(W), 0.0
+    for row in range(int(multipliers[ROWS])):
+        force, held, value = force_of(y, v, t, row, data, multipliers)
         total += value
         if EQUALITY or force > 0:
             curvature = multipliers[PENALTY] if held == force else 0.0
             fill(slope, W, 0.0)
-            constraint_slope(x, u, t, row, data, slope)
+            constraint_slope(y, v, t, row, data, slope)
             for i in range(W):
                 gradient[i] -= held * slope[i]
                 for j in range(W):
@@ -76,22 +69,13 @@ def augment_at(x, u, t, data, multipliers, hessian, gradient):
 
 def augmentation(x, u, t, data, multipliers):
     """The value alone."""
-    total = 0.0
-    if multipliers[PENALTY] > 0 and t >= multipliers[FIRST]:
-        if SHARED:
-            shared = stack(SHARED)
-            places(x, data, shared)
-            total = augmentation_at(shared, u, t, data, multipliers)
-        else:
-            total = augmentation_at(x, u, t, data, multipliers)
-    return total
-
-
-def augmentation_at(x, u, t, data, multipliers):
-    """The value alone; x may be the shared numbers."""
-    total = 0.0
+    if not multipliers[PENALTY] > 0 or t < multipliers[FIRST]:
+        return 0.0
+    shared, total = stack(SHARED), 0.0
+    if SHARED:
+        places(x, data, shared)
     for row in range(int(multipliers[ROWS])):
-        _, _, value = force_of(x, u, t, row, data, multipliers)
+        _, _, value = force_of(shared if SHARED else x, u, t, row, data, multipliers)
         total += value
     return total / (2 * multipliers[PENALTY])
 
@@ -112,27 +96,19 @@ def constraint_values(x, u, t, acts, data, multipliers, values):
 
     If the constraint does not act, the values are satisfied: infinite for an inequality, zero for an equality.
     """
+    shared, rows = stack(SHARED), int(multipliers[ROWS])
     if SHARED:
-        shared = stack(SHARED)
         places(x, data, shared)
-        values_at(shared, u, t, acts, data, multipliers, values)
-    else:
-        values_at(x, u, t, acts, data, multipliers, values)
-
-
-def values_at(x, u, t, acts, data, multipliers, values):
-    """Write the values; x may be the shared numbers."""
-    rows = int(multipliers[ROWS])
     for row in range(rows):
-        satisfied = 0.0 if EQUALITY else inf
-        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[FIRST] else satisfied
+        values[rows * t + row] = 0.0 if EQUALITY else inf
+        if acts and t >= multipliers[FIRST]:
+            values[rows * t + row] = constraint_value(shared if SHARED else x, u, t, row, data)
 
 
 def add_slope(x, u, t, row, data, gradient):
     """Add the gradient (W,) of one of a constraint's values."""
+    shared, jacobian = stack(SHARED), zeros(SHARED, N)
     if SHARED:
-        shared, jacobian = stack(SHARED), zeros(SHARED, N)
         places_jacobian(x, data, shared, jacobian)
-        constraint_slope(shared, jacobian, t, row, data, gradient)
-    else:
-        constraint_slope(x, u, t, row, data, gradient)
+    y, v = (shared, jacobian) if SHARED else (x, u)
+    constraint_slope(y, v, t, row, data, gradient)
