@@ -26,7 +26,7 @@ from sampling import examples, is_short, rarely
 import lqrsim as ls
 from lqrsim import kernels
 from lqrsim.codegen.compiled_module import Call, Entry
-from lqrsim.codegen.language import Pointer, Struct, StructArray, type_of
+from lqrsim.codegen.language import Pointer, type_of
 from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
@@ -207,7 +207,7 @@ def snapshot(value: Any, known: dict[int, Any]) -> Any:
 
 
 def kind_of(value: Any) -> Any:
-    return Struct(value.dtype.names or ()) if isinstance(value, np.void) else type_of(value)
+    return Pointer((), value.dtype.names or ()) if isinstance(value, np.void) else type_of(value)
 
 
 def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, but: tuple[str, ...] = ()) -> Any:
@@ -296,10 +296,9 @@ def entries(calls: list[Recorded]) -> list[Entry]:
         if digest not in ADDRESSES and digest not in new:
             new[digest] = f"entry{len(new)}"
             together.entry(one.function, one.types, new[digest])
-        laid_out = tuple(StructArray(kind.fields) if isinstance(kind, Struct) else kind for kind in one.types)
-        MADE[keys[-1]] = laid_out, digest, returns
+        MADE[keys[-1]] = one.types, digest, returns
     if new:
-        LOADED.append(Loaded(object_code(together.text, LEVEL), tuple(together.libraries)))
+        LOADED.append(Loaded(object_code(together.text, LEVEL)))
         ADDRESSES.update({digest: LOADED[-1].address(symbol) for digest, symbol in new.items()})
     return [Entry(types, ADDRESSES[digest], returns) for types, digest, returns in map(MADE.__getitem__, keys)]
 

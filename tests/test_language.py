@@ -714,18 +714,18 @@ WRONG = {
     "rows of ints": (
         4,
         np.zeros(2, dtype=[("cost", np.int64), ("gap", np.int64)]),
-        "want a structured array of float64: cost, gap",
+        "want C-ordered \\[\\('cost', '<f8'\\), \\('gap', '<f8'\\)\\] blocks",
     ),
     "rows of float32": (
         4,
         np.zeros(2, dtype=[("cost", np.float32), ("gap", np.float64)]),
-        "want a structured array of float64",
+        "want C-ordered \\[\\('cost', '<f8'\\)",
     ),
-    "every other row": (4, np.zeros(4, dtype=[("cost", np.float64), ("gap", np.float64)])[::2], "not contiguous"),
+    "every other row": (4, np.zeros(4, dtype=[("cost", np.float64), ("gap", np.float64)])[::2], "want C-ordered"),
     "one row": (
         4,
         np.zeros((), dtype=[("cost", np.float64), ("gap", np.float64)]),
-        "want a structured array of float64",
+        "want C-ordered \\[\\('cost', '<f8'\\)",
     ),
     "a float for an int": (6, 2.0, "got a float, want an int"),
     "text": (5, "text", "got str, want an array"),

@@ -30,7 +30,6 @@ from lqrsim.codegen.language import (
     Pointer,
     Pointers,
     Scalar,
-    StructArray,
     Type,
     scalars,
     type_of,
@@ -138,12 +137,12 @@ class CompiledModule:
         clock = time.perf_counter()
         program = Program()
         returns = write(program, Scope(self._source, self._sizes))
-        code, libraries = object_code(program.text), tuple(program.libraries)
-        loaded = Loaded(code, libraries)
+        code = object_code(program.text)
+        loaded = Loaded(code)
         self._loaded.append(loaded)
         if long:
             disk.note(timed, time.perf_counter() - clock)
-        disk.save(key, code, what, libraries=libraries, returns=[_encoded(kind) for kind in returns])
+        disk.save(key, code, what, returns=[_encoded(kind) for kind in returns])
         return loaded, returns
 
 
@@ -229,7 +228,7 @@ class Call:
         """Write the words of an argument, beginning at an index."""
         kind = layout.kind
         if layout.block is not None:
-            self._words[place] = _address_of(argument, layout.block)
+            self._words[place] = _address_of(argument, layout.block, layout.dtype)
         elif layout.parts or isinstance(kind, Group):
             if not isinstance(argument, tuple) or len(argument) != len(layout.parts):
                 raise TypeError(f"got {type(argument).__name__}, want {layout.what}")
@@ -244,43 +243,36 @@ class Call:
             if not isinstance(argument, bool | np.bool_):
                 raise TypeError(f"got {type(argument).__name__}, want a bool")
             self._words[place] = bool(argument)
-        elif isinstance(kind, Pointers):
-            table = (ctypes.c_int64 * max(len(argument), 1))(*(_address_of(array, ()) for array in argument))
+        else:
+            assert isinstance(kind, Pointers)
+            table = (ctypes.c_int64 * max(len(argument), 1))(*(_address_of(array, (), _FLOAT64) for array in argument))
             self._tables[place] = table
             self._words[place] = ctypes.addressof(table)
-        else:
-            assert isinstance(kind, StructArray)
-            if not isinstance(argument, np.ndarray) or argument.dtype != layout.row or not argument.ndim:
-                raise TypeError(
-                    f"got {type(argument).__name__}, want a structured array of float64: {', '.join(kind.fields)}"
-                )
-            if not argument.flags.c_contiguous:
-                raise TypeError("got an array that is not contiguous, want numpy.ascontiguousarray(array)")
-            self._words[place] = argument.ctypes.data
 
 
 class _Layout:
-    """The layout of a type: size in words, parts, shape of an array's blocks, and dtype of a structured array."""
+    """The layout of a type: size in words, parts; of an array, the shape of its blocks and the dtype of its entries."""
 
     def __init__(self, kind: Type) -> None:
         self.kind = kind
         self.parts = tuple(_Layout(member) for member in kind.members) if isinstance(kind, Group) else ()
         self.size = len(scalars(kind))
-        self.block = kind.block if isinstance(kind, Pointer) else None
+        self.block, self.dtype = kind.block if isinstance(kind, Pointer) else None, _FLOAT64
+        if isinstance(kind, Pointer) and kind.fields:
+            self.block, self.dtype = kind.block[:-1], np.dtype([(name, np.float64) for name in kind.fields])
         self.vectors = isinstance(kind, Pointers)
-        self.row = np.dtype([(name, np.float64) for name in kind.fields]) if isinstance(kind, StructArray) else None
         self.what = (kind.record or "a tuple") if isinstance(kind, Group) else ""
 
 
 _FLOAT64 = np.dtype(np.float64)
 
 
-def _address_of(array: Array, block: tuple[int, ...]) -> int:
-    """The address of an array of blocks of that shape. Raises TypeError for anything else."""
+def _address_of(array: Array, block: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """The address of an array of blocks of that shape and of that dtype. Raises TypeError for anything else."""
     if not isinstance(array, np.ndarray):
         raise TypeError(f"got {type(array).__name__}, want an array")
-    if array.dtype != _FLOAT64 or not array.ndim or array.shape[1:] != block or not array.flags.c_contiguous:
-        raise TypeError(f"got an array {array.shape} of {array.dtype}, want C-ordered float64 blocks {block}")
+    if array.dtype != dtype or not array.ndim or array.shape[1:] != block or not array.flags.c_contiguous:
+        raise TypeError(f"got an array {array.shape} of {array.dtype}, want C-ordered {dtype} blocks {block}")
     try:  # four times as fast as array.ctypes.data
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError):  # empty, or read-only
@@ -314,7 +306,7 @@ def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[Type | N
     """Load cached functions; None if they cannot be used, and must be compiled again."""
     try:
         returns = [_decoded(kind) for kind in known["returns"]]
-        return Loaded(code, tuple(map(str, known["libraries"]))), returns
+        return Loaded(code), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
         logger.debug(f"a cached compiled function cannot be used ({error})")
         return None

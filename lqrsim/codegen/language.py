@@ -78,28 +78,18 @@ INT32 = Scalar("32-bit int", "i32")  # only for arguments of C functions
 
 @dataclass(frozen=True)
 class Pointer:
-    """A pointer to float64 blocks of the shape `block`: `()` for a vector, `(W,)` for a matrix with rows of W."""
+    """A pointer to float64 blocks of the shape `block`: `()` for a vector, `(W,)` for a matrix with rows of W.
+
+    The entries of a row may have names, `fields`: a structured array is a matrix of named columns, a struct its row.
+    """
 
     block: tuple[int, ...] = ()
+    fields: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Pointers:
     """A table of addresses of vectors."""
-
-
-@dataclass(frozen=True)
-class StructArray:
-    """A pointer to the structs of a structured array."""
-
-    fields: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Struct:
-    """An entry of a structured array."""
-
-    fields: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -111,7 +101,7 @@ class Group:
     fields: tuple[str, ...] = ()
 
 
-Type = Scalar | Pointer | Pointers | StructArray | Struct | Group
+Type = Scalar | Pointer | Pointers | Group
 
 VECTOR = Pointer()
 
@@ -123,19 +113,17 @@ def describe(kind: Type | None) -> str:
             return "nothing"
         case Scalar(name=name):
             return f"a {name}" if name != "int" else "an int"
+        case Pointer(block=block, fields=fields) if fields:
+            return "a structured array" if block else "a struct"
         case Pointer(block=block):
             return f"an array of {len(block) + 1} dimensions"
         case Pointers():
             return "a tuple of vectors"
-        case StructArray():
-            return "a structured array"
-        case Struct():
-            return "a struct"
         case Group(record=record):
             return f"a {record}" if record else "a tuple"
 
 
-def scalars(kind: Type) -> list[Scalar | Pointer | Pointers | StructArray | Struct]:
+def scalars(kind: Type) -> list[Scalar | Pointer | Pointers]:
     """The parts of a type that are neither tuples nor records."""
     if isinstance(kind, Group):
         return [scalar for member in kind.members for scalar in scalars(member)]
@@ -166,9 +154,8 @@ def join(one: Type, other: Type) -> Type | None:
 def type_of(argument: Any) -> Type:
     """The type of an argument from Python. Raises TypeError if the subset has no such type."""
     if isinstance(argument, np.ndarray):
-        if argument.dtype.names:
-            return StructArray(argument.dtype.names)
-        return Pointer(argument.shape[1:])
+        names = argument.dtype.names or ()
+        return Pointer((*argument.shape[1:], len(names)), names) if names else Pointer(argument.shape[1:])
     if isinstance(argument, (bool, np.bool_)):
         return BOOL
     if isinstance(argument, (int, np.integer)):

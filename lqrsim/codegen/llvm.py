@@ -1,6 +1,6 @@
 """LLVM: compile IR to machine code for this processor, and load machine code into memory."""
 
-import ctypes
+import contextlib
 import ctypes.util
 import os
 import threading
@@ -8,12 +8,6 @@ from functools import cache
 from typing import Any
 
 from lqrsim.machine import instruction_set
-
-# Functions that LLVM may call for loops over arrays and for its intrinsics, in addition to those that kernels call.
-_IMPLIED = (
-    "sin", "cos", "sincos", "exp", "exp2", "log", "log2", "log10", "pow", "fmod", "floor", "ceil", "trunc", "rint",
-    "memcpy", "memset", "memmove",
-)  # fmt: skip
 
 _loading = threading.Lock()
 
@@ -24,6 +18,10 @@ def _binding() -> Any:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    # Where LLVM finds the C library's functions, those of its own intrinsics, too.
+    for library in ("ucrtbase", "msvcrt") if os.name == "nt" else (ctypes.util.find_library("m") or "libm.so.6",):
+        with contextlib.suppress(RuntimeError):
+            llvm.load_library_permanently(library)
     return llvm
 
 
@@ -73,16 +71,14 @@ def _emitted(module: Any, level: int = 3) -> bytes:
 
 
 class Loaded:
-    """An object file in memory, and the C library functions that it calls; keep it alive as long as it is in use.
+    """An object file in memory; keep it alive as long as it is in use.
 
     Raises RuntimeError if the contents are no object file for this processor, or a function is not found.
     """
 
-    def __init__(self, contents: bytes, libraries: tuple[str, ...]) -> None:
+    def __init__(self, contents: bytes) -> None:
         llvm = _binding()
         with _loading:
-            for name in (*libraries, *_IMPLIED):
-                _provide(name)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
             self._engine.add_object_file(llvm.ObjectFileRef.from_data(contents))
             self._engine.finalize_object()
@@ -93,29 +89,3 @@ class Loaded:
         if not address:
             raise RuntimeError(f"the object file has no {symbol}")
         return address
-
-
-@cache
-def _provide(name: str) -> None:
-    """Register a C library function with LLVM, unless LLVM finds it itself."""
-    llvm = _binding()
-    if llvm.address_of_symbol(name):
-        return
-    for library in _libraries():
-        function = getattr(library, name, None)
-        address = ctypes.cast(function, ctypes.c_void_p).value if function is not None else None
-        if address:
-            llvm.add_symbol(name, address)
-            return
-
-
-@cache
-def _libraries() -> list[ctypes.CDLL]:
-    names = ["ucrtbase", "msvcrt"] if os.name == "nt" else [ctypes.util.find_library("m"), None]
-    libraries = []
-    for name in names:
-        try:
-            libraries.append(ctypes.CDLL(name))
-        except OSError:
-            continue
-    return libraries

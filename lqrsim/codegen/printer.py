@@ -30,8 +30,6 @@ from lqrsim.codegen.language import (
     Group,
     Pointer,
     Pointers,
-    Struct,
-    StructArray,
     SubsetError,
     Type,
     describe,
@@ -109,11 +107,6 @@ class Program:
         kinds = "attributes #0 = { nounwind }\nattributes #1 = { nounwind alwaysinline }\n"
         kinds += "attributes #2 = { nounwind noinline }\nattributes #3 = { nounwind noinline optsize }\n"
         return "\n".join([*self._declared.values(), *self._texts, kinds])
-
-    @property
-    def libraries(self) -> list[str]:
-        """Names of the C library functions that are called."""
-        return [name for name in self._declared if not name.startswith("llvm.")]
 
     def instance(self, function: ScopedFunction, types: tuple[Type, ...]) -> tuple[str, Type | None]:
         """LLVM's name of a function for arguments of these types, and the type of its result."""
@@ -491,7 +484,7 @@ class _Body:
                 return entry
         elif isinstance(target, ast.Attribute):
             row = self._expression(target.value)
-            if isinstance(row.type, Struct) and target.attr in row.type.fields:
+            if _is_struct(row.type) and target.attr in row.type.fields:
                 return self._field(row, row.type.fields.index(target.attr))
         self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a struct")
 
@@ -651,11 +644,11 @@ class _Body:
         if part is not None:  # loaded without the rest of the record
             return self._get(*part)
         value = self._expression(node.value)
-        fields = value.type.fields if isinstance(value.type, Group | Struct) else ()
+        fields = value.type.fields if isinstance(value.type, Group) or _is_struct(value.type) else ()
         if node.attr not in fields:
             self._refuse(node, f".{node.attr} of {describe(value.type)}", f"one of: {', '.join(fields) or '(none)'}")
         place = fields.index(node.attr)
-        if isinstance(value.type, Struct):
+        if _is_struct(value.type):
             return Value(FLOAT, self._emit(f"load double, ptr {self._field(value, place)}"))
         return value.parts[place]
 
@@ -690,20 +683,19 @@ class _Body:
         if not values or (not isinstance(base.type, Group) and any(value.type is BOOL for value in values)):
             self._refuse(node, f"`{ast.unparse(node)}`", "ints as indices")
         match base.type:
-            case Pointer(block=block) if len(values) <= len(block) + 1:
+            case Pointer(block=block, fields=fields) if len(values) <= len(block) + (not fields):
                 total = None
                 for i, value in enumerate(values):
                     number, stride = self._int(value, node), math.prod(block[i:])
                     number = self._emit(f"mul nsw i64 {number}, {stride}") if stride != 1 else number
                     total = number if total is None else self._emit(f"add nsw i64 {total}, {number}")
                 address = self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {total}")
-                return address if len(values) == len(block) + 1 else Value(Pointer(block[len(values) :]), address)
+                return (
+                    address if len(values) == len(block) + 1 else Value(Pointer(block[len(values) :], fields), address)
+                )
             case Pointers() if len(values) == 1:
                 address = self._emit(f"getelementptr inbounds ptr, ptr {base.name}, i64 {self._int(values[0], node)}")
                 return Value(VECTOR, self._emit(f"load ptr, ptr {address}"))
-            case StructArray(fields=fields) if len(values) == 1:
-                place = self._emit(f"mul nsw i64 {self._int(values[0], node)}, {len(fields)}")
-                return Value(Struct(fields), self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {place}"))
             case Group() if len(values) == 1:
                 return self._member(base, values[0], node)
         self._refuse(node, f"{len(values)} indices of {describe(base.type)}", "as many as it has")
@@ -1116,6 +1108,10 @@ def _passed(function: ScopedFunction, types: tuple[Type, ...]) -> list[Type]:
 def _passed_type(kind: Type) -> str:
     """LLVM's name of the type of an argument."""
     return "ptr" if isinstance(kind, Group) else llvm_type(kind)
+
+
+def _is_struct(kind: Type) -> TypeGuard[Pointer]:
+    return isinstance(kind, Pointer) and not kind.block and bool(kind.fields)
 
 
 def _is_address(value: Value) -> bool:

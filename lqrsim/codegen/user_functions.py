@@ -48,7 +48,7 @@ def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int] | None:
         # Creating numba's target registers the functions of its runtime.
         if not (registry.cpu_target.target_context and are_there(known["needed"])):
             raise ValueError("it needs a function that is missing")
-        loaded = Loaded(code, ())
+        loaded = Loaded(code)
         return loaded, loaded.address(_SYMBOL)
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
         logger.debug(f"a cached compiled function cannot be used ({error})")

@@ -16,7 +16,7 @@ class Compiled:
         program = Program()
         types = tuple(map(type_of, arguments))
         self.returns = program.entry(function, types, "entry")
-        self._loaded = Loaded(object_code(program.text), tuple(program.libraries))
+        self._loaded = Loaded(object_code(program.text))
         self._entry = Entry(types, self._loaded.address("entry"), self.returns)
 
     def __call__(self, *arguments: Any) -> Any:
