@@ -58,16 +58,14 @@ def residual_jacobian(x, data, out, slopes):
     find_with_slopes(x, data, 0, out, slopes, which, segments)
 
 
-def distances_of(count, states, each, displaced, moved, data, out, which, segments):
+def distances_of(count, states, each, displaced, data, out, which, segments):
     """Write the distances, row by row, at states (count, N).
 
-    If obstacles have moved, the same displacements, three numbers per row, hold for `each` consecutive states.
+    For `each` consecutive states obstacles have the same displacements, three numbers per row.
     """
     rows = int(data[1])
     for i in range(count):
-        find_one(
-            states[i], displaced, 3 * rows * (i // each) if moved == 1 else -1, data, rows * i, out, which, segments
-        )
+        find(states[i], displaced, 3 * rows * (i // each), data, rows * i, out, which, segments)
 
 
 def slopes_of(count, states, data, out, slopes, which, segments):
@@ -96,11 +94,6 @@ def places(x, data, out):
 
 
 @outline
-def find_one(x, displaced, moved, data, first, out, which, segments):
-    """As `find`."""
-    find(x, displaced, moved, data, first, out, which, segments)
-
-
 def find(x, displaced, moved, data, first, out, which, segments):
     """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
     p = at(data[0])

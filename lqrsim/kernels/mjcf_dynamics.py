@@ -35,17 +35,17 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: flags of the slots
 # in use, address of their numbers, number of slots. MODEL: MuJoCo's model. STEP, STEP_SKIP: the addresses of mj_step
 # and mj_stepSkip. KEEPS: whether stages of a step can be kept for the next. TIMESTEP: timestep of the physics, in s.
-# NV, NA: numbers of degrees of freedom and of actuators' states. JOINTS: number of joints; ACTUATORS: address of the
-# list of actuators that the controls drive. TEAM, JOB: addresses at which helper threads find their work, 0 without
-# helpers; YIELD: the address of the function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE:
-# the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model for
-# distances. LOADED, LOADS: number of bodies that may carry a load, and address of the loads, in kg; the numbers of
-# these bodies and their own masses follow. CONSTANTS: the address of mj_setConst. AXIS: the axis of turns, a one and
-# two zeros; three zeros for rotation vectors. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
+# NV, NA: numbers of degrees of freedom and of actuators' states. JOINTS: number of joints. TEAM, JOB: addresses at
+# which helper threads find their work, 0 without helpers; YIELD: the address of the function that yields to other
+# threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac
+# and mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of bodies that may carry a load,
+# and index of the loads, in kg; the numbers of these bodies and their own masses follow. CONSTANTS: the address of
+# mj_setConst. AXIS: the axis of turns, a one and two zeros; three zeros for rotation vectors. TABLE: the joints' kind
+# and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, STEP_SKIP, KEEPS = 0, 6, 7, 8, 9, 10, 11, 12
-TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
-RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS = 22, 23, 24, 25, 26, 27, 28, 29
-AXIS, TABLE = 30, 33
+TIMESTEP, NV, NA, JOINTS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20
+RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS = 21, 22, 23, 24, 25, 26, 27, 28
+AXIS, TABLE = 29, 32
 
 # Addresses that a slot has for its MjData, and their number.
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
@@ -291,13 +291,10 @@ def claim_slot(p):
 def write_to(z, p, one):
     """Write a state and a control into an MjData."""
     nv = int(p[NV])
-    qvel, act, ctrl = at(one[QVEL]), at(one[ACT]), at(one[CTRL])
     write_positions(z, p, at(one[QPOS]))
-    copy_part(z, nv, qvel, 0, nv)
-    copy_part(z, 2 * nv, act, 0, int(p[NA]))
-    listed = int(p[ACTUATORS])
-    for i in range(M):
-        ctrl[int(p[listed + i])] = z[N + i]
+    copy_part(z, nv, at(one[QVEL]), 0, nv)
+    copy_part(z, 2 * nv, at(one[ACT]), 0, int(p[NA]))
+    copy_part(z, N, at(one[CTRL]), 0, M)
 
 
 def write_positions(x, p, qpos):

@@ -157,17 +157,17 @@ class MjcfPhysics:
         # RK4 ends with the stages of its last evaluation.
         numbers[kernel.KEEPS] = model.opt.integrator != RK4
         numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
-        numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
+        numbers[kernel.JOINTS] = model.njnt
         numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
         numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
         numbers[kernel.RESET], numbers[kernel.COMPOS] = functions["mj_resetData"], functions["mj_comPos"]
         numbers[kernel.JAC], numbers[kernel.DISTANCE] = functions["mj_jac"], functions["mj_geomDistance"]
-        numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size + model.nu
+        numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size
         loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
         numbers[kernel.CONSTANTS] = functions["mj_setConst"]
         if turns_about is not None:
             numbers[kernel.AXIS + AXES.index(turns_about)] = 1.0
-        return np.concatenate([numbers, joints.ravel(), np.arange(model.nu), *loads])
+        return np.concatenate([numbers, joints.ravel(), *loads])
 
 
 def _soften(model: mujoco.MjModel, width: float) -> None:

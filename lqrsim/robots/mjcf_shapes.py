@@ -72,35 +72,24 @@ class MjcfGeoms(CollisionGeoms):
     ) -> Array:
         mjcf_dynamics, numbers = self._bound(dynamics, world)
         states = vectors_of("states", states, len(dynamics.state_coordinates))
-        flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(numbers)
-        moved = displaced is not None and bool(displaced.any())
-        displacements = in_c_order(displaced.reshape(-1)) if moved and displaced is not None else np.zeros(1)
-        per_displacement = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
-        distances, pairs, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
-        if count:
-            _, data = self._to_each(mjcf_dynamics, numbers)
-            self._module(dynamics).distances_of(
-                len(flat), flat, per_displacement, displacements, int(moved), data, distances, pairs, segments
-            )
-        return distances[: len(flat) * count].reshape(*states.shape[:-1], count)
+        _, data = self._to_each(mjcf_dynamics, numbers)
+        distances, _ = _distances(states.reshape(-1, states.shape[-1]), data, displaced)
+        return distances.reshape(*states.shape[:-1], len(numbers))
 
     def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
         mjcf_dynamics, numbers = self._bound(dynamics, world)
         flat, count = in_c_order(vectors_of("states", states, len(dynamics.state_coordinates))), len(numbers)
-        distances, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
-        pairs, segments = np.empty(count + 1), np.empty((count + 1, 6))
-        if count:
-            _, data = self._to_each(mjcf_dynamics, numbers)
-            self._module(dynamics).slopes_of(len(flat), flat, data, distances, slopes, pairs, segments)
-        shape = len(flat), count
-        return distances[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
+        distances, slopes = np.empty(len(flat) * count), np.zeros((len(flat) * count, flat.shape[1]))
+        _, data = self._to_each(mjcf_dynamics, numbers)
+        _module(flat.shape[1]).slopes_of(
+            len(flat), flat, data, distances, slopes, np.empty(count), np.empty((count, 6))
+        )
+        return distances.reshape(-1, count), slopes.reshape(-1, count, flat.shape[1])
 
     def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
         mjcf_dynamics, numbers = self._bound(dynamics, world)
-        flat, count = in_c_order(np.asarray(state, dtype=np.float64)[None]), len(numbers)
-        distances, pairs, segments = np.empty(count), np.empty(count + 1), np.empty((count + 1, 6))
         chosen, data = self._to_each(mjcf_dynamics, numbers)
-        self._module(dynamics).distances_of(1, flat, 1, np.zeros(1), 0, data, distances, pairs, segments)
+        distances, pairs = _distances(np.asarray(state, dtype=np.float64)[None], data)
         pair = self._pairs[chosen[int(pairs[int(distances.argmin())])]]
         first, second = (self.scene.model.body(body).name for body in self.scene.model.geom_bodyid[pair].tolist())
         return first, second
@@ -142,10 +131,6 @@ class MjcfGeoms(CollisionGeoms):
         chosen = np.flatnonzero(rows >= 0)
         data = self._data(chosen, rows[chosen], len(numbers), _FAR)
         return chosen, np.concatenate([[float(dynamics.physics.address())], data])
-
-    def _module(self, dynamics: Dynamics) -> Any:
-        n = len(dynamics.state_coordinates)
-        return module_of(source_of(mjcf_distances), f"MuJoCo's distances ({n} states)", N=n)
 
 
 class SelfClearance(Constraint):
@@ -200,13 +185,10 @@ class SelfClearance(Constraint):
     def distances(self, dynamics: MjcfDynamics, states: npt.ArrayLike) -> Array:
         """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m."""
         states = vectors_of("states", states, len(dynamics.state_coordinates))
-        flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(self.links)
-        distances, pairs, segments = np.empty(len(flat) * count + 1), np.empty(count + 1), np.empty((count + 1, 6))
-        data = mjcf_obstacles.distance_data(self._mjcf.model, self._pairs, self._rows, count, 1.0)
+        data = mjcf_obstacles.distance_data(self._mjcf.model, self._pairs, self._rows, len(self.links), 1.0)
         data = np.concatenate([[float(dynamics.physics.address())], data])
-        module = module_of(source_of(mjcf_distances), "MuJoCo's distances", N=flat.shape[1])
-        module.distances_of(len(flat), flat, max(1, len(flat)), np.zeros(1), 0, data, distances, pairs, segments)
-        return distances[:-1].reshape(*states.shape[:-1], count)
+        distances, _ = _distances(states.reshape(-1, states.shape[-1]), data)
+        return distances.reshape(*states.shape[:-1], len(self.links))
 
     def check(self, field: str, dynamics: MjcfDynamics, state: Array) -> None:
         """Raises InputError if links are nearer to each other than the margin at a state (n,), named `field`."""
@@ -218,6 +200,25 @@ class SelfClearance(Constraint):
                 f" {self.margin:g} m; or, if they may touch, <contact><exclude"
                 f' body1="{first}" body2="{second}"/></contact> in the MJCF'
             )
+
+
+def _distances(states: Array, data: Array, displaced: Array | None = None) -> tuple[Array, Array]:
+    """Distances (K rows,) at states (K, n) by the kernel's data, and the pair of each row at the last state.
+
+    Args:
+      displaced: (D, rows, 3), displacements in m of the obstacles, the first for the first K / D states.
+    """
+    flat, rows = in_c_order(states), int(data[1])
+    displaced = np.zeros((1, rows, 3)) if displaced is None else displaced
+    distances, pairs, each = np.empty(len(flat) * rows), np.empty(rows), max(1, len(flat) // max(1, len(displaced)))
+    _module(flat.shape[1]).distances_of(
+        len(flat), flat, each, in_c_order(displaced.reshape(-1)), data, distances, pairs, np.empty((rows, 6))
+    )
+    return distances, pairs
+
+
+def _module(states: int) -> Any:
+    return module_of(source_of(mjcf_distances), f"MuJoCo's distances ({states} states)", N=states)
 
 
 class MjcfBalls(CollisionSpheres):

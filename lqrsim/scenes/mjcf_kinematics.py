@@ -3,13 +3,16 @@
 import copy
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
+
+if TYPE_CHECKING:
+    from lqrsim.scenes.mjcf_model import MjcfModel
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
 _TYPED = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding
@@ -126,7 +129,7 @@ class Axes:
     moving: tuple[bool, ...]
 
 
-def position_of(mjcf: MjcfModel, body: int) -> Axes:
+def position_of(mjcf: "MjcfModel", body: int) -> Axes:
     """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
     model, data, rng = mjcf.model, mujoco.MjData(mjcf.model), np.random.default_rng(0)
     candidates = {

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_number, check_path, excerpt
+from lqrsim.scenes.mjcf_kinematics import axes_of, contacts_of
 from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, listed
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
@@ -264,9 +265,8 @@ def _moments(body: mujoco.MjsBody) -> Array:
 
 def _frame(position: Array, quaternion: Array) -> Array:
     """The frame at a position as a homogeneous matrix, (4, 4)."""
-    turn, frame = np.zeros(9), np.eye(4)
-    mujoco.mju_quat2Mat(turn, quaternion)
-    frame[:3, :3], frame[:3, 3] = turn.reshape(3, 3), position
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = axes_of(quaternion), position
     return frame
 
 
@@ -375,12 +375,10 @@ def _exclude_overlaps(mjcf: ElementTree.Element, model: mujoco.MjModel, name: st
 
     A URDF cannot say which links may collide. Hulls of links that are two joints apart often overlap in any position.
     """
-    data, limited = mujoco.MjData(model), np.flatnonzero(model.jnt_limited)
+    qpos, limited = model.qpos0.copy(), np.flatnonzero(model.jnt_limited)
     places = model.jnt_qposadr[limited]
-    data.qpos[places] = np.clip(data.qpos[places], *model.jnt_range[limited].T)
-    mujoco.mj_fwdPosition(model, data)
-    bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
-    pairs = dict.fromkeys((model.body(first).name, model.body(second).name) for first, second in bodies.tolist())
+    qpos[places] = np.clip(qpos[places], *model.jnt_range[limited].T)
+    pairs = contacts_of(model, qpos)
     section = _add(mjcf, "contact")
     for first, second in pairs:
         _add(section, "exclude", {"body1": first, "body2": second})
