@@ -124,8 +124,7 @@ class CompiledModule:
         """Machine code of some functions, from disk or newly compiled, and the types that entries among them return."""
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
-        stored = disk.load(key)
-        if stored is not None and (unpacked := _unpacked(*stored)) is not None:
+        if (unpacked := disk.made_of(disk.load(key), _unpacked)) is not None:
             self._loaded.append(unpacked[0])
             return unpacked
         compilations.append(what)
@@ -302,14 +301,10 @@ def _decoded(known: Any) -> Type | None:
     return Group(kinds) if several else kinds[0]
 
 
-def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[Type | None]] | None:
-    """Load cached functions; None if they cannot be used, and must be compiled again."""
-    try:
-        returns = [_decoded(kind) for kind in known["returns"]]
-        return Loaded(code), returns
-    except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
-        logger.debug(f"a cached compiled function cannot be used ({error})")
-        return None
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[Type | None]]:
+    """Load cached functions, with the types that they return."""
+    returns = [_decoded(kind) for kind in known["returns"]]
+    return Loaded(code), returns
 
 
 @functools.cache

@@ -10,11 +10,13 @@ against people: anyone who can write to the folder can run code in the name of i
 
 import contextlib
 import json
+import logging
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import platformdirs
 
@@ -28,6 +30,9 @@ _SHRINKING = "00"
 _DURATIONS = "durations.json"
 _LONGEST = 100_000  # largest size in bytes of a header, and of the durations
 _ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
+
+Made = TypeVar("Made")
+logger = logging.getLogger("lqrsim")
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,15 @@ def load(name: str) -> tuple[bytes, dict[str, Any]] | None:
     with contextlib.suppress(OSError):
         os.utime(path)  # marks it as used now
     return contents, details
+
+
+def made_of(stored: tuple[bytes, dict[str, Any]] | None, make: Callable[[bytes, dict[str, Any]], Made]) -> Made | None:
+    """What `make` makes of an item; None if there is none, or it cannot be used, as of another compiler."""
+    try:
+        return None if stored is None else make(*stored)
+    except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
+        logger.debug(f"a cached item cannot be used ({error})")
+        return None
 
 
 def save(name: str, contents: bytes, what: str, **said: Any) -> None:

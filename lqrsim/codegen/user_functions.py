@@ -40,19 +40,15 @@ _SYMBOL = "function"
 _loaded: dict[str, tuple[Any, int]] = {}
 
 
-def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int] | None:
-    """Load a cached function; None if it cannot be used."""
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int]:
+    """Load a cached function."""
     from numba.core import registry
 
-    try:
-        # Creating numba's target registers the functions of its runtime.
-        if not (registry.cpu_target.target_context and are_there(known["needed"])):
-            raise ValueError("it needs a function that is missing")
-        loaded = Loaded(code)
-        return loaded, loaded.address(_SYMBOL)
-    except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
-        logger.debug(f"a cached compiled function cannot be used ({error})")
-        return None
+    # Creating numba's target registers the functions of its runtime.
+    if not (registry.cpu_target.target_context and are_there(known["needed"])):
+        raise ValueError("it needs a function that is missing")
+    loaded = Loaded(code)
+    return loaded, loaded.address(_SYMBOL)
 
 
 @cache
@@ -301,8 +297,7 @@ class UserFunction:
         key = disk.key(*parts, digest) if digest else ""
         if key in _loaded:
             return _loaded[key]
-        stored = disk.load(key) if key else None
-        compiled = _unpacked(*stored) if stored is not None else None
+        compiled = disk.made_of(disk.load(key) if key else None, _unpacked)
         if compiled is None:
             note_helpers(function)
             # numba compiled helpers with their globals at that time. If these have changed, the result is not cached.
@@ -325,7 +320,7 @@ class UserFunction:
             if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
                 code, needed = object_code_of_one(text, adapted.native_name, _SYMBOL)
                 disk.save(key, code, self.name, needed=needed)
-                compiled = _unpacked(code, {"needed": needed}) or compiled
+                compiled = disk.made_of((code, {"needed": needed}), _unpacked) or compiled
         if key:
             _loaded[key] = compiled
         return compiled

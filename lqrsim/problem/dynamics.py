@@ -5,7 +5,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -96,9 +96,9 @@ class Dynamics:
     _prefix = ""
     _want = "Dynamics(...), such as robot.dynamics"
     # Whether MuJoCo does the steps; see `robots/mjcf_dynamics.py`. They have no second derivatives.
-    by_mujoco: ClassVar[bool] = False
+    by_mujoco: bool = False
     # Relative size of states whose cost is negligible: if the least cost is zero, it is not reached to rounding.
-    rounding: ClassVar[float] = 1e-13
+    rounding: float = 1e-13
     # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
     # Runge-Kutta steps in a control period; see `with_substeps`.

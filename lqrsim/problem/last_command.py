@@ -3,7 +3,6 @@
 With `x = (y, z)`, `y_{t+1} = g(y_t, u_t)` and `z_{t+1} = u_t`, a rate is that of u_t and z_t. The kernels are its step.
 """
 
-import contextlib
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, TypeVar
@@ -32,6 +31,11 @@ class LastCommand(Dynamics):
     def __init__(self, of: Dynamics) -> None:
         self.of, self.level, self.functions = of, of.level, ()
         self.parameters, self.disturbances = dict[str, float](), dict[str, float]()  # those of `of` are its own
+        # The steps are those of `of`, and so is what is told of them: its states come first.
+        self._period, self.by_mujoco, self.rounding = of.period, of.by_mujoco, of.rounding
+        self.period_near, self.check_period = of.period_near, of.check_period
+        self.solving, self.quiet, self._with_finer_steps = of.solving, of.quiet, of._with_finer_steps
+        self.touches, self._cause_of_failure = of.touches, of._cause_of_failure
         space, controls = of.state_coordinates, of.control_coordinates
         names = list(space.names)
         for name in controls.names:
@@ -41,18 +45,6 @@ class LastCommand(Dynamics):
             names=tuple(names), units=(*space.units, *controls.units), position=space.position, plane=space.plane,
             offset=space.offset, angles=space.angles, rotation_vectors=space.rotation_vectors,
         )  # fmt: skip
-
-    @property
-    def period(self) -> float | None:
-        return self.of.period
-
-    @property
-    def by_mujoco(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.of.by_mujoco
-
-    @property
-    def rounding(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.of.rounding
 
     @property
     def name(self) -> str:
@@ -85,14 +77,8 @@ class LastCommand(Dynamics):
         """States (..., n) without the last command."""
         return np.asarray(states)[..., : len(self.of.state_coordinates)]
 
-    def touches(self, states: Array) -> bool:
-        return self.of.touches(self._own(states))
-
     def untouched_body(self, states: Array, state: int) -> str:
         return self.of.untouched_body(self._own(states), state) if state < len(self.of.state_coordinates) else ""
-
-    def _cause_of_failure(self, state: Array) -> str | None:
-        return self.of._cause_of_failure(self._own(state))
 
     def softened(self, states: Array) -> Iterator[tuple[str, Dynamics]]:
         return ((name, LastCommand(softer)) for name, softer in self.of.softened(self._own(states)))
@@ -104,21 +90,6 @@ class LastCommand(Dynamics):
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
         return self.of._runge_kutta(self._own(states), controls, dt)
-
-    def _with_finer_steps(self, dt: float, most: float) -> str:
-        return self.of._with_finer_steps(dt, most)
-
-    def period_near(self, dt: float) -> float:
-        return self.of.period_near(dt)
-
-    def check_period(self, dt: float) -> None:
-        self.of.check_period(dt)
-
-    def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
-        return self.of.solving(threads)
-
-    def quiet(self) -> contextlib.AbstractContextManager[None]:
-        return self.of.quiet()
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
         """That of the dynamics; 0 for the last command, which jumps."""

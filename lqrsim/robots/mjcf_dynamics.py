@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -213,8 +213,8 @@ class MjcfDynamics(Dynamics):
     is no rate: solvers in continuous time, and solvers that need an inverse, do not accept these dynamics.
     """
 
-    by_mujoco: ClassVar[bool] = True
-    rounding: ClassVar[float] = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
+    by_mujoco: bool = True
+    rounding: float = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
 
     def __init__(
         self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
