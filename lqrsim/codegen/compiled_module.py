@@ -11,7 +11,6 @@ import importlib
 import logging
 import operator
 import threading
-import time
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -129,18 +128,13 @@ class CompiledModule:
             return unpacked
         compilations.append(what)
         # It is a warning, because scripts show warnings without setting up logging: a long silence would be worse.
-        log, timed = logger.warning if long else logger.debug, f"{what} on {instruction_set()[1]}"
-        last = disk.noted(timed)
-        took = "some seconds" if last is None else f"{last:.0f} s the last time"
-        log(f"compiling {what}, once for this size ({took}) ...")
-        clock = time.perf_counter()
+        log = logger.warning if long else logger.debug
+        log(f"compiling {what}, once for this size (some seconds) ...")
         program = Program()
         returns = write(program, Scope(self._source, self._sizes))
         code = object_code(program.text)
         loaded = Loaded(code)
         self._loaded.append(loaded)
-        if long:
-            disk.note(timed, time.perf_counter() - clock)
         disk.save(key, code, what, returns=[_encoded(kind) for kind in returns])
         return loaded, returns
 

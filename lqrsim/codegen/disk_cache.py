@@ -27,8 +27,7 @@ LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes abo
 _SUFFIX = ".item"
 # The items after which the cache is shrunk begin so. Names are hashes: one in 256 does, after some 25 MB of solvers.
 _SHRINKING = "00"
-_DURATIONS = "durations.json"
-_LONGEST = 100_000  # largest size in bytes of a header, and of the durations
+_LONGEST = 100_000  # largest size in bytes of a header
 _ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
 
 Made = TypeVar("Made")
@@ -92,25 +91,6 @@ def save(name: str, contents: bytes, what: str, **said: Any) -> None:
             _shrink()
 
 
-def note(name: str, seconds: float) -> None:
-    """Store, if possible, how long something took on this machine, in place of the previous time."""
-    with contextlib.suppress(OSError, InputError, ValueError), replacing(folder() / _DURATIONS) as unfinished:
-        unfinished.write_text(json.dumps(_durations() | {name: seconds}), encoding="utf-8")
-
-
-def noted(name: str) -> float | None:
-    """The seconds that something took the last time; None if unknown."""
-    seconds = _durations().get(name)
-    return seconds if isinstance(seconds, float) and 0 < seconds < 1e5 else None
-
-
-def _durations() -> dict[str, Any]:
-    try:
-        return _object_of((folder() / _DURATIONS).read_bytes())
-    except OSError:
-        return {}
-
-
 def _object_of(text: bytes) -> dict[str, Any]:
     """The object of a JSON text, such as the header in an item's first line; empty if it is damaged."""
     try:
@@ -135,8 +115,6 @@ def clear() -> int:
     removed = items()
     for path in [*(item.path for item in removed), *_unfinished(0.0)]:
         path.unlink(missing_ok=True)
-    with contextlib.suppress(NotADirectoryError):
-        (folder() / _DURATIONS).unlink(missing_ok=True)
     return len(removed)
 
 
