@@ -6,7 +6,7 @@ Its derivatives follow from those of a step by the chain rule: Jacobians forward
 from lqrsim.kernels.declarations import M, N, W, compact, part_curvature, stack, zeros
 from lqrsim.kernels.linear_algebra import copy
 from lqrsim.kernels.runge_kutta import advance as part
-from lqrsim.kernels.runge_kutta import state_jacobians as slopes_of_rates
+from lqrsim.kernels.runge_kutta import state_jacobians as state_jacobians
 from lqrsim.kernels.runge_kutta import step_jacobian as part_jacobian
 
 PARTS = 2  # number of steps
@@ -59,12 +59,6 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
             for i in range(N):
                 before[j] += own[i, j] * w[i]
         copy(before, N, w)
-
-
-@compact
-def state_jacobians(count, states, controls, p, slopes):
-    """Write df/dx to slopes (count, N, N), which are zero on entry, at states (count, N) and controls (count, M)."""
-    slopes_of_rates(count, states, controls, p, slopes)
 
 
 def begin(slopes, first):

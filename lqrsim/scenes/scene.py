@@ -127,7 +127,7 @@ def _with_choice(mjcf: MjcfModel, obstacles: Choice, kinds: Collection[str] = KI
     return scene_of(mjcf, geoms, kinds)
 
 
-def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str] = KINDS) -> Scene:
+def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str]) -> Scene:
     """The scene in which these geoms are the obstacles. Raises InputError if a geom is not of these kinds."""
     return Scene(mjcf, World(_obstacles(mjcf.model, mjcf.name, geoms, kinds)), tuple(geoms))
 
