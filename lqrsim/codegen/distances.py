@@ -12,23 +12,21 @@ from lqrsim.kernels import obstacle_distances
 from lqrsim.scenes.world import World
 
 
-def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
-    """Distances (...) of points (..., 2 or 3) to the nearest obstacle: `world_seen.distance(points)`, compiled."""
-    points = np.asarray(points, dtype=np.float64)
-    flat = points.reshape(1, points[..., 0].size, points.shape[-1])
-    still = np.zeros((1, len(world_seen), 3))
-    return signed_distance_displaced(world_seen, flat, still).reshape(points.shape[:-1])
+def signed_distance(world_seen: World, points: npt.ArrayLike, displaced: Array | None = None) -> Array:
+    """Distances (...) of points (..., 2 or 3) to the nearest obstacle: `world_seen.distance(points)`, compiled.
 
-
-def signed_distance_displaced(world_seen: World, points: Array, displaced: Array) -> Array:
-    """Distances (K, k) of points (K, k, 2 or 3) to obstacles that have moved by displaced (K, obstacles, 3)."""
-    trials, count, size = points.shape
-    flat, out, obstacles = np.zeros((trials * count, 3)), np.empty(trials * count), len(world_seen)
-    flat[:, :size] = points.reshape(-1, size)
+    Args:
+      displaced: (K, obstacles, 3) displacements of the obstacles; the first axis of the points is then K.
+    """
+    points, count = np.asarray(points, dtype=np.float64), len(world_seen)
+    flat = np.zeros((points[..., 0].size, 3))
+    flat[:, : points.shape[-1]] = points.reshape(-1, points.shape[-1])
+    displaced, out = np.zeros((1, count, 3)) if displaced is None else displaced, np.empty(len(flat))
+    per_displacement = max(1, len(flat) // max(1, len(displaced)))
     # One row for each obstacle, so that their number is not part of the type: another world compiles nothing.
-    away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(trials * obstacles, 3)
-    _distances().nearest(obstacles, len(flat), count, world_seen.table, flat, away, out)
-    return out.reshape(trials, count)
+    away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(-1, 3)
+    _distances().nearest(count, len(flat), per_displacement, world_seen.table, flat, away, out)
+    return out.reshape(points.shape[:-1])
 
 
 def hull_distances(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.codegen.jitted import Jitted, in_double_precision
-from lqrsim.codegen.user_functions import UserFunction, parameters_class, view
+from lqrsim.codegen.user_functions import UserFunction, c_function, parameters_class, view
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import HESSIANS, JACOBIANS, STATES
 
@@ -39,8 +39,6 @@ class JaxSteps(UserFunction):
 
     @cached_property
     def called_back(self) -> tuple[Any, int]:
-        pointer, integer = ctypes.c_void_p, ctypes.c_int64
-        prototype = ctypes.CFUNCTYPE(None, *[integer] * 3, *[pointer] * 3, ctypes.c_double, *[pointer] * 4)
         n, m, end = self.states, self.controls, self.offset + len(self.parameters)
 
         def callback(
@@ -54,10 +52,8 @@ class JaxSteps(UserFunction):
             w = rows(weights, n, skipped) if what == HESSIANS else None
             self._guarded(lambda: self._write(what, *arguments, w, arrays), arrays)
 
-        held = prototype(callback)
-        address = ctypes.cast(held, ctypes.c_void_p).value
-        assert address is not None
-        return held, address
+        pointer = ctypes.c_void_p
+        return c_function(callback, *[ctypes.c_int64] * 3, *[pointer] * 3, ctypes.c_double, *[pointer] * 4)
 
     def _write(
         self, what: int, x: Array, u: Array, p: Array, h: float, weights: Array | None, outputs: list[Array]

@@ -239,8 +239,6 @@ class UserFunction:
 
         It is `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
         """
-        count = 3 + (len(self.writes) or 1)
-        prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * count)
         sizes = [int(np.prod(shape)) for shape in self.writes] or [self.values]
         end = self.offset + len(self.parameters)
 
@@ -255,10 +253,7 @@ class UserFunction:
 
             self._guarded(write, arrays)
 
-        pointer = prototype(callback)
-        address = ctypes.cast(pointer, ctypes.c_void_p).value
-        assert address is not None
-        return pointer, address
+        return c_function(callback, *[ctypes.c_void_p] * (3 + (len(self.writes) or 1)))
 
     def _guarded(self, write: Callable[[], None], outputs: Sequence[Array]) -> None:
         """Let a callback write its outputs. After an exception they are NaN, and the solver checks `raised`."""
@@ -357,6 +352,12 @@ class UserFunction:
         if self.columns:
             return f"[{i // self.columns}][{i % self.columns}]"
         return f"[{i}]" if self.entries else ""
+
+
+def c_function(callback: Callable[..., None], *kinds: Any) -> tuple[Any, int]:
+    """A C function of arguments of these kinds that calls back: the object to keep alive, and its address."""
+    held = ctypes.CFUNCTYPE(None, *kinds)(callback)
+    return held, ctypes.cast(held, ctypes.c_void_p).value or 0
 
 
 def with_derivatives(

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.distances import hull_distances, signed_distance, signed_distance_displaced
+from lqrsim.codegen.distances import hull_distances, signed_distance
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
@@ -157,11 +157,7 @@ class ShapeInWorld:
         if self.hulls:
             distances, _ = hull_distances(self.world, places, self.hulls, displaced)
             return (distances - self.radii[:, None]).min(axis=(-2, -1))
-        if displaced is None:
-            return (signed_distance(self.world, places) - self.radii).min(axis=-1)
-        flat = places.reshape(len(places), -1, places.shape[-1])
-        signed = signed_distance_displaced(self.world, flat, displaced).reshape(places.shape[:-1])
-        return (signed - self.radii).min(axis=-1)
+        return (signed_distance(self.world, places, displaced) - self.radii).min(axis=-1)
 
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
         """Clearance of each obstacle at states (K, n), (K, O) in m, and its derivatives in some states, (K, O, p).

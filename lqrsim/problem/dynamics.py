@@ -491,14 +491,14 @@ class Dynamics:
         return fx, fu
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds from a state (n,), with a control (m,) held: one step, in plain Python.
+        """The state (n,) after `dt` seconds from a state (n,), with a control (m,) held: one step.
 
-        Negative steps lead backwards in time; a map has none.
+        Negative steps lead backwards in time; a map and MuJoCo have none. MuJoCo's are NaN if they overflow.
         """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
         self.check_period(dt)
-        self._plain["advance"](x, u, self._numbers(), float(dt), out)
+        self._evaluate("advance", x, u, float(dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
@@ -507,9 +507,13 @@ class Dynamics:
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
         self.check_period(dt)
-        self._plain["step_jacobian"](x, u, self._numbers(), float(dt), out, jacobian)
+        self._evaluate("step_jacobian", x, u, float(dt), out, jacobian)
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
+
+    def _evaluate(self, name: str, x: Array, u: Array, dt: float, *out: Array) -> None:
+        """Call a function of `step_source`, which writes."""
+        self._plain[name](x, u, self._numbers(), dt, *out)
 
     def _check(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
         x = check_array("state", state, (len(self.state_coordinates),))

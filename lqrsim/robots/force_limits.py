@@ -7,7 +7,6 @@ never clips, and both models are the same along it.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import mujoco
@@ -101,42 +100,28 @@ class ForceLimits(Constraint):
         return np.concatenate(forces)
 
     def with_added_state(self, dynamics: Dynamics) -> "ForceLimits":
-        return self._widened(len(dynamics.control_coordinates), 1)
-
-    def _widened(self, controls: int, count: int) -> "ForceLimits":
-        """The same beside further states, the last ones, which do not count."""
-
-        def wide(slopes: Array) -> Array:
-            return np.insert(slopes, [slopes.shape[-1] - controls] * count, 0.0, axis=-1)
-
-        limits = [limit._replace(slopes=wide(limit.slopes)) for limit in self.limits]
-        return ForceLimits(limits, None if self.later is None else wide(self.later))
+        return self
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
-        mjcf_dynamics, n, m = dynamics.calling, len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        mjcf_dynamics = dynamics.calling
         assert isinstance(mjcf_dynamics, MjcfDynamics)
-        if added := n - len(mjcf_dynamics.state_coordinates):
-            limits = [
-                limit._replace(slopes=np.delete(limit.slopes, np.s_[1 + n - added : 1 + n])) for limit in self.limits
-            ]
-            narrow = ForceLimits(limits)._refined(mjcf_dynamics, replace(plan, states=plan.states[:, : n - added]))
-            return None if narrow is None else narrow._widened(m, added)
-        dynamics = mjcf_dynamics
-        count, pairs = round(plan.dt / dynamics.period), zip(plan.states, plan.controls, strict=False)
-        later = np.stack([self._ahead(dynamics, x, u, count) for x, u in pairs])
-        forces = later[..., 0] + np.einsum("tki,ti->tk", later[..., 1:], np.hstack([plan.states[:-1], plan.controls]))
+        states, count = plan.states[:, : len(mjcf_dynamics.state_coordinates)], round(plan.dt / mjcf_dynamics.period)
+        pairs = zip(states, plan.controls, strict=False)
+        later = np.stack([self._ahead(mjcf_dynamics, x, u, count) for x, u in pairs])
+        forces = later[..., 0] + np.einsum("tki,ti->tk", later[..., 1:], np.hstack([states[:-1], plan.controls]))
         low, high = (np.tile([getattr(limit, side) for limit in self.limits], count - 1) for side in ("low", "high"))
         return ForceLimits(self.limits, later) if ((forces < low) | (forces > high)).any() else None
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        n, m = len(dynamics.calling.state_coordinates), len(dynamics.control_coordinates)
+        added = len(dynamics.state_coordinates) - n  # further states, the last ones, which do not count
         for limit in self.limits:
             if len(limit.slopes) != 1 + n + m:
                 got = f"forces of {len(limit.slopes) - 1} states and controls"
                 raise InputError(f"ForceLimits: got {got}, want {n + m}, as the dynamics have")
         later = np.zeros((1, 0, 1 + n + m)) if self.later is None else self.later
         first = np.broadcast_to(self._slopes, (len(later), *self._slopes.shape))
-        table = np.concatenate([first, later], axis=1)
+        table = np.insert(np.concatenate([first, later], axis=1), [1 + n] * added, 0.0, axis=-1)
         limits, described = self.limits * (table.shape[1] // len(self.limits)), []
         for side, word in (("low", "at least"), ("high", "at most")):
             described += [f"the force {limit.name} of {word} {getattr(limit, side):g} {limit.unit}" for limit in limits]

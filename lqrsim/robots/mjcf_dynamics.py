@@ -438,24 +438,10 @@ class MjcfDynamics(Dynamics):
     def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
         raise InputError(f"{self.name}: got MuJoCo's steps, which have no rate, want `linearize`")
 
-    def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """As in `Dynamics`; NaN if it overflows."""
-        x, u = self._check(state, control)
-        self.check_period(dt)
-        next_state = np.empty(len(x))
+    def _evaluate(self, name: str, x: Array, u: Array, dt: float, *out: Array) -> None:
+        """By MuJoCo, which writes NaN where a step overflows."""
         with unlogged():
-            self.compiled.advance(in_c_order(x), in_c_order(u), self.data, float(dt), next_state)
-        return next_state
-
-    def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
-        x, u = self._check(state, control)
-        self.check_period(dt)
-        n, m = len(x), len(u)
-        next_state, jacobian = np.empty(n), np.empty((n, n + m))
-        with unlogged():
-            self.compiled.step_jacobian(in_c_order(x), in_c_order(u), self.data, float(dt), next_state, jacobian)
-        a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
-        return a, b, next_state - a @ x - b @ u
+            getattr(self.compiled, name)(in_c_order(x), in_c_order(u), self.data, dt, *out)
 
     def quiet(self) -> contextlib.AbstractContextManager[None]:
         return unlogged()

@@ -173,7 +173,7 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
     used_names, types = set(names), model.geom_type.tolist()
     kind_of = {number: mujoco.mjtGeom(number).name.removeprefix("mjGEOM_").lower() for number in set(types)}
     places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-    sizes, velocity, no_corners = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
+    sizes, still, no_corners = model.geom_size.copy(), np.zeros(3), np.zeros((0, 3))
     obstacles: list[Obstacle] = []
     for geom in geoms:
         kind = kind_of[types[geom]]
@@ -189,7 +189,10 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
             middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], FLAT)
             position = position + axes[geom] @ middle
             corners = _hull_of(model, int(model.geom_dataid[geom])) - middle if kind == "mesh" else no_corners
-        obstacles.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, velocity, corners))
+        obstacle = Obstacle._of_mujoco(
+            name=name, kind=kind, position=position, rotation=axes[geom], size=size, velocity=still, corners=corners
+        )
+        obstacles.append(obstacle)
     planes = [obstacle for obstacle in obstacles if obstacle.kind == "plane"]
     for i, obstacle in enumerate(obstacles):
         if obstacle.kind in ("capsule", "cylinder") and all(_walled_off(obstacle, end, planes) for end in (-1, 1)):

@@ -5,7 +5,7 @@ and `kernels/hull_distance.py`.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -85,14 +85,10 @@ class Obstacle:
         return cls(name, "mesh", (low + high) / 2, np.eye(3), size, real("velocity", velocity), flat - (low + high) / 2)
 
     @classmethod
-    def _of_mujoco(
-        cls, name: str, kind: str, position: Array, rotation: Array, size: Array, velocity: Array, corners: Array
-    ) -> "Obstacle":
+    def _of_mujoco(cls, **fields: Any) -> "Obstacle":
         """Make an obstacle that MuJoCo has compiled, without checks: there can be tens of thousands."""
         obstacle = object.__new__(cls)
-        vars(obstacle).update(
-            name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity, corners=corners
-        )
+        vars(obstacle).update(fields)
         return obstacle
 
     @property

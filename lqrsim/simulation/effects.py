@@ -45,6 +45,7 @@ class Effects:
         self._effects: list[tuple[str, Effect]] = []
         for stream, disturbance in enumerate(disturbances):
             name = type(disturbance).__name__
+            disturbance.check(plant)
             effect = disturbance.start(plant, plan, _Streams(generators, trials, stream))
             self._effects.append((name, check_kind(f"{name}.start", effect, Effect, "an Effect")))
         self.displaced = np.zeros((len(trials), len(plant.world), 3))

@@ -145,6 +145,7 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
             generator = np.random.default_rng(campaign.seed)
             untouched, known = generator.bit_generator.state, _is_own(type(disturbance))
             try:
+                disturbance.check(plant)
                 disturbance.start(plant, standing, [generator])
             except InputError as error:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None

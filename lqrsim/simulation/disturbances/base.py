@@ -116,7 +116,7 @@ class Disturbance(abc.ABC):
         )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
-        """Raise an InputError for a plant that cannot have this disturbance."""
+        """Raise an InputError for a plant that cannot have this disturbance; called before each `start`."""
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason."""

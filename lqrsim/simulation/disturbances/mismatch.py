@@ -88,7 +88,6 @@ class Mismatch(Disturbance):
         return np.abs(self._fit(self.factor, parts, "factor") - 1)
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         parts = self.parts(plant)
         if self.factor is None:
             factors = 1 + (self.std or 0.0) * np.array(
@@ -159,7 +158,6 @@ class Payload(Disturbance):
         return f"a load of {self.mass:g} kg on {self.body}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         number = self._number(plant)
 
         def alter(simulations: batch.Batch) -> None:

@@ -153,7 +153,6 @@ class DisplacedObstacles(GaussianDisturbance):
             )
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         displaced = self._fit(self.std, self.along) * normal(generators, len(plant.world), 3)
         displaced[:, [obstacle.kind == "plane" for obstacle in plant.world.obstacles]] = 0.0
         if plant.robot.dynamics.state_coordinates.from_above:
@@ -186,7 +185,6 @@ class StateNoise(Disturbance):
         self.noise.bind(plant.robot.dynamics)
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         draws = normal(generators, plan.steps, self.noise.size)
 
         def kick(step: int, states: Array, controls: Array) -> Array:

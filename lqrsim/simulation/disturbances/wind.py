@@ -58,7 +58,6 @@ class MeanWind(Wind):
         return f"wind of {words(self.velocity)} m/s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
@@ -92,7 +91,6 @@ class Gusts(Wind):
         return f"gusts, std {words(self.std)} m/s, time constant {self.time_constant:g} s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         noise = normal(generators, plan.steps, 3)
         return self.blow(plant, self._fit(self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
 
@@ -159,7 +157,6 @@ class Dryden(Wind):
         return replace(self, wind=self._times(self.wind_at_20_ft, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        self.check(plant)
         noise = normal(generators, plan.steps, 5)
         steps = self.airspeed * plan.dt / np.array(self.lengths)
         along = self.std[0] * first_order(noise[..., :1], steps[0])[..., 0]
