@@ -7,7 +7,7 @@ records state the permitted contents of a file; see `fields.py`. `save` and `loa
 import enum
 import os
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, overload
 
@@ -22,7 +22,6 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Certificate
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | FailureCertificate
 _Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, FailureCertificate)
@@ -39,17 +38,6 @@ FORMATS: dict[type, tuple[str, int]] = {
 # A file in which an entry of a rotation vector is an angle, a turn about its axis, has the next version, for lqrsim 0.2
 # would read it as part of the vector. When a version is raised, it is by two.
 VERSIONS = {name: (version, version + 1) for name, version in FORMATS.values()}
-# Fields that older files of the same version lack.
-LATER = {
-    (Certificate, "contacts"),
-    (Certificate, "curvature"),
-    (FailureCertificate, "keep"),
-    (Rollout, "moving"),
-    (Rollout, "obstacle_geoms"),
-    (Rollout, "undisturbed"),
-    (Rollout, "warnings"),
-    (Solution, "problem_parts"),
-}
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
@@ -178,13 +166,15 @@ def record_from(kind: Any, tree: Any, path: str, arrays: archive.Arrays) -> Any:
     if unknown := sorted(tree.keys() - known.keys()):
         raise InputError(f"{path or 'meta'}: got {excerpt(unknown[0])}, want only {', '.join(known)}")
     values = {}
+    # A field that is added later has a default: older files of the same version lack it.
+    needed = {field.name for field in fields(kind) if field.default is field.default_factory is MISSING}
     for name, said in known.items():
         field = _join(path, name)
         if name in tree:
             values[name] = _value(said, tree[name], field, arrays)
         elif said.dtype is not None and field in arrays:
             values[name] = arrays.pop(field)
-        elif (kind, name) not in LATER:
+        elif name in needed:
             raise InputError(f"{field}: got nothing, want this field")
     if kind is AffinePolicy and not (np.isfinite(values["gain"]).all() and np.isfinite(values["offset"]).all()):
         raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")
