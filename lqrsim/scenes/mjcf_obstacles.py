@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Finite, checked
 from lqrsim.errors import Array
 from lqrsim.outlines import Capsule
-from lqrsim.scenes.mjcf_kinematics import placed
+from lqrsim.scenes.mjcf_kinematics import placed, posed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -233,14 +233,11 @@ def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) 
     """
     if not len(pairs):
         return np.zeros(0, dtype=bool)
-    data = placed(model)
-    always = _touch(model, data, pairs)
+    always = _touch(model, placed(model), pairs)
     if carried:
         always &= ~_moved_by(model, pairs, _FREE)
     remaining = np.flatnonzero(always)
-    for qpos in _random_positions(model) if len(remaining) else ():
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
+    for data in posed(model, _random_positions(model)) if len(remaining) else ():
         always[remaining] = [_close(model, data, pair) for pair in pairs[remaining]]
         remaining = remaining[always[remaining]]
         if not len(remaining):
@@ -277,13 +274,9 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
     floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
     if not moving.any():
         return set()
-    data, supports, reach = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
-    for qpos, candidates in (
-        (model.qpos0, pairs[moving]),
-        *((keyframe, pairs[floating]) for keyframe in model.key_qpos),
-    ):
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
+    supports, reach = set[int](), _NEAR + 2 * _LOWERED
+    for k, data in enumerate(posed(model, [model.qpos0, *model.key_qpos])):
+        candidates = pairs[floating if k else moving]
         for geom, support in candidates[_touch(model, data, candidates)].tolist():
             gap = mujoco.mj_geomDistance(model, data, geom, support, reach, None)
             data.geom_xpos[support, 2] -= _LOWERED

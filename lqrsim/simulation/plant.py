@@ -249,12 +249,10 @@ class Plant(OneVersion):
 
     def _places_on(self, number: int, place: Array, states: Array) -> Array:
         """The position of a point of a body, (k, 1, 3), in these states (k, n)."""
-        data, places = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
-        for k, qpos in enumerate(self.robot.configuration(states)[0]):
-            data.qpos[self.qpos] = qpos
-            mujoco.mj_kinematics(self.model, data)
-            places[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
-        return places
+        positions = np.tile(self.model.qpos0, (len(states), 1))
+        positions[:, self.qpos] = self.robot.configuration(states)[0]
+        poses = mjcf_kinematics.posed(self.model, positions)
+        return np.reshape([data.xpos[number] + data.xmat[number].reshape(3, 3) @ place for data in poses], (-1, 1, 3))
 
     @property
     def obstacle_geoms(self) -> npt.NDArray[np.int64]:
