@@ -187,11 +187,13 @@ def test_differences_of_independent_rates_cover(trials: tuple[int, int], first: 
     assert covered > 0.93
 
 
-def test_mean_has_student_s_interval() -> None:
-    """Of 1, 2, 3: t of 2 degrees of freedom is 4.303, over the root of 3."""
-    found = mean([1.0, 2.0, 3.0])
-    assert found.value == 2
-    np.testing.assert_allclose((found.low, found.high), (2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), atol=1e-4)
+@given(st.integers(2, 20), st.floats(1e-3, 1e3), st.integers(0, 2**32 - 1))
+def test_mean_has_student_s_interval(count: int, scale: float, seed: int) -> None:
+    """That of SciPy's t-test; to rounding."""
+    sample = scale * np.random.default_rng(seed).normal(0.5, 1.0, count)
+    found, interval = mean(sample), stats.ttest_1samp(sample, 0.0).confidence_interval(0.95)
+    assert found.value == sample.mean()
+    np.testing.assert_allclose((found.low, found.high), interval, rtol=1e-9, atol=1e-9 * scale)
 
 
 def test_bootstrap_of_a_mean_is_near_the_normal_interval() -> None:
