@@ -64,6 +64,8 @@ def test_trials_that_are_all_alike_are_no_sample() -> None:
     found = success(Cell("smooth", "calm", 0.0), table_of(["reached"] * 200, worst=0.1))
     assert found.alike
     assert (found.exact.low, found.exact.high) == (1.0, 1.0)
+    for too_few in (table_of(["reached"]), table_of(["error"] * 3, worst=0.1, ended=np.nan)):
+        assert not success(Cell("smooth", "calm", 0.0), too_few).alike
     cells = Cell("smooth", "calm", 0.0), Cell("open_loop", "calm", 0.0)
     same = table_of(["reached"] * 200, worst=0.1), table_of(["collided"] * 200, worst=0.1)
     assert comparisons(dict(zip(cells, same, strict=True))) == []
