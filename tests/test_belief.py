@@ -126,7 +126,8 @@ def test_late_and_lost_readings_are_taken_at_their_time(delay: int) -> None:
         stage_cost=ls.QuadraticCost({"x": 2.0, "v": 1.0}, about={}) + ls.ControlCost([0.5, 0.3]),
         final_cost=ls.QuadraticCost({"x": 2.0}, about={}),
     )  # fmt: skip
-    run = ls.belief.BeliefFeedback(problem, ls.smooth(problem)).start(trials)
+    plan = ls.smooth(problem)
+    run = ls.belief.BeliefFeedback(problem, plan).start(trials)
     readings = rng.normal(size=(steps, trials, 2))
     readings[rng.random(readings.shape) < 0.4] = np.nan
     late = np.full((delay, trials, 2), np.nan)
@@ -142,6 +143,8 @@ def test_late_and_lost_readings_are_taken_at_their_time(delay: int) -> None:
         belief = run.beliefs[t, k]
         np.testing.assert_allclose(belief[:2], mean, atol=1e-12)
         np.testing.assert_allclose(of.covariance(belief), covariance, atol=1e-12)
+        affine = plan.policy.gain[t] @ belief + plan.policy.offset[t]
+        np.testing.assert_allclose(controls[t][k], affine, atol=1e-12)
 
 
 def test_averaged_noise_is_that_of_the_readings_drawn() -> None:
