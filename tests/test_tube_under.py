@@ -18,15 +18,16 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
     problem, plant = differential_drive.problem, differential_drive.plant()
     elsewhere = ls.FixedState(drive_solution.trajectory.states[0] + 0.1)
     another = ls.smooth(dataclasses.replace(problem, initial=elsewhere))
+    plan = drive_solution.trajectory
+    moved = dataclasses.replace(drive_solution, trajectory=dataclasses.replace(plan, controls=plan.controls + 0.01))
+    told = ls.uncertainty_of(plant, [NOISE])
     cases = {
         "an OffsetFree or an AffinePolicy": (
             [NOISE],
             ls.Replanner(problem, drive_solution, every=1.0),
         ),
-        "an OffsetFree of another plan": (
-            [NOISE],
-            ls.OffsetFree(problem, another, ls.uncertainty_of(plant, [NOISE])),
-        ),
+        "an OffsetFree of another plan": ([NOISE], ls.OffsetFree(problem, another, told)),
+        "want one of the solution": ([NOISE], ls.OffsetFree(problem, moved, told)),
     }
     for word, (disturbances, controller) in cases.items():
         tube, line = tube_under(problem, drive_solution, plant, disturbances, controller)
