@@ -8,6 +8,7 @@ from typing import Any
 
 import hypothesis
 import numpy as np
+import numpy.typing as npt
 import pytest
 from funnels_by_hand import funnel_by_hand
 from hypothesis import strategies as st
@@ -35,7 +36,17 @@ from lqrsim.disturbances import (
 from lqrsim.errors import InputError
 from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress import funnels
-from lqrsim.stress.funnels import NEAR, FoundLevel, find_level, lowest_rate, points_of, smallest_test
+from lqrsim.stress.funnels import (
+    BATCH,
+    NEAR,
+    FoundLevel,
+    LevelTest,
+    find_level,
+    fresh,
+    lowest_rate,
+    points_of,
+    smallest_test,
+)
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.view import plots
 
@@ -164,6 +175,24 @@ def test_a_check_is_shown_by_its_counts_and_not_by_its_trials(trials: int) -> No
     for text in (str(check), repr((check,))):
         assert "True" not in text
         assert len(text) < 200
+
+
+@hypothesis.given(st.integers(1, 3 * BATCH), st.data())
+def test_a_level_is_tested_by_trials_of_its_own(trials: int, data: st.DataObject) -> None:
+    """In order, once each, none of the pilot's; to the end of the batch in which too many have failed."""
+    allowed, bad = data.draw(st.integers(0, 3)), data.draw(st.sets(st.integers(0, trials - 1), max_size=6))
+    ran: list[int] = []
+
+    def runs(level: float, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+        assert len(numbers) <= BATCH
+        ran.extend(numbers.tolist())
+        return ~np.isin(numbers, [trials + number for number in bad])
+
+    failed, done = fresh(runs, 1.0, LevelTest(trials, allowed, allowed))
+    assert ran == list(range(trials, trials + done))
+    assert failed == sum(number < done for number in bad)
+    last = sorted(bad)[allowed] if len(bad) > allowed else trials - 1
+    assert done == min(trials, (last // BATCH + 1) * BATCH)
 
 
 @pytest.mark.parametrize(
