@@ -49,7 +49,7 @@ def faults(text: str) -> Iterator[tuple[int, int, str]]:
         elif (
             isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool)
         ):
-            yield *place(node), repr(1.1 * node.value if isinstance(node.value, float) else node.value + 1)
+            yield *place(node), repr(1.1 * node.value or 0.1 if isinstance(node.value, float) else node.value + 1)
         for left, right in between:
             first, last = place(left)[1], place(right)[0]
             written = encoded[first:last].decode()
