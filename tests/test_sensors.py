@@ -21,6 +21,7 @@ from lqrsim.disturbances import (
     Sensor,
     SensorErrors,
     Uncertainty,
+    Unknown,
 )
 from lqrsim.errors import InputError
 from lqrsim.simulation.closed_loop import simulate_from
@@ -197,6 +198,29 @@ def test_derivatives_along_the_plan_are_those_of_mujoco(cage, law, plan):
             sides.append(np.concatenate([found[one.name] for one in IMU]))
         wanted = (sides[0] - sides[1]) / 2e-4
         np.testing.assert_allclose(states[t] @ dx + controls[t] @ du + wrench[t] @ df, wanted, atol=2e-5)
+
+
+def test_of_unknowns_only_white_ones_are_noise_of_readings(cage, plan, problem):
+    """Variances of controls and white forces, by MuJoCo's own readings, are added; what lasts is estimated."""
+    sensors, t = cage.sensors(IMU), 17
+
+    def filter_of(*unknowns):
+        return ls.OffsetFree(problem, plan, Uncertainty(unknowns=list(unknowns)), sensors=sensors)._sensing
+
+    def slope(*step):  # of the readings, which are linear in controls and forces
+        du, df = np.split(np.array(step), [4])
+        sides = [sensordata(cage, plan.trajectory.states[t], u + sign * du, sign * df) for sign in (1, -1)]
+        return (np.subtract(*(np.concatenate([side[one.name] for one in IMU]) for side in sides))) / 2
+
+    u, exact = plan.trajectory.controls[t - 1], filter_of()
+    control = [slope(*(row * exact.model.uncertainty.control), *np.zeros(6)) for row in np.eye(4)]
+    wanted = sensors.each("noise") ** 2 + np.square(control).sum(axis=0)
+    lasting = Unknown("force_x", 0.3), Unknown("force_z", 0.3, time_constant=0.5)
+    white = Unknown({"force_x": 0.6, "force_z": 0.8}, 0.3, time_constant=0.0)
+    for sensing in (exact, filter_of(*lasting)):
+        np.testing.assert_allclose(sensing.noise[t], wanted, atol=1e-6)
+    pushed = slope(*np.zeros(4), 0.18, 0, 0.24, 0, 0, 0)
+    np.testing.assert_allclose(filter_of(*lasting, white).noise[t], wanted + pushed**2, atol=1e-6)
 
 
 @settings(max_examples=examples(25))
