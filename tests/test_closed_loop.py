@@ -19,7 +19,6 @@ from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
-from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.robots.quadrotor import Quadrotor
@@ -28,6 +27,7 @@ from lqrsim.scenes.scene import load_scene, scene_from_xml
 from lqrsim.simulation.closed_loop import ClosedLoop, simulate
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
+from models import Jointed
 
 NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
 RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
@@ -157,7 +157,7 @@ SLED = """<mujoco>
 
 
 @dataclass(frozen=True)
-class Sled(Robot):
+class Sled(Jointed):
     radius: float = 0.1
 
     name = "sled"
@@ -175,12 +175,6 @@ class Sled(Robot):
             position=("x", "y"),
             control_limits=(-5, 5),
         )
-
-    def state(self, qpos, qvel, near=None):
-        return np.concatenate([qpos, qvel], axis=-1)
-
-    def configuration(self, state):
-        return np.asarray(state)[..., :2], np.asarray(state)[..., 2:]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.solvers.control_rates import bounding_cost, feedback
+from models import arm
 
 SIZES = [(2, 1), (2, 2)]  # states and controls
 
@@ -322,19 +323,11 @@ class TestReplans:
             assert np.abs(live.step([0.5, 2.0], 0.05) - first).max() <= 4.0 * 0.05 + 1e-12
 
 
-ARM = """<mujoco>
-  <option timestep="0.01" integrator="implicitfast"/>
-  <compiler autolimits="true"/>
-  <worldbody>
-    <geom name="post" type="sphere" size="0.05" pos="0.45 0 -0.2"/>
-    <body name="link">
-      <joint name="elbow" axis="0 1 0" damping="0.5"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.5"/>
-      <site name="tip" pos="0.3 0 0"/>
-    </body>
-  </worldbody>
-  <actuator><position name="servo" joint="elbow" kp="40" forcerange="-6 6" ctrlrange="-3 3"/></actuator>
-</mujoco>"""
+ARM = arm(
+    0.3, names=["elbow"], end='<site name="tip" pos="0.3 0 0"/>', geom='size="0.02" mass="0.5"',
+    actuators='<position name="servo" joint="elbow" kp="40" forcerange="-6 6" ctrlrange="-3 3"/>',
+    things='<geom name="post" type="sphere" size="0.05" pos="0.45 0 -0.2"/>',
+)  # fmt: skip
 
 
 def test_an_arm_from_an_mjcf(tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.study import Campaign
+from models import Jointed
 
 ARM = """<mujoco>
   <option timestep="0.01"/>
@@ -71,20 +72,6 @@ CART_POLE = """<mujoco>
   </worldbody>
   <actuator><motor name="push" joint="slide" ctrlrange="-20 20"/></actuator>
 </mujoco>"""
-
-
-class Jointed(Robot):
-    """A robot whose states are its joints' positions and speeds, and none of them a position in the world."""
-
-    radius = 0.1
-
-    def state(self, qpos, qvel, near=None):
-        state = np.concatenate([qpos, qvel], axis=-1)
-        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
-
-    def configuration(self, state):
-        qpos, qvel = np.split(np.asarray(state, dtype=float), 2, axis=-1)
-        return qpos, qvel
 
 
 @dataclass(frozen=True)

@@ -13,25 +13,10 @@ from scipy.optimize import LinearConstraint, minimize
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.solvers.compiled import costs_of
+from models import arm, sled
 
 # Two links that a floor does not stop, with what is filled in as actuators.
-ARM = """
-<mujoco>
-  <option timestep="{timestep}" integrator="{integrator}"/>
-  <worldbody>
-    <body>
-      <joint name="a" axis="0 1 0" damping="0.2" armature="0.05" {joint}/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1" contype="0" conaffinity="0"/>
-      <body pos="0.3 0 0">
-        <joint name="b" axis="0 1 0" damping="0.2" armature="0.02"/>
-        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.5" contype="0" conaffinity="0"/>
-      </body>
-    </body>
-  </worldbody>
-  <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="-0.5"/></fixed></tendon>
-  <actuator>{actuators}</actuator>
-</mujoco>
-"""
+TENDON = """<tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="-0.5"/></fixed></tendon>"""
 SERVOS = """
 <position name="pa" joint="a" kp="{kp}" kv="{kv}" ctrlrange="-3 3" forcerange="-{most} {most}"/>
 <position name="pb" joint="b" kp="{kp}" kv="{kv}" ctrlrange="-3 3" forcerange="-{other} {other}"/>
@@ -42,7 +27,11 @@ def robot(
     folder: Path, actuators: str, *, timestep: float = 0.002, integrator: str = "implicitfast", joint: str = ""
 ) -> ls.MjcfRobot:
     path = folder / "arm.xml"
-    path.write_text(ARM.format(actuators=actuators, timestep=timestep, integrator=integrator, joint=joint))
+    path.write_text(arm(
+        0.3, 0.3, joint='axis="0 1 0" damping="0.2"', joints=(f'armature="0.05" {joint}', 'armature="0.02"'),
+        geoms=('mass="1"', 'size="0.02" mass="0.5"'), option=f'timestep="{timestep}" integrator="{integrator}"',
+        actuators=actuators, more=TENDON,
+    ))  # fmt: skip
     return ls.MjcfRobot(path)
 
 
@@ -152,17 +141,13 @@ def test_constraints_with_a_linear_file_are_those_of_a_quadratic_program(
 ) -> None:
     """A mass on a slide, moved by a motor: against SciPy's trust region on the controls alone, to 1e-5 of the cost."""
     path = tmp_path / "slide.xml"
-    path.write_text(
-        """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body><joint name="q" type="slide" axis="1 0 0"/>
-        <geom size="0.1" mass="2" contype="0" conaffinity="0"/></body></worldbody>
-        <actuator><motor name="m" joint="q" ctrlrange="-6 6"/></actuator></mujoco>"""
-    )
+    path.write_text(sled("x", geom='size="0.1" mass="2"', limits=[6], option='timestep="0.02" gravity="0 0 0"'))
     cart, steps, h = ls.MjcfRobot(path), 30, 0.04
     goal = 0.3
     problem = ls.Problem(
         dynamics=cart.dynamics, dt=h, steps=steps, initial=ls.FixedState([0.0, 0.0]), stage_cost=ls.ControlCost([0.05]),
         final_cost=ls.QuadraticCost([80.0, 20.0], about=[goal, 0.0]), control_limits=(-6.0, 6.0),
-        constraints=[ls.StateBounds(q=bounds[0], q_velocity=bounds[1]), ls.GoalState(q_velocity=0.0)],
+        constraints=[ls.StateBounds(x=bounds[0], x_velocity=bounds[1]), ls.GoalState(x_velocity=0.0)],
     )  # fmt: skip
     solution = ls.smooth(problem)
     assert solution.status is ls.Status.CONVERGED, solution.detail

@@ -15,6 +15,7 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from models import arm
 
 Make = Callable[[Array], ls.Problem]
 
@@ -153,7 +154,18 @@ def test_a_robot_from_an_mjcf(tmp_path: Path) -> None:
 
     def make(p: Array) -> ls.Problem:
         path = tmp_path / "arm.xml"
-        path.write_text(ARM.format(*p[:2]), encoding="utf-8")
+        path.write_text(
+            arm(
+                0.5,
+                0.4,
+                joint='axis="0 1 0" damping="0.5"',
+                joints=(f'damping="{p[1]}"', ""),
+                limits=(20, 8),
+                geoms=(f'mass="{p[0]}"', 'mass="0.2"'),
+                option='timestep="0.01" integrator="RK4"',
+            ),
+            encoding="utf-8",
+        )
         return ls.Problem(
             dynamics=ls.MjcfRobot(path).dynamics, dt=0.05, steps=15, initial=ls.FixedState([0.0] * 4),
             stage_cost=ls.ControlCost([0.01, 0.01], about=[0.0, 0.0]),
@@ -166,22 +178,6 @@ def test_a_robot_from_an_mjcf(tmp_path: Path) -> None:
     compare(ls.gradients(make, at, solution), along(make, at, solution, 1e-3, tolerance=1e-8), 1e-3)
     with pytest.raises(ls.InputError, match="curvature is NOT_CHECKED, want MINIMUM, or plan=False"):
         ls.gradients(make, at, solution, plan=True)
-
-
-ARM = """
-<mujoco>
-  <option timestep="0.01" integrator="RK4"/>
-  <worldbody>
-    <body><joint name="shoulder" axis="0 1 0" damping="{1}"/>
-      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.03" mass="{0}"/>
-      <body pos="0.5 0 0"><joint name="elbow" axis="0 1 0" damping="0.5"/>
-        <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="0.2"/></body></body>
-  </worldbody>
-  <actuator>
-    <motor joint="shoulder" ctrlrange="-20 20"/><motor joint="elbow" ctrlrange="-8 8"/>
-  </actuator>
-</mujoco>
-"""
 
 
 def near_point(p: Array, **changed: Any) -> ls.Problem:

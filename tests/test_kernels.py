@@ -108,6 +108,7 @@ from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.interior_point import InteriorPoint
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
+from models import FLOATING
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, Any] = {}  # types, hash of the IR, and returned type of what was compiled, by all that it depends on
@@ -844,18 +845,11 @@ X, U = np.array([0.45, 0.3, 0.2]), np.array([0.7, -0.2])
 SIZES = {"N": 3, "M": 2, "W": 5}
 
 
-FLOATING = """<mujoco>
-  <asset><mesh name="rock" vertex="0 0 .2  .1 0 0  0 .1 0  -.1 0 0  0 -.1 0  0 0 -.2"/></asset>
-  <worldbody>
-    <geom name="rock" type="mesh" mesh="rock" pos="0.9 0 0"/>
-    <geom name="plane" type="plane" size="1 1 1" pos="0 0 -0.6" euler="20 30 0"/>
-    <body name="hull"><freejoint/><geom size="0.1"/>
-      <body name="upper" pos="0.2 0 0"><joint type="ball"/><geom type="capsule" size="0.03" fromto="0.05 0 0 0.2 0 0"/>
-        <body name="fore" pos="0.25 0 0"><joint name="elbow" axis="0 1 0.3"/>
-          <geom type="box" size="0.08 0.03 0.03"/><site name="tip" pos="0.1 0 0" euler="0 20 0"/></body></body></body>
-  </worldbody>
-  <actuator><motor joint="elbow"/></actuator>
-</mujoco>"""
+SPACE = FLOATING.format(
+    things='<geom name="rock" type="mesh" mesh="rock" pos="0.9 0 0"/>'
+    '<geom name="plane" type="plane" size="1 1 1" pos="0 0 -0.6" euler="20 30 0"/>',
+    link='type="box" size="0.08 0.03 0.03"', more="", motors="",
+)  # fmt: skip
 
 
 def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
@@ -1154,7 +1148,7 @@ class TestParts:
     @pytest.mark.parametrize("touching", [True, *rarely(False)])
     def test_distances_and_sites_of_mujoco(self, touching: bool) -> None:
         """Of a robot with a free, a ball and a hinge joint, clear of a mesh and a plane or within them."""
-        scene, axis = scene_from_xml(FLOATING, "floating", obstacles=False), "y" if touching else None
+        scene, axis = scene_from_xml(SPACE, "floating", obstacles=False), "y" if touching else None
         robot = ls.MjcfRobot(scene, obstacles=("rock", "plane"), turns_about=axis)
         n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
         x, u, world = 0.3 * np.random.default_rng(0).normal(size=n), np.ones(m), robot.scene.world

@@ -12,6 +12,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.disturbances import MotorLag, Uncertainty, Unknown, preset
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
+from models import arm
 
 LAG = 0.25  # s: two and a half control periods
 SMALL = 1e-9  # so that no control comes to its limits, even in loops that are not stable
@@ -73,13 +74,10 @@ def test_without_its_lag_an_arm_stays_near_its_plan(pose: tuple[float, float]) -
 
 def held(shoulder: float, elbow: float) -> tuple[ls.MjcfRobot, ls.Solution, ls.Problem]:
     """An arm of two links, held still against gravity for a second."""
-    links = """<body><joint name="shoulder"/><geom type="capsule" fromto="0.1 0 0 0.4 0 0" mass="1"/>
-        <body pos="0.4 0 0"><joint name="elbow"/><geom type="capsule" fromto="0.08 0 0 0.35 0 0" mass="0.5"/>
-        </body></body>"""
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option timestep="0.01" integrator="implicitfast"/>
-        <default><joint axis="0 -1 0" damping="0.5" armature="0.02"/><geom size="0.03"/></default>
-        <worldbody>{links}</worldbody><actuator><motor name="shoulder" joint="shoulder" ctrlrange="-20 20"/>
-        <motor name="elbow" joint="elbow" ctrlrange="-8 8"/></actuator></mujoco>""", "two_links"))  # fmt: skip
+    xml = arm(
+        0.4, 0.35, names=("shoulder", "elbow"), joint='axis="0 -1 0" damping="0.5" armature="0.02"', limits=(20, 8)
+    )
+    robot = ls.MjcfRobot(scene_from_xml(xml, "two_links"))
     state, steps, dt = robot.at(shoulder=shoulder, elbow=elbow), 50, 0.02
     plan = ls.Trajectory(np.tile(state, (steps + 1, 1)), np.tile(robot.hold(state), (steps, 1)), dt)
     policy = ls.AffinePolicy(
@@ -128,9 +126,7 @@ ACTUATORS: Sequence[tuple[str, bool]] = (
 @pytest.mark.parametrize(("actuator", "own"), ACTUATORS, ids=[one for one, _ in ACTUATORS])
 def test_presets_have_no_second_lag(actuator: str, own: bool) -> None:
     """A robot whose actuators have states has their lag in its own model."""
-    xml = f"""<mujoco><worldbody><body><joint name="turn" damping="0.1"/>
-        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" contype="0" conaffinity="0"/></body></worldbody>
-        <actuator>{actuator} joint="turn" ctrlrange="-1 1"/></actuator></mujoco>"""
+    xml = arm(0.3, names=["turn"], actuators=f'{actuator} joint="turn" ctrlrange="-1 1"/>')
     robot = ls.MjcfRobot(scene_from_xml(xml, "turn"))
     plant = ls.Plant(robot, robot.scene)
     assert bool(robot.activations) == own

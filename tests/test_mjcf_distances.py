@@ -16,6 +16,7 @@ import lqrsim as ls
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.scenes.scene import scene_from_xml
+from models import sled
 
 SHAPES = {
     "sphere": 'size="0.08"', "capsule": 'size="0.04 0.1"', "cylinder": 'size="0.06 0.08"',
@@ -134,11 +135,10 @@ def test_obstacles_that_move_and_are_in_no_mjcf(other: str, seed: int) -> None:
     assert shape.world.names == world.names
 
 
-SLED = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
-  <geom name="wall" type="box" size="0.1 1 1" pos="9 0 0"/>
-  <body name="sled"><joint name="x" type="slide" axis="1 0 0"/>
-    <geom name="front" type="box" size="0.2 0.2 0.2" mass="1"/></body></worldbody>
-  <actuator><motor name="push" joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+SLED = sled(
+    geom='type="box" size="0.2 0.2 0.2" mass="1"', limits=[1],
+    things='<geom name="wall" type="box" size="0.1 1 1" pos="9 0 0"/>',
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_a_robot_from_an_mjcf_meets_what_comes_toward_it(
     np.testing.assert_allclose(run.clearance[0, before], (gap - speed * knots)[before], rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize(("name", "kind"), [("wall", "sphere"), ("front", "sphere"), ("new", "mesh")])
+@pytest.mark.parametrize(("name", "kind"), [("wall", "sphere"), ("sled", "sphere"), ("new", "mesh")])
 def test_obstacles_that_cannot_move_about_a_robot_from_an_mjcf_are_refused(name: str, kind: str) -> None:
     robot = ls.MjcfRobot(scene_from_xml(SLED, "sled"))
     plan = track(robot, np.zeros(2), np.zeros((2, 1)), 0.05, feedback=False)

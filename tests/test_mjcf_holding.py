@@ -16,10 +16,10 @@ import lqrsim as ls
 from lqrsim.errors import InputError
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import scene_from_xml
+from models import NO_CONTACT, arm
 
 STAYS = 1e-4  # rad or m within which a held robot stays for 2 s
 MORE = 1.02  # ratio of the norms of what two searches leave, of which the larger is no least
-NO_CONTACT = 'contype="0" conaffinity="0"'
 
 
 def outcome(seed: int) -> tuple[str, str]:
@@ -94,10 +94,11 @@ def test_a_thousand_robots_of_all_actuators() -> None:
 
 def pendulum(actuators: str, joint: str = "", more: str = "") -> str:
     """A link in gravity about the y axis, of 0.5 kg and 0.3 m, with these actuators."""
-    return f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><compiler autolimits="true"/><worldbody>
-      <body name="link"><joint name="turn" axis="0 1 0" damping="0.1" {joint}/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.5" {NO_CONTACT}/></body></worldbody>
-      <actuator>{actuators}</actuator>{more}</mujoco>"""
+    option, hinge = 'timestep="0.002" integrator="implicitfast"', 'axis="0 1 0" damping="0.1"'
+    geom = f'size="0.02" mass="0.5" {NO_CONTACT}'
+    return arm(
+        0.3, names=["turn"], joint=hinge, joints=[joint], geom=geom, actuators=actuators, option=option, more=more
+    )
 
 
 WEIGHT = 0.5 * 9.81 * 0.15  # N m, of the level link

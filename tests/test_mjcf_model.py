@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+import models
 from lqrsim.scenes.mjcf_model import MjcfModel
 
-ARM = """<mujoco model="arm"><option timestep="0.01" integrator="implicitfast"/>
-  <worldbody><geom type="plane" size="2 2 .1"/><geom type="sphere" size=".1" pos="0 2 .5"/>
-    <body pos="0 0 1"><joint name="turn" axis="0 1 0" damping="1"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body>
-  </worldbody><actuator><motor joint="turn" ctrlrange="-5 5"/></actuator></mujoco>"""
+THINGS = '<geom type="plane" size="2 2 .1"/><geom type="sphere" size=".1" pos="0 2 .5"/>'
+ARM = models.arm(0.3, names=["turn"], place="0 0 1", limits=[5], things=THINGS)
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from lqrsim.machine import processors
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenes.scene import scene_from_xml
+from models import arm, motors
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -571,15 +572,11 @@ def test_tumbling_costs_a_free_body_and_nothing_what_it_handles() -> None:
 
 def over_floor(rng: np.random.Generator) -> str:
     """An arm of three hinges, lengths drawn, that can strike the floor and itself."""
-    upper, fore, hand = rng.uniform(0.25, 0.45, 3)
-    return f"""<mujoco model="arm"><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
-      <default><joint axis="0 -1 0" damping="0.3" armature="0.02"/></default><worldbody>
-      <geom name="floor" type="plane" size="3 3 0.1"/><body name="upper" pos="0 0 0.3"><joint name="a"/>
-      <geom type="capsule" fromto="0.08 0 0 {upper} 0 0" size="0.04" mass="3"/><body name="fore" pos="{upper} 0 0">
-      <joint name="b"/><geom type="capsule" fromto="0.1 0 0 {fore} 0 0" size="0.035" mass="2"/>
-      <body name="hand" pos="{fore} 0 0"><joint name="c"/>
-      <geom type="capsule" fromto="0.1 0 0 {hand} 0 0" size="0.03" mass="1"/></body></body></body></worldbody>
-      <actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/></actuator></mujoco>"""
+    return arm(
+        *rng.uniform(0.25, 0.45, 3), joint='axis="0 -1 0" damping="0.3" armature="0.02"', geom='size="0.035"', gap=0.1,
+        geoms=('mass="3"', 'mass="2"', 'mass="1"'), place="0 0 0.3",
+        things='<geom name="floor" type="plane" size="3 3 0.1"/>',
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", [3, 8, 11, 13])
@@ -611,8 +608,8 @@ def test_an_arm_that_swings_onto_the_floor_at_first_follows_a_line_of_states(see
 def test_an_arm_that_is_to_stay_where_it_is_has_nothing_to_do(seed: int) -> None:
     """The least cost is zero; by MuJoCo's rounding, that of the arm's friction included, the plan's is about 1e-20."""
     rng = np.random.default_rng(seed)
-    friction = f'<default><joint frictionloss="{rng.uniform(0, 0.1)}"/></default>' if rng.random() < 0.5 else ""
-    xml = over_floor(rng).replace("<worldbody>", f"{friction}<worldbody>", 1)
+    friction = f'frictionloss="{rng.uniform(0, 0.1)}" ' if rng.random() < 0.5 else ""
+    xml = over_floor(rng).replace("<joint ", f"<joint {friction}", 1)
     robot = ls.MjcfRobot(scene_from_xml(xml, "arm"), obstacles=False)
     state = robot.at(a=rng.uniform(1.0, 2.0), b=rng.uniform(-0.5, 0.5), c=rng.uniform(-0.5, 0.5))
     solution = ls.smooth(robot.problem(state, state, steps=50, dt=0.02), threads=1)
@@ -1012,13 +1009,15 @@ def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
 
 def elbow(gear: float, least: float, *, collides: int = 0) -> ls.MjcfRobot:
     """Two links on a fixed base, in a level plane; the second joint has limits. The first link overlaps the base."""
-    link = f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1" contype="{collides}" conaffinity="1"/>'
-    return ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true" angle="radian"/>
-      <option timestep="0.005"/><worldbody><body name="base"><geom size="0.05" contype="{collides}" conaffinity="1"/>
-      <body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}<body name="fore" pos="0.4 0 0">
-      <joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}</body></body></body></worldbody><actuator>
-      <motor joint="a" gear="10" ctrlrange="-1 1"/><motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>
-      """, "arm"))  # fmt: skip
+    touching = f'contype="{collides}" conaffinity="1"'
+    links = arm(
+        0.4, 0.4, joint='axis="0 0 1" damping="0.05"', joints=("", f'range="{least} 2"'), option='timestep="0.005"',
+        geom=f'size="0.03" mass="1" {touching}',
+        actuators=motors("ab", (1, 1)).replace('"a" ', '"a" gear="10" ', 1).replace('"b" ', f'"b" gear="{gear}" ', 1),
+    )  # fmt: skip
+    base = f'<body name="base"><geom size="0.05" {touching}/>'
+    xml = links.replace("<worldbody>", f"<worldbody>{base}").replace("</worldbody>", "</body></worldbody>")
+    return ls.MjcfRobot(scene_from_xml(xml, "arm"))
 
 
 @pytest.mark.parametrize("turn", [1.0, 1.5, 2.0])

@@ -13,6 +13,7 @@ from lqrsim.errors import InputError
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
+from models import sled
 
 
 @pytest.fixture
@@ -53,11 +54,9 @@ def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
     assert not ls.scenarios.mjcf(str(file), start={"z": 1.0}, obstacles=False).problem.obstacle_costs
 
 
-SLIDER = """<mujoco><option gravity="0 0 0"/><worldbody>
-  <geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/>
-  <body name="slider"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
-    <geom name="slider" type="box" size="0.1 0.1 0.1"/></body></worldbody>
-  <actuator><motor name="x" joint="x"/><motor name="z" joint="z"/></actuator></mujoco>"""
+SLIDER = sled(
+    "xz", geom='type="box" size="0.1 0.1 0.1"', things='<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/>'
+)
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.02, 0.3])

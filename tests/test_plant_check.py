@@ -14,12 +14,13 @@ from tracking import track, weave
 
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
+from models import Jointed
 
 MASS, LENGTH, GRAVITY = 0.4, 0.5, 9.81
 
 
 @dataclass(frozen=True)
-class Arm(ls.Robot):
+class Arm(Jointed):
     """A rod that a motor swings, with a ball at its end: nothing of it is a position."""
 
     radius: float = 0.1
@@ -45,12 +46,6 @@ class Arm(ls.Robot):
             angles=("angle",),
             control_limits=(-3, 3),
         )
-
-    def state(self, qpos, qvel, near=None):
-        return np.concatenate([qpos, qvel], axis=-1)
-
-    def configuration(self, state):
-        return np.asarray(state)[..., :1], np.asarray(state)[..., 1:]
 
 
 def arm(things: str) -> ls.Scene:

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
+import models
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
+from models import FLOATING
 
 NEAR = 1e-6  # m, MuJoCo's own tolerance of distances; ours is less
 
@@ -36,16 +38,7 @@ def contacts(robot: ls.MjcfRobot, states: Array) -> int:
     return count
 
 
-FLOATING = """<mujoco>
-  <asset><mesh name="rock" vertex="0 0 .1  .1 0 0  0 .1 0  -.1 0 0  0 -.1 0  0 0 -.1"/></asset>
-  <worldbody>
-    <body name="hull"><freejoint/><geom size="0.1"/>
-      <body name="upper" pos="0.2 0 0"><joint type="ball"/><geom type="capsule" size="0.03" fromto="0.05 0 0 0.2 0 0"/>
-        <body name="fore" pos="0.25 0 0"><joint name="elbow" axis="0 1 0.3"/><geom type="{kind}" {size}/></body></body>
-      <body name="tail" pos="-0.2 0 0.1"><joint name="wag" axis="0 0 1"/><geom type="mesh" mesh="rock"/></body></body>
-  </worldbody>
-  <actuator><motor joint="elbow"/><motor joint="wag"/></actuator>
-</mujoco>"""
+TAIL = """<body name="tail" pos="-0.2 0 0.1"><joint name="wag" axis="0 0 1"/><geom type="mesh" mesh="rock"/></body>"""
 KINDS = {"box": 'size="0.08 0.03 0.03"', "ellipsoid": 'size="0.08 0.04 0.03"', "mesh": 'mesh="rock"'}
 
 
@@ -54,7 +47,8 @@ KINDS = {"box": 'size="0.08 0.03 0.03"', "ellipsoid": 'size="0.08 0.04 0.03"', "
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_are_mujocos_and_slopes_those_of_differences(kind: str, seed: int) -> None:
     """With a free and a ball joint: both links move, and in other coordinates than MuJoCo's."""
-    robot = ls.MjcfRobot(scene_from_xml(FLOATING.format(kind=kind, size=KINDS[kind]), "floating"))
+    xml = FLOATING.format(things="", link=f'type="{kind}" {KINDS[kind]}', more=TAIL, motors='<motor joint="wag"/>')
+    robot = ls.MjcfRobot(scene_from_xml(xml, "floating"))
     rng, n = np.random.default_rng(seed), len(robot.dynamics.state_coordinates)
     state = robot.at() + np.concatenate([rng.normal(0, 0.5, n // 2), np.zeros(n // 2)])
     kept = robot.self_clearance(1.0)
@@ -110,27 +104,19 @@ def test_links_are_those_that_mujoco_lets_collide(seed: int) -> None:
             robot.self_clearance()
 
 
-ARM = """<mujoco>
-  <option gravity="0 0 0" timestep="0.01" integrator="implicitfast"/>
-  <default><geom type="capsule" size="0.02" mass="0.5"/><joint axis="0 0 1" damping="0.1"/></default>
-  <worldbody>
-    <body name="base">{base}
-      <body name="upper"><joint name="shoulder"/><geom fromto="0.05 0 0 0.3 0 0"/>
-        <body name="fore" pos="0.35 0 0"><joint name="elbow"/><geom fromto="0.05 0 0 0.25 0 0"/>
-          <body name="hand" pos="0.3 0 0"><joint name="wrist"/><geom fromto="0.05 0 0 0.22 0 0"/></body>
-        </body>
-      </body>
-    </body>
-    {things}
-  </worldbody>
-  <actuator><motor joint="shoulder"/><motor joint="elbow"/><motor joint="wrist"/></actuator>
-</mujoco>"""
 # Elbow and wrist at the start and at the goal: the hand points past the upper arm on one side, then on the other.
 THROUGH = [((2.58, 3.49), (1.94, 2.18)), ((2.38, 1.6), (2.06, 3.36)), ((2.12, 1.38), (2.38, 3.31))]
 
 
 def arm(base: str = "", things: str = "") -> ls.MjcfRobot:
-    return ls.MjcfRobot(scene_from_xml(ARM.format(base=base, things=things), "arm"))
+    links = models.arm(
+        0.35, 0.3, 0.22, names=("shoulder", "elbow", "wrist"), joint='axis="0 0 1" damping="0.1"',
+        geom='size="0.02" mass="0.5"', gap=0.05, option='gravity="0 0 0" timestep="0.01" integrator="implicitfast"',
+    )  # fmt: skip
+    whole = links.replace("<worldbody>", f'<worldbody><body name="base">{base}').replace(
+        "</worldbody>", f"</body>{things}</worldbody>"
+    )
+    return ls.MjcfRobot(scene_from_xml(whole, "arm"))
 
 
 def test_links_keep_clear_of_their_base_but_not_of_what_they_handle() -> None:

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 import lqrsim as ls
+from models import Jointed
 
 LENGTH, RADIUS, HEIGHT = 0.4, 0.03, 0.1  # m, of each link, and where the plane is
 INERTIA, DAMPING = 0.05, 0.5  # kg m^2, of each joint's motor, which is most of what moves; N m s
@@ -31,7 +30,7 @@ def places(x, p):
 
 
 @dataclass(frozen=True)
-class PlanarArm(ls.Robot):
+class PlanarArm(Jointed):
     """Speeds are commanded: each joint follows its own, so that the dynamics are linear and the geometry is not."""
 
     radius: float = 0.3  # m, how large pictures take it to be
@@ -59,14 +58,6 @@ class PlanarArm(ls.Robot):
     def balls(self) -> ls.CollisionSpheres:  # pyright: ignore[reportIncompatibleVariableOverride]
         sites = [None] * (LINK.count - 1)
         return ls.CollisionSpheres(places, 3 * LINK.radii, sites=[*sites, "end 0", *sites, "end 1", *sites, "end 2"])
-
-    def state(self, qpos, qvel, near=None):
-        state = np.concatenate([qpos, qvel], axis=-1)
-        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
-
-    def configuration(self, state):
-        state = np.asarray(state)
-        return state[..., :3], state[..., 3:]
 
     @staticmethod
     def scene(folder: Path, things: str = POSTS) -> ls.Scene:

@@ -7,13 +7,14 @@ import numpy as np
 from oracle.planar_quadrotor import ARM, DRAG, INERTIA, MASS, rate
 
 import lqrsim as ls
+from models import Jointed
 
 GRAVITY = 9.8  # m/s^2, as MuJoCo's models here have it
 BLOCK = '<geom name="block" type="box" size="0.15 0.4 0.8" pos="0 0.1 0.2"/>'
 
 
 @dataclass(frozen=True)
-class PlanarQuadrotor(ls.Robot):
+class PlanarQuadrotor(Jointed):
     """State: place, roll about the normal and their rates. Control: two rotors' forces in N."""
 
     plane: str = ""  # as `Dynamics` takes it
@@ -40,14 +41,6 @@ class PlanarQuadrotor(ls.Robot):
             angles=("roll",),
             control_limits=(0.0, 6.0),
         )
-
-    def state(self, qpos, qvel, near=None):
-        state = np.concatenate([qpos, qvel], axis=-1)
-        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
-
-    def configuration(self, state):
-        state = np.asarray(state)
-        return state[..., :3], state[..., 3:]
 
 
 def mjcf(things: str = BLOCK, *, level: str = "x", y: float = 0.0, before: str = "", flags: str = "") -> str:

@@ -5,14 +5,13 @@ RK4 is exact under a constant force, so that of a control period is exactly the 
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from linear_plans import by_hand
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from models import Jointed
 
 DT, STEPS = 0.1, 20
 STIFFNESS, DAMPING = 0.3, 0.4  # so weak that much is left at the end
@@ -35,7 +34,7 @@ MJCF = """
 
 
 @dataclass(frozen=True)
-class Puck(ls.Robot):
+class Puck(Jointed):
     radius: float = RADIUS
 
     name = "puck"
@@ -50,13 +49,6 @@ class Puck(ls.Robot):
             states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"push_x": "N", "push_y": "N"},
             position=("x", "y"),
         )  # fmt: skip
-
-    def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: Any = None) -> Array:
-        return np.concatenate([qpos, qvel], axis=-1)
-
-    def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        state = np.asarray(state)
-        return state[..., :2], state[..., 2:]
 
 
 def plant(folder: Path, *, wall: float | None = None) -> ls.Plant:
