@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_plans import DT, Linear, linear
+from mechanisms import arm
 from sampling import examples, rarely
 from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.solvers.control_rates import bounding_cost, feedback
-from models import arm
 
 SIZES = [(2, 1), (2, 2)]  # states and controls
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import Jointed
 from sampling import examples
 from sympy import cos, sin
 from tracking import hover, track
@@ -42,7 +43,6 @@ from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.study import Campaign
-from models import Jointed
 
 ARM = """<mujoco>
   <option timestep="0.01"/>

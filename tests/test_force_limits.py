@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import arm, sled
 from sampling import examples
 from scipy.optimize import LinearConstraint, minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.solvers.compiled import costs_of
-from models import arm, sled
 
 # Two links that a floor does not stop, with what is filled in as actuators.
 TENDON = """<tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="-0.5"/></fixed></tendon>"""

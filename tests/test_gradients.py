@@ -10,12 +10,12 @@ import point_mass
 import pytest
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
+from mechanisms import arm
 from numpy.typing import NDArray
 from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from models import arm
 
 Make = Callable[[Array], ls.Problem]
 

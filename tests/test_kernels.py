@@ -21,6 +21,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_plans import linear
+from mechanisms import FLOATING
 from sampling import examples, is_short, rarely
 
 import lqrsim as ls
@@ -108,7 +109,6 @@ from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.interior_point import InteriorPoint
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
-from models import FLOATING
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, Any] = {}  # types, hash of the IR, and returned type of what was compiled, by all that it depends on

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from linear_plans import DT, Linear, by_hand, linear
+from mechanisms import arm
 
 import lqrsim as ls
 from lqrsim.control.linear_loop import LinearLoop
@@ -12,7 +13,6 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.disturbances import MotorLag, Uncertainty, Unknown, preset
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
-from models import arm
 
 LAG = 0.25  # s: two and a half control periods
 SMALL = 1e-9  # so that no control comes to its limits, even in loops that are not stable

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from mechanisms import sled
 from sampling import examples, rarely
 from tracking import track
 
@@ -16,7 +17,6 @@ import lqrsim as ls
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.scenes.scene import scene_from_xml
-from models import sled
 
 SHAPES = {
     "sphere": 'size="0.08"', "capsule": 'size="0.04 0.1"', "cylinder": 'size="0.06 0.08"',

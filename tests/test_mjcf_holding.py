@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 from actuated import Rest, draw
+from mechanisms import NO_CONTACT, arm
 
 import lqrsim as ls
 from lqrsim.errors import InputError
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import scene_from_xml
-from models import NO_CONTACT, arm
 
 STAYS = 1e-4  # rad or m within which a held robot stays for 2 s
 MORE = 1.02  # ratio of the norms of what two searches leave, of which the larger is no least

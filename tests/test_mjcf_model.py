@@ -5,16 +5,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import mechanisms
 import mujoco
 import numpy as np
 import pytest
 
 import lqrsim as ls
-import models
 from lqrsim.scenes.mjcf_model import MjcfModel
 
 THINGS = '<geom type="plane" size="2 2 .1"/><geom type="sphere" size=".1" pos="0 2 .5"/>'
-ARM = models.arm(0.3, names=["turn"], place="0 0 1", limits=[5], things=THINGS)
+ARM = mechanisms.arm(0.3, names=["turn"], place="0 0 1", limits=[5], things=THINGS)
 
 
 @contextmanager

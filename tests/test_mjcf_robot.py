@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import arm, motors
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -26,7 +27,6 @@ from lqrsim.machine import processors
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenes.scene import scene_from_xml
-from models import arm, motors
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import mjcf_files
 import numpy as np
 import pytest
+from mechanisms import sled
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -13,7 +14,6 @@ from lqrsim.errors import InputError
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
-from models import sled
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import Jointed
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 from sampling import examples
 from tracking import track, weave
 
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
-from models import Jointed
 
 MASS, LENGTH, GRAVITY = 0.4, 0.5, 9.81
 

@@ -2,18 +2,18 @@
 
 import itertools
 
+import mechanisms
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import FLOATING
 from sampling import examples
 
 import lqrsim as ls
-import models
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
-from models import FLOATING
 
 NEAR = 1e-6  # m, MuJoCo's own tolerance of distances; ours is less
 
@@ -109,7 +109,7 @@ THROUGH = [((2.58, 3.49), (1.94, 2.18)), ((2.38, 1.6), (2.06, 3.36)), ((2.12, 1.
 
 
 def arm(base: str = "", things: str = "") -> ls.MjcfRobot:
-    links = models.arm(
+    links = mechanisms.arm(
         0.35, 0.3, 0.22, names=("shoulder", "elbow", "wrist"), joint='axis="0 0 1" damping="0.1"',
         geom='size="0.02" mass="0.5"', gap=0.05, option='gravity="0 0 0" timestep="0.01" integrator="implicitfast"',
     )  # fmt: skip

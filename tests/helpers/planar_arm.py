@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from mechanisms import Jointed
+
 import lqrsim as ls
-from models import Jointed
 
 LENGTH, RADIUS, HEIGHT = 0.4, 0.03, 0.1  # m, of each link, and where the plane is
 INERTIA, DAMPING = 0.05, 0.5  # kg m^2, of each joint's motor, which is most of what moves; N m s

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from mechanisms import Jointed
 from oracle.planar_quadrotor import ARM, DRAG, INERTIA, MASS, rate
 
 import lqrsim as ls
-from models import Jointed
 
 GRAVITY = 9.8  # m/s^2, as MuJoCo's models here have it
 BLOCK = '<geom name="block" type="box" size="0.15 0.4 0.8" pos="0 0.1 0.2"/>'

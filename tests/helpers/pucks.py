@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from linear_plans import by_hand
+from mechanisms import Jointed
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from models import Jointed
 
 DT, STEPS = 0.1, 20
 STIFFNESS, DAMPING = 0.3, 0.4  # so weak that much is left at the end
