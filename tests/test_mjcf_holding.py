@@ -120,11 +120,18 @@ def test_too_weak_an_actuator_is_short_by_what_its_limit_leaves(joint: str, actu
     assert robot._held(robot.at()).missed == pytest.approx([-(WEIGHT - 0.4)], rel=1e-6)
 
 
-def test_a_robot_above_its_ground_is_told_how_to_stand_on_it() -> None:
+@pytest.mark.parametrize(
+    "joints",
+    [
+        "<freejoint/>",
+        '<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><joint axis="0 1 0"/>',
+    ],
+)
+def test_a_robot_above_its_ground_is_told_how_to_stand_on_it(joints: str) -> None:
     robot = ls.MjcfRobot(
         scene_from_xml(
-            """<mujoco><worldbody><geom type="plane" size="5 5 1"/>
-            <body name="base" pos="0 0 0.15"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="2"/>
+            f"""<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+            <body name="base" pos="0 0 0.15">{joints}<geom type="box" size="0.1 0.1 0.1" mass="2"/>
             <body><joint name="arm" axis="0 0 1"/><geom pos="0.2 0 0.1" size="0.02" mass="0.1"/></body></body>
             </worldbody><actuator><motor joint="arm"/></actuator></mujoco>""",
             "cart",

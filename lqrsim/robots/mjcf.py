@@ -36,7 +36,7 @@ from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms, SelfClearance
 from lqrsim.rotations import AXES
-from lqrsim.scenes.mjcf_holding import Holding, at_rest, efforts, holding
+from lqrsim.scenes.mjcf_holding import Holding, at_rest, efforts, falling, holding
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
@@ -439,8 +439,10 @@ class MjcfRobot(Robot):
         shortfall = "".join(f"; {drifting}" for drifting in self._drifting(held))
         if not held.held and not shortfall:
             shortfall = f"; {space.names[worst]} is not held: {abs(held.missed[worst]):.3g} {unit} are missing"
-            if any(joint.kind == "free" and joint.dof <= worst < joint.dof + 6 for joint in self.mjcf.joints):
-                shortfall += "; what stands on the ground starts from robot.at_rest(robot.at())"
+            model, driven = self.dynamics.physics.model, {actuator.joint for actuator in self.mjcf.actuators}
+            falls = falling(model, self.configuration(self.at())[0])
+            if model.dof_jntid[worst] in falls and self.mjcf.joints[model.dof_jntid[worst]].name not in driven:
+                shortfall += "; what stands on the ground starts from robot.at_rest(robot.at()), on the command line with at_rest=True"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",

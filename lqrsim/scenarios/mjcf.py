@@ -34,6 +34,7 @@ def mjcf(
     steps: int = 150,
     body: str | None = None,
     floors: bool = True,
+    at_rest: bool = False,
     turns_about: str | None = None,
     obstacles: bool | Sequence[str] = True,
     clearance: float | None = None,
@@ -57,6 +58,7 @@ def mjcf(
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; see
         `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.
+      at_rest: whether start and goal are moved to where contacts carry the robot, as by `MjcfRobot.at_rest`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       clearance: least distance to obstacles in metres, as in `MjcfRobot.problem`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
@@ -71,6 +73,8 @@ def mjcf(
         robot = robot.with_parameters(**parameters)
     space, controls = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
     begin, end = _state(robot, "start", start), _state(robot, "goal", goal)
+    if at_rest:
+        begin, end = robot.at_rest(begin), robot.at_rest(end)
     if np.array_equal(begin, end):
         _log.warning(
             "%s: start and goal are the same, so there is nothing to do; say one by name, as goal={'%s': 0.1}",

@@ -28,6 +28,7 @@ _NEAR = 0.1  # 1 / (1 + square) of a right one
 _END = 1e-9  # relative distance from the end of its range within which an activation is there
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
+_VERTICAL = 1 - 1e-6  # least part of a slide's axis along gravity, of one by which a base is let down
 _FALLS = 200  # heights at which a body that is let down may touch: thinner supports are not found
 
 
@@ -442,12 +443,12 @@ def _integrals(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
 def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
-    A free body that touches nothing is let down first. Then Newton's method with steps of least norm: contacts are
-    springs, and nothing moves in a free direction, such as along a floor.
+    A base that touches nothing is let down first. Then Newton's method with steps of least norm: contacts are springs,
+    and nothing moves in a free direction, such as along a floor.
     """
-    qpos = _let_down(model, qpos)
     data, actuators = mujoco.MjData(model), _AtRest(mjcf, model, qpos)
-    free = np.flatnonzero(~actuators.driven(actuators.linear(actuators.neutral)))
+    driven = actuators.driven(actuators.linear(actuators.neutral))
+    qpos, free = _let_down(model, qpos, driven), np.flatnonzero(~driven)
     if not len(free):
         return qpos.copy(), 0.0
 
@@ -474,14 +475,29 @@ def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
     return positions, float(np.abs(forces).max(initial=0.0))
 
 
-def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
-    """Positions (nq,) in which each free body that touches nothing is lower along gravity, if it touches something
-    there, within the size of the model.
-    """
-    data, lowered = mujoco.MjData(model), qpos.copy()
-    down, most = model.opt.gravity / max(float(np.linalg.norm(model.opt.gravity)), mujoco.mjMINVAL), model.stat.extent
+def falling(model: mujoco.MjModel, qpos: Array) -> dict[int, Array | float]:
+    """The joints by which bases fall, free joints and vertical slides, each with what it moves for a metre down."""
+    data, gravity = mujoco.MjData(model), model.opt.gravity
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    down = gravity / max(float(np.linalg.norm(gravity)), mujoco.mjMINVAL)
+    falls = dict[int, Array | float]()
+    for joint in np.flatnonzero(model.body_parentid[model.jnt_bodyid] == 0).tolist():
+        along = float(data.xaxis[joint] @ down)
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            falls[joint] = down
+        elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and abs(along) > _VERTICAL:
+            falls[joint] = along
+    return falls
 
-    def touches(joint: int, fall: float) -> bool:
+
+def _let_down(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) -> Array:
+    """Positions (nq,) in which each base that touches nothing is lower along gravity, if it touches something there,
+    within the size of the model.
+    """
+    data, lowered, most = mujoco.MjData(model), qpos.copy(), model.stat.extent
+
+    def touches(joint: int, down: Array | float, fall: float) -> bool:
         data.qpos[:] = lowered
         data.joint(joint).qpos[:3] += fall * down
         mujoco.mj_kinematics(model, data)
@@ -490,15 +506,17 @@ def _let_down(model: mujoco.MjModel, qpos: Array) -> Array:
         of_body = (roots == model.body_rootid[model.jnt_bodyid[joint]]).any(axis=1)
         return bool((of_body & (data.contact.dist <= 0)).any())
 
-    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist():
-        falls = np.linspace(0, most, _FALLS)
-        first = next((k for k, fall in enumerate(falls) if touches(joint, fall)), 0)
+    falls = np.linspace(0, most, _FALLS)
+    for joint, down in falling(model, qpos).items():
+        if driven[model.jnt_dofadr[joint]]:
+            continue
+        first = next((k for k, fall in enumerate(falls) if touches(joint, down, fall)), 0)
         if first:
             low, high = falls[first - 1], falls[first]
             while high - low > _SMALL * most:
                 middle = 0.5 * (low + high)
-                low, high = (low, middle) if touches(joint, middle) else (middle, high)
-            touches(joint, high)
+                low, high = (low, middle) if touches(joint, down, middle) else (middle, high)
+            touches(joint, down, high)
             lowered = data.qpos.copy()
     return lowered
 

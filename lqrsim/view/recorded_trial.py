@@ -79,6 +79,7 @@ class RecordedTrial:
             mujoco.mj_integratePos(self.model, data.qpos, motion, float(np.clip((time - start) / (end - start), 0, 1)))
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
+        mujoco.mj_tendon(self.model, data)
         mujoco.mj_camlight(self.model, data)
 
     def driven(self, at: Array | float) -> Array:

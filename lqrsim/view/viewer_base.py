@@ -103,6 +103,7 @@ class Viewer(abc.ABC):
         self._time, self.data.time, self.data.qpos[:] = time, time, qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
         place = place_of(self.data, self.robot, self._balls).copy()
         if begins:
             self._trace.clear()
