@@ -124,7 +124,7 @@ def test_late_and_lost_readings_are_taken_at_their_time(delay: int) -> None:
     problem = ls.Problem(
         dynamics=of, dt=DT, steps=steps, initial=ls.FixedState(of.state([1.0, -0.5], START[:2, :2])),
         stage_cost=ls.QuadraticCost({"x": 2.0, "v": 1.0}, about={}) + ls.ControlCost([0.5, 0.3]),
-        final_cost=ls.QuadraticCost({"x": 2.0}, about={}),
+        final_cost=ls.QuadraticCost({"x": 2.0}, about={}), noise=of.innovations,
     )  # fmt: skip
     plan = ls.smooth(problem)
     run = ls.belief.BeliefFeedback(problem, plan).start(trials)

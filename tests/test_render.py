@@ -260,9 +260,6 @@ def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> 
     video = decode(render(flight, tmp_path / "run.mp4", quality="draft", size=(480, 270), fps=3))
     assert len(video) == len(frames)
     assert max(np.abs(one - other).mean() for one, other in zip(frames, video, strict=True)) < 4
-    with Image.open(render(flight, tmp_path / "again.gif", quality="draft", fps=3)) as image:
-        again = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(image)]
-    assert max(np.abs(one - other).mean() for one, other in zip(frames, again, strict=True)) < 0.5  # not bits: OpenGL
 
 
 @draws
@@ -364,7 +361,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
 
     def shown(*overlays: Overlay) -> np.ndarray:
-        options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
+        options: dict = {"time": 2.1, "size": (480, 270), "overlays": overlays, "solution": quadrotor_solution}
         return pixels(render(noisy, tmp_path / "still.png", funnel=funnel, **options))
 
     bare = shown()

@@ -240,7 +240,7 @@ def test_simulate_runs_a_controller_by_its_name(
     name: str, solved: Path, tmp_path: Path, differential_drive: ls.Scenario
 ) -> None:
     told = ["--design-disturbances", "light"] if name in DESIGNED else []
-    options = ["--disturbances", "light", "--trials", "3", "--out", str(tmp_path), "--controller", name, *told]
+    options = ["--disturbances", "light", "--trials", "1", "--out", str(tmp_path), "--controller", name, *told]
     assert main(["simulate", str(solved), *options]) == 0
     solution, plant = ls.load(solved, ls.Solution), differential_drive.plant()
     light = ls.disturbances.preset("light", plant)
@@ -251,7 +251,7 @@ def test_simulate_runs_a_controller_by_its_name(
         "offset_free": lambda: ls.OffsetFree(problem, solution, stated),
         "replan": lambda: ls.Replanner(problem, solution, every=problem.steps * problem.dt / 10, deadline=0.0),
     }[name]()
-    wanted = ls.simulate(plant, solution, controller=law, disturbances=light, trials=3)
+    wanted = ls.simulate(plant, solution, controller=law, disturbances=light)
     found = ls.load(tmp_path / "rollout.npz", ls.Rollout)
     np.testing.assert_array_equal(found.states, wanted.states)
     assert found.policy_digest == law.digest
@@ -305,7 +305,7 @@ def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest
 
 
 def test_stress_takes_the_new_ones_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 2 --workers 0"
+    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 1 --workers 0"
     assert main(["stress", "differential_drive", *options.split(), "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
     rows = [line for line in printed if line.startswith("light")]
