@@ -123,7 +123,7 @@ def test_no_texts_overlap(tmp_path_factory: pytest.TempPathFactory, data: st.Dat
     else:
         figure = written(ls.view.plot_run, solution, {"calm": run, "again": run}, path, world=world, style=looks)
     boxes = check_layout(figure)
-    assert figure.get_figwidth() == style.LOOKS[looks].width
+    assert figure.get_figwidth() == style.LAYOUTS[looks].width
     assert looks == "screen" or min(float(text.get_fontsize()) for text in boxes) >= 7
     said = " ".join(text.get_text() for text in boxes)
     assert ("obstacle" in said) == bool(world.obstacles)

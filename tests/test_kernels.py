@@ -911,8 +911,8 @@ class TestParts:
             of_constraint(ls.Clearance(world, balls=balls).bind(CART), x=x)
         flat, count, parts = np.zeros((2, 12)), len(world), np.array([0.0, 4.0])
         flat.reshape(2, 4, 3)[..., :2] = square(X, None)
-        out, pulls = np.zeros(2 * count), np.zeros((2 * count, 12))
-        given = count, 2, 1, world.upright().table, parts, 1, flat, np.zeros((2 * count, 3)), out, pulls
+        out, slopes = np.zeros(2 * count), np.zeros((2 * count, 12))
+        given = count, 2, 1, world.upright().table, parts, 1, flat, np.zeros((2 * count, 3)), out, slopes
         replay(source_of(obstacle_distances), {}, "hull_distances", *given)
 
     @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])
@@ -1457,7 +1457,7 @@ class TestPlanMethods:
         costates, rows = rng.normal(size=(4, 3)), stages.live.size
         assert replay(source, SIZES, "survey", stages.about, plan) > 0
         stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)
-        replay(source, SIZES, "look", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "write_models", stages.about, plan, costates, 0.0)
         replay(source, SIZES, "adjoint", stages.about, costates, np.zeros((3, 2)))
         replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
         replay(source, SIZES, "read_rows", stages.about, plan, np.zeros(rows))
@@ -1488,7 +1488,7 @@ class TestPlanMethods:
         bent = convex.copy()
         bent[2, 2, 2] -= 1e6
         assert direction(bent) == 2  # a jump without a least
-        replay(source, SIZES, "look", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "write_models", stages.about, plan, costates, 0.0)
         replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
 
 

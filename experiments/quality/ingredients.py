@@ -44,11 +44,11 @@ ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "dropped late": ({}, LATE),
     "no continuation": ({}, {"SHARES": ()}),
     "at even speed": ({}, {"path": linear}),
-    "pull x 0.3": ({}, {"PULL": 0.3 * multistart.PULL}),
-    "pull x 3": ({}, {"PULL": 3 * multistart.PULL}),
+    "path weight x 0.3": ({}, {"PATH_WEIGHT": 0.3 * multistart.PATH_WEIGHT}),
+    "path weight x 3": ({}, {"PATH_WEIGHT": 3 * multistart.PATH_WEIGHT}),
     "1 start, at even speed": ({"starts": 1}, {"path": linear}),
-    "1 start, pull x 0.3": ({"starts": 1}, {"PULL": 0.3 * multistart.PULL}),
-    "1 start, pull x 3": ({"starts": 1}, {"PULL": 3 * multistart.PULL}),
+    "1 start, path weight x 0.3": ({"starts": 1}, {"PATH_WEIGHT": 0.3 * multistart.PATH_WEIGHT}),
+    "1 start, path weight x 3": ({"starts": 1}, {"PATH_WEIGHT": 3 * multistart.PATH_WEIGHT}),
 }
 
 

@@ -48,13 +48,13 @@ def hull_distances(
     flat[..., : places.shape[-1]] = places.reshape(-1, *places.shape[-2:])
     displaced = np.zeros((1, count, 3)) if displaced is None else displaced
     rows, per_displacement = len(flat) * len(hulls) * count, max(1, len(flat) // len(displaced))
-    out, pulls = np.empty(rows), np.zeros((rows, 3 * widest))
+    out, corner_slopes = np.empty(rows), np.zeros((rows, 3 * widest))
     _distances().hull_distances(
         count, len(flat), per_displacement, world_seen.table, np.cumsum([0, *hulls], dtype=np.float64),
-        len(hulls), flat.reshape(len(flat), -1), np.ascontiguousarray(displaced).reshape(-1, 3), out, pulls,
+        len(hulls), flat.reshape(len(flat), -1), np.ascontiguousarray(displaced).reshape(-1, 3), out, corner_slopes,
     )  # fmt: skip
     shape = (*batch, len(hulls), count)
-    return out.reshape(shape), pulls.reshape(*shape, widest, 3)
+    return out.reshape(shape), corner_slopes.reshape(*shape, widest, 3)
 
 
 def _distances() -> CompiledModule:

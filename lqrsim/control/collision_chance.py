@@ -49,8 +49,8 @@ class Surroundings:
             )
         pairs = [(term, shape) for term in terms if len((shape := term.in_world(problem.dynamics)).world)]
         shapes = tuple(shape for _, shape in pairs)
-        moved_by = [shape.moved_by for shape in shapes]
-        position = place if set(moved_by) <= {place} else tuple(sorted({i for indices in moved_by for i in indices}))
+        states = [shape.depends_on for shape in shapes]
+        position = place if set(states) <= {place} else tuple(sorted({i for indices in states for i in indices}))
         return cls(tuple(term for term, _ in pairs), shapes, place, position, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:

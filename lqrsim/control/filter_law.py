@@ -201,11 +201,11 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     )  # fmt: skip
 
 
-def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, moves: bool) -> None:
-    """Write one period's transition, input and drift. Without `moves`, z waits for the first measurement."""
+def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, started: bool) -> None:
+    """Write one period's transition, input and drift. Without `started`, z waits for the first measurement."""
     (F, G, f), m, late = step, now["input"].shape[1], len(now["drift"]) > size
     now["transition"][:size, :size] = np.eye(size)
-    if moves:
+    if started:
         now["transition"][:size, :size], now["drift"][:size] = F, f
         if late:  # the oldest command acts
             now["transition"][:size, size : size + m] = G

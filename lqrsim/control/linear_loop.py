@@ -45,8 +45,8 @@ def moments_of(loops: LoopArrays, stated: int, count: int | None = None, lost: f
     for t in range(steps + 1):
         advance(t, *arguments)
         if t < steps:
-            np.matmul(M[..., :size, :], P, out=work.moved)
-            np.matmul(work.moved, M.swapaxes(-1, -2), out=P[..., :size, :])
+            np.matmul(M[..., :size, :], P, out=work.driven)
+            np.matmul(work.driven, M.swapaxes(-1, -2), out=P[..., :size, :])
     return LoopMoments(*(np.moveaxis(moment, 0, 2) for moment in moments))
 
 

@@ -26,13 +26,13 @@ from lqrsim.kernels.stages import (
     closed_loop_rollout,
     cost_of_plan,
     direction,
-    look,
-    look_with_own_costates,
     measure,
-    moved,
     read_rows,
     regularised_direction,
+    row_change,
     typical_sizes,
+    write_models,
+    write_models_and_costates,
 )
 
 # What rows do: nothing, stay at their targets, or, at a price, stay violated.
@@ -82,7 +82,7 @@ def begin_active_set(violation, stages, work, mem):
     copy(rows.acts, rows.size * (stages.steps + 1), rows.live)
     read_rows(stages, work.plan, rows.numbers)
     leave(stages)
-    mem.cost = look_with_own_costates(stages, work.plan, work.costates)
+    mem.cost = write_models_and_costates(stages, work.plan, work.costates)
     mem.typical = typical_sizes(stages, work.plan, stages.models.hessian)
     for at in range(rows.size * (stages.steps + 1)):
         at_limit = rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * rows.sizes[at]
@@ -177,7 +177,7 @@ def predict_rows(scale, stages, work):
             if rows.live[at] == 0:
                 continue
             size, price, missed = rows.sizes[at], rows.prices[at], 0.0
-            change = moved(t, row, stages)
+            change = row_change(t, row, stages)
             if rows.held[at] == HELD:
                 force = work.forces[at] - work.curves[at] * change
                 work.pressing[at] = force
@@ -248,7 +248,7 @@ def apply_step(violation, stages, work, mem):
                 work.plan.controls[t, i] += changes.controls[t, i]
     read_rows(stages, work.plan, rows.numbers)
     leave(stages)
-    mem.cost = look(stages, work.plan, work.costates, 0.0)
+    mem.cost = write_models(stages, work.plan, work.costates, 0.0)
     measure_plan(violation, stages, work, mem)
 
 

@@ -35,10 +35,10 @@ from lqrsim.kernels.rollouts import ilqr_pass
 from lqrsim.kernels.rollouts import rollout as rollout
 from lqrsim.kernels.stages import adjoint as adjoint
 from lqrsim.kernels.stages import least_curvatures as least_curvatures
-from lqrsim.kernels.stages import look as look
 from lqrsim.kernels.stages import read_rows as read_rows
 from lqrsim.kernels.stages import survey as survey
 from lqrsim.kernels.stages import trial as trial
+from lqrsim.kernels.stages import write_models as write_models
 
 
 def smoother(task, first, last, settings, model, work, memory, log):

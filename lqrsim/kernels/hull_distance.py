@@ -23,8 +23,8 @@ CORNER = 3  # index in a point of M, after its coordinates: the number of the ro
 
 
 @outline
-def hull_distance(data, row, corners, first, count, pulls) -> float:
-    """The signed distance; write its derivatives in the robot's corners to pulls (3 count,).
+def hull_distance(data, row, corners, first, count, gradient) -> float:
+    """The signed distance; write its derivatives in the robot's corners to gradient (3 count,).
 
     Args:
       corners: the robot's corners, from the one numbered `first` on, in any order.
@@ -32,11 +32,11 @@ def hull_distance(data, row, corners, first, count, pulls) -> float:
     simplex, weights, normal, axis, curve = zeros(4, 4), zeros(4), stack(3), zeros(3), stack(3, 3)
     if count == 1 and data[row] != MESH:
         x, y, z = corners[3 * first], corners[3 * first + 1], corners[3 * first + 2]
-        return signed_distance_derivatives(data, row, x, y, z, pulls, curve)
+        return signed_distance_derivatives(data, row, x, y, z, gradient, curve)
     for k in range(3 * count):
-        pulls[k] = 0.0
+        gradient[k] = 0.0
     if data[row] == 0:
-        return distance_to_plane(data, row, corners, first, count, pulls)
+        return distance_to_plane(data, row, corners, first, count, gradient)
     write_axis(data, row, axis)
     distance = shortest(data, row, corners, first, count, axis, simplex, weights, normal)
     if not distance > 0:
@@ -44,11 +44,11 @@ def hull_distance(data, row, corners, first, count, pulls) -> float:
     for k in range(4):
         corner = 3 * int(simplex[k, CORNER])
         for i in range(3):
-            pulls[corner + i] += weights[k] * normal[i]
+            gradient[corner + i] += weights[k] * normal[i]
     return distance - rounding_radius(data, row)
 
 
-def distance_to_plane(data, row, corners, first, count, pulls):
+def distance_to_plane(data, row, corners, first, count, gradient):
     """The distance of the lowest corner."""
     least, lowest = inf, 0
     for k in range(count):
@@ -58,7 +58,7 @@ def distance_to_plane(data, row, corners, first, count, pulls):
         if distance < least:
             least, lowest = distance, k
     for i in range(3):
-        pulls[3 * lowest + i] = data[row + 6 + 3 * i]
+        gradient[3 * lowest + i] = data[row + 6 + 3 * i]
     return least
 
 

@@ -41,15 +41,15 @@ from lqrsim.kernels.stages import (
     LIMIT,
     adjoint,
     direction,
-    look,
-    look_with_own_costates,
     measure,
-    moved,
     read_rows,
     regularised_direction,
+    row_change,
     share_of,
     survey,
     trial,
+    write_models,
+    write_models_and_costates,
 )
 
 # Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
@@ -416,7 +416,7 @@ def models_with_barrier(stages, work, mem):
                 if has_excess(at, rows):
                     width += slacks.excess[at] / below(at, rows)
             work.curves[at] = 1 / width
-    pull_rows(False, work.corrections, stages, work, mem)
+    write_row_forces(False, work.corrections, stages, work, mem)
     rung = regularised_direction(stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
     if rung < 0:
         return False
@@ -425,7 +425,7 @@ def models_with_barrier(stages, work, mem):
 
 
 @compact
-def pull_rows(beyond, corrections, stages, work, mem):
+def write_row_forces(beyond, corrections, stages, work, mem):
     """Write the forces of the rows in the condensed equations of a step; `beyond` adds further residuals."""
     rows = stages.rows
     for at in range(rows.size * (stages.steps + 1)):
@@ -450,7 +450,7 @@ def residual_of(at, corrections, rows, work, mem):
 @compact
 def solve(beyond, corrections, gaps, stages, work, mem):
     """Compute another step with the same models, but without weights on changes; return whether there is one."""
-    pull_rows(beyond, corrections, stages, work, mem)
+    write_row_forces(beyond, corrections, stages, work, mem)
     return direction(stages, work.now.plan, gaps, mem.share, 0.0, 1.0, work.curves, work.forces) == -1
 
 
@@ -466,7 +466,7 @@ def complete(beyond, corrections, out, stages, work, mem):
             out.force[at], out.slacks.slack[at], out.slacks.excess[at] = 0.0, 0.0, 0.0
             if rows.live[at] == 0:
                 continue
-            ahead = moved(t, row, stages) + residual_of(at, corrections, rows, work, mem)
+            ahead = row_change(t, row, stages) + residual_of(at, corrections, rows, work, mem)
             if beyond:
                 ahead += work.beyond[at]
             change = -work.curves[at] * ahead
@@ -672,7 +672,7 @@ def close_residuals(part, stages, work, mem):
             for row in range(rows.size):
                 at = rows.size * t + row
                 if rows.live[at] != 0:
-                    change = -work.curves[at] * (moved(t, row, stages) + missed(at, tried))
+                    change = -work.curves[at] * (row_change(t, row, stages) + missed(at, tried))
                     other.slacks.slack[at] = -slacks.slack[at] / above(at, rows) * change
                     other.slacks.excess[at] = slacks.excess[at] / below(at, rows) * change
         far = longest(boundary(mem), tried.slacks, other.slacks, stages)
@@ -732,10 +732,10 @@ def accept_step(part, stages, work, mem):
     mem.age = mem.age + 1 if mem.age < mem.oldest else 0.0
     stages.keeps[0] = 1.0 if mem.age > 0 else 0.0
     if learns:
-        remember(stages, work.now.plan, new, work.costates, work.moves, work.turns)
+        remember(stages, work.now.plan, new, work.costates, work.last_step, work.turns)
     go_to(work.tried, mem.tried, NEGLIGIBLE * mem.scale, stages, work, mem)
     if learns:
-        learn(stages, work.costates, work.moves, work.turns, part >= LONG and mem.stationarity > CRAWL * before)
+        learn(stages, work.costates, work.last_step, work.turns, part >= LONG and mem.stationarity > CRAWL * before)
 
 
 @compact
@@ -871,7 +871,7 @@ def go_to(point, cost, least, stages, work, mem):
     copy_point(point, work.now, stages)
     mem.cost = cost
     copy_matrix(point.arrived, stages.steps, N, stages.models.arrived)
-    look(stages, work.now.plan, work.costates, least)
+    write_models(stages, work.now.plan, work.costates, least)
     measure_iterate(stages, work, mem)
 
 
@@ -879,7 +879,7 @@ def go_to(point, cost, least, stages, work, mem):
 def renew(stages, work, mem):
     """Compute the derivatives of the dynamics anew, about the iterate."""
     stages.keeps[0], mem.age = 0.0, 0.0
-    look(stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
+    write_models(stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
     measure_iterate(stages, work, mem)
 
 
@@ -941,7 +941,7 @@ def polish(tolerance, violation, begun, stages, work, mem):
             if rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * size:
                 rows.force[at] = AT_LIMIT * mem.scale / size
     if isfinite(cost):
-        look_with_own_costates(stages, plan, work.active.costates)
+        write_models_and_costates(stages, plan, work.active.costates)
         if polish_rows(tolerance, violation, stages, work, mem):
             return True
     go_back(stages, work, mem)
@@ -976,7 +976,7 @@ def polish_rows(tolerance, violation, stages, work, mem):
         elif rows.held[at] == PAID:
             rows.force[at] = copysign(rows.prices[at], rows.force[at])
     memory.typical = mem.typical
-    memory.cost = look(stages, active.plan, active.costates, 0.0)
+    memory.cost = write_models(stages, active.plan, active.costates, 0.0)
     measure_plan(violation, stages, active, memory)
     for k in range(CROSSINGS):
         # The first step may be long; with a weight as large as in the other steps, rounding would spoil it.

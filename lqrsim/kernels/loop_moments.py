@@ -60,7 +60,7 @@ def dot(a, i, b, k, count):
 @outline
 def spread(t, system, sizes, loops, work):
     """Write the covariance of d at knot t."""
-    R = sizes.entries - sizes.moved
+    R = sizes.entries - sizes.driven
     given, noise = R * R * system, R * R * (sizes.systems * t + system)
     for i in range(R * R):
         work.half[i] = 0.0
@@ -79,7 +79,7 @@ def spread(t, system, sizes, loops, work):
 @outline
 def disturb(t, system, law, sizes, loops, work):
     """Add the effects of limits, losses and the commands' noise in step t to the covariance of y."""
-    Y, X, m, S = sizes.moved, sizes.entries, sizes.controls, sizes.stated
+    Y, X, m, S = sizes.driven, sizes.entries, sizes.controls, sizes.stated
     k = sizes.laws * system + law
     G, P, pushed = m * Y * (sizes.systems * t + system), X * X * k, m * Y * k
     for i in range(Y):
@@ -93,7 +93,7 @@ def disturb(t, system, law, sizes, loops, work):
 @outline
 def arrive(t, system, law, sizes, loops, work, moments):
     """Add the noise that leads to knot t, fill in the rest of the symmetric covariance, and write the moments."""
-    Y, X, rows, columns, count = sizes.moved, sizes.entries, sizes.rows, sizes.columns, sizes.shown
+    Y, X, rows, columns, count = sizes.driven, sizes.entries, sizes.rows, sizes.columns, sizes.shown
     k, loop = sizes.laws * system + law, sizes.systems * t + system
     P, R = X * X * k, X - Y
     for i in range(rows):
@@ -108,13 +108,13 @@ def arrive(t, system, law, sizes, loops, work, moments):
         moments.mean[count * at + i] = work.mean[Y * k + i]
         copy_part(work.P, P + X * i, moments.covariance, count * (count * at + i), count)
         if t > 0:
-            copy_part(work.moved, X * (Y * k + i), moments.across, count * (count * last + i), count)
+            copy_part(work.driven, X * (Y * k + i), moments.across, count * (count * last + i), count)
 
 
 @outline
 def act(t, system, law, sizes, loops, work, moments):
     """Write M of X' = M X and noise under the limited commands of step t, the next mean, and what noise is left."""
-    Y, X, m = sizes.moved, sizes.entries, sizes.controls
+    Y, X, m = sizes.driven, sizes.entries, sizes.controls
     k, loop = sizes.laws * system + law, sizes.systems * t + system
     P, x, own, at = X * X * k, Y * k, m * k, m * (sizes.systems * sizes.laws * t + k)
     K, F, G, c = m * X * (sizes.laws * t + law), Y * X * loop, m * Y * loop, Y * loop
@@ -146,7 +146,7 @@ def act(t, system, law, sizes, loops, work, moments):
 @inline
 def shake(t, system, law, sizes, loops, work):
     """Write the products with G of the commands' noise, and of what a loss changes, for `disturb`."""
-    Y, X, m, S = sizes.moved, sizes.entries, sizes.controls, sizes.stated
+    Y, X, m, S = sizes.driven, sizes.entries, sizes.controls, sizes.stated
     k, loop, given = sizes.laws * system + law, sizes.systems * t + system, sizes.laws * t + law
     own, G, force = m * k, m * Y * loop, S - m
     for a in range(m):

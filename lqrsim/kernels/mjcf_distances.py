@@ -94,14 +94,14 @@ def places(x, data, out):
 
 
 @outline
-def find(x, displaced, moved, data, first, out, which, segments):
+def find(x, displaced, offset, data, first, out, which, segments):
     """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
     p = at(data[0])
     slot = claim_slot(p)
     one = at(p[SLOTS] + 8 * SLOT * slot)
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
-    look(p, one, data, displaced, moved, first, out, which, segments)
+    find_with_data(p, one, data, displaced, offset, first, out, which, segments)
     store(p[FLAGS], slot, 0)
 
 
@@ -117,7 +117,7 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
     call(p[COMPOS], at(p[MODEL]), at(one[DATA]))
-    look(p, one, data, nowhere, -1, first, out, which, segments)
+    find_with_data(p, one, data, nowhere, -1, first, out, which, segments)
     for row in range(int(data[1])):
         if which[row] >= 0:
             pair = PAIRS + PAIR * int(which[row])
@@ -135,10 +135,10 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     store(p[FLAGS], slot, 0)
 
 
-def look(p, one, data, displaced, moved, first, out, which, segments):
+def find_with_data(p, one, data, displaced, offset, first, out, which, segments):
     """As `find`, of an MjData that has its positions.
 
-    If `moved` is not negative, obstacles are displaced by the three numbers from displaced[moved + 3 row] on.
+    If `offset` is not negative, obstacles are displaced by the three numbers from displaced[offset + 3 row] on.
     """
     middles, axes, segment = at(one[GEOM_XPOS]), at(one[GEOM_XMAT]), stack(6)
     for row in range(int(data[1])):
@@ -147,9 +147,9 @@ def look(p, one, data, displaced, moved, first, out, which, segments):
         pair = PAIRS + PAIR * k
         row, own, other = int(data[pair]), 3 * int(data[pair + 1]), 3 * int(data[pair + 3])
         before_x, before_y, before_z = middles[other], middles[other + 1], middles[other + 2]
-        if moved >= 0:
+        if offset >= 0:
             for i in range(3):
-                middles[other + i] += displaced[moved + 3 * row + i]
+                middles[other + i] += displaced[offset + 3 * row + i]
         x, y, z = middles[own] - middles[other], middles[own + 1] - middles[other + 1], middles[own + 2]
         z -= middles[other + 2]
         if data[pair + 5] == 1:

@@ -9,30 +9,30 @@ from lqrsim.kernels.signed_distance import signed_distance
 MOST_CORNERS = 64  # of a hull of a robot; its distances take time in proportion to it
 
 
-def hull_distances(obstacles, count, each, data, parts, size, corners, displaced, out, pulls):
+def hull_distances(obstacles, count, each, data, parts, size, corners, displaced, out, slopes):
     """Write the distances (count parts obstacles,) of robots of convex hulls, and their derivatives in the corners.
 
     Args:
       each: robots per trial. parts: the first corner of each hull, and the end of the last. size: number of the hulls.
       corners: (count, 3 B). displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
-      pulls: (count parts obstacles, at least 3 for each corner of a hull).
+      slopes: (count parts obstacles, at least 3 for each corner of a hull).
     """
     for i in range(count):
         for part in range(size):
             for k in range(obstacles):
                 at, moved = (i * size + part) * obstacles + k, obstacles * (i // each) + k
                 first, end = int(parts[part]), int(parts[part + 1])
-                out[at] = hull_distance_displaced(data, ROW * k, corners[i], first, end, displaced[moved], pulls[at])
+                out[at] = hull_distance_displaced(data, ROW * k, corners[i], first, end, displaced[moved], slopes[at])
 
 
 @outline
-def hull_distance_displaced(data, row, corners, first, end, displaced, pulls):
+def hull_distance_displaced(data, row, corners, first, end, displaced, gradient):
     """The distance of one hull to one obstacle that is displaced by (3,)."""
     there = stack(3 * MOST_CORNERS)
     for k in range(end - first):
         for i in range(3):
             there[3 * k + i] = corners[3 * (first + k) + i] - displaced[i]
-    return hull_distance(data, row, there, 0, end - first, pulls)
+    return hull_distance(data, row, there, 0, end - first, gradient)
 
 
 def nearest(obstacles, count, each, data, points, displaced, out):
@@ -48,12 +48,12 @@ def nearest(obstacles, count, each, data, points, displaced, out):
 @outline
 def nearest_to(obstacles, data, point, displaced, first):
     """The distance of one point (3,) to the nearest obstacle. Obstacles are displaced by the rows from `first` on."""
-    least, there, pulls = inf, stack(3), stack(3)
+    least, there, corner_slopes = inf, stack(3), stack(3)
     for k in range(obstacles):
         for i in range(3):
             there[i] = point[i] - displaced[first + k, i]
         if data[ROW * k] == MESH:
-            distance = hull_distance(data, ROW * k, there, 0, 1, pulls)
+            distance = hull_distance(data, ROW * k, there, 0, 1, corner_slopes)
         else:
             distance = signed_distance(data, ROW * k, there[0], there[1], there[2])
         if not distance >= least:  # a NaN stays

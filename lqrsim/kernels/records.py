@@ -334,7 +334,7 @@ class InteriorArrays(NamedTuple):
     others: Slacks
     beyond: Annotated[Arrays, "K"]  # further residuals of the rows
     wider: Annotated[Arrays, "T N"]  # further gaps
-    moves: Annotated[Arrays, "T+1 W"]  # the last step
+    last_step: Annotated[Arrays, "T+1 W"]  # the last step
     turns: Annotated[Arrays, "T+1 W"]  # the change of the Lagrangian's gradients by it
     active: ActiveSetArrays  # of the crossover
     active_memory: Arrays  # (1,) row of `ACTIVE_SET`
@@ -469,7 +469,7 @@ class LoopSizes(NamedTuple):
     steps: int  # T
     systems: int  # L
     laws: int  # C
-    moved: int  # Y
+    driven: int  # Y
     entries: int  # X
     controls: int  # m
     shown: int  # number of entries of y whose moments are written
@@ -508,7 +508,7 @@ class LoopWork(NamedTuple):
 
     P: Annotated[Arrays, "L C X X"]  # covariance of X
     M: Annotated[Arrays, "L C X X"]  # of X' = M X and noise
-    moved: Annotated[Arrays, "L C Y X"]  # M P for y alone
+    driven: Annotated[Arrays, "L C Y X"]  # M P for y alone
     given: Annotated[Arrays, "L R R"]  # covariance of d
     half: Annotated[Arrays, "R R"]  # the transition times it
     mean: Annotated[Arrays, "L C Y"]  # of y
@@ -537,7 +537,7 @@ class PassSizes(NamedTuple):
     """Sizes of the backward pass of C tracking laws; see `tracking_law.py`."""
 
     laws: int  # C
-    moved: int  # Y, the states that controls move
+    driven: int  # Y, the states that controls move
     entries: int  # Z, of z = (y, d)
     controls: int  # m
     lost: float  # fraction of the commands that get lost; the last m of y are then the actuators' states

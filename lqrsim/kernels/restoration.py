@@ -20,11 +20,11 @@ from lqrsim.kernels.stages import (
     EQUALITY,
     LIMIT,
     closed_loop_rollout,
-    look,
-    moved,
     read_rows,
     regularised_direction,
+    row_change,
     trial,
+    write_models,
 )
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; factor
@@ -53,7 +53,7 @@ def restoration(first, last, price, stages, work, memory, log):
 
     Returns:
       The number of iterations so far; and RUNNING, STALLED if no step helps or none is needed, NOT_FINITE if there is
-      none; or NO_PROGRESS if the caller is to look whether the violation of the plan is stationary, with the
+      none; or NO_PROGRESS if the caller is to test whether the violation of the plan is stationary, with the
       multipliers relative to the price in `work.shares`. If it is not, the next call continues.
     """
     mem = memory[0]
@@ -131,7 +131,7 @@ def descend(price, stages, work, mem):
         good = good and (rows.live[at] == 0 or isfinite(rows.numbers[at]))
     if not good:
         return False
-    look(stages, work.plan, work.costates, 0.0)
+    write_models(stages, work.plan, work.costates, 0.0)
     for t in range(steps):
         fill(work.gaps[t], N, 0.0)
     while True:
@@ -162,7 +162,7 @@ def descend(price, stages, work, mem):
         for row in range(rows.size):
             at = rows.size * t + row
             if rows.live[at] != 0:
-                work.aims[at] = rows.force[at] - work.curves[at] * moved(t, row, stages)
+                work.aims[at] = rows.force[at] - work.curves[at] * row_change(t, row, stages)
                 work.duals[at] += part * (work.aims[at] - work.duals[at])
     if part > LONG:
         mem.damping /= TIMES
@@ -184,7 +184,7 @@ def slope_of_merit(stages):
         for row in range(rows.size):
             at = rows.size * t + row
             if rows.live[at] != 0:
-                slope -= rows.force[at] * moved(t, row, stages)
+                slope -= rows.force[at] * row_change(t, row, stages)
     return slope
 
 

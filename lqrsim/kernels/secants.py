@@ -22,7 +22,7 @@ def forget(stages):
 
 
 @compact
-def remember(stages, before, after, costates, moves, turns):
+def remember(stages, before, after, costates, last_step, turns):
     """Before a step is taken, keep it, (T+1, W), and the Lagrangian's gradients at its beginning, (T+1, W).
 
     The Lagrangian is that of the multipliers after the step.
@@ -30,13 +30,13 @@ def remember(stages, before, after, costates, moves, turns):
     for t in range(stages.steps + 1):
         lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], turns[t])
         for i in range(N):
-            moves[t, i] = after.states[t, i] - before.states[t, i]
+            last_step[t, i] = after.states[t, i] - before.states[t, i]
         for i in range(M):
-            moves[t, N + i] = after.controls[t, i] - before.controls[t, i] if t < stages.steps else 0.0
+            last_step[t, N + i] = after.controls[t, i] - before.controls[t, i] if t < stages.steps else 0.0
 
 
 @compact
-def learn(stages, costates, moves, turns, slow):
+def learn(stages, costates, last_step, turns, slow):
     """Update what is learned, with the models at the end of the step; from when `slow` on, add it to the Hessians."""
     models, slope, lacks = stages.models, stack(W), stack(W)
     for t in range(stages.steps + 1):
@@ -48,9 +48,9 @@ def learn(stages, costates, moves, turns, slow):
                 known = models.hessian[t, i, j]
                 if stages.slow[0] == 0:
                     known += models.learned[t, i, j]
-                lacks[i] -= known * moves[t, j]
-            along += lacks[i] * moves[t, i]
-            far += moves[t, i] * moves[t, i]
+                lacks[i] -= known * last_step[t, j]
+            along += lacks[i] * last_step[t, i]
+            far += last_step[t, i] * last_step[t, i]
             wide += lacks[i] * lacks[i]
         if along * along > NOTHING * NOTHING * far * wide:
             for i in range(W):

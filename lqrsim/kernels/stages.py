@@ -51,7 +51,7 @@ CONTROL, SIGN, SIDE, RANGE, STRAIGHT = 0, 1, 2, 3, 4  # columns of `StageRows.li
 INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
-def look(stages, plan, costates, least):
+def write_models(stages, plan, costates, least):
     """Write the models of all stages at a plan, with costates (T+1, N), and return its cost.
 
     Multipliers up to `least`, times the sizes of their rows, count as zero in the Hessians.
@@ -71,8 +71,8 @@ def look(stages, plan, costates, least):
     return total
 
 
-def look_with_own_costates(stages, plan, costates):
-    """As `look`, but write the costates: those of this plan and the forces of its rows."""
+def write_models_and_costates(stages, plan, costates):
+    """As `write_models`, but write the costates: those of this plan and the forces of its rows."""
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
     total, slope, out = 0.0, stack(W), stages.models
@@ -265,7 +265,7 @@ def survey(stages, plan):
                 beside.controls[t, i] = plan.controls[t, i] + ASIDE * sin(1.0 + N + i)
         fill(stages.to_go.gradient[t], N, 0.0)
     constraint_slopes(stages, beside)
-    look(stages, plan, stages.to_go.gradient, inf)
+    write_models(stages, plan, stages.to_go.gradient, inf)
     project(stages, plan)
     return typical_sizes(stages, plan, stages.models.convex)
 
@@ -288,10 +288,10 @@ def typical_sizes(stages, plan, hessian):
             continue
         effect, largest = SLOWEST, 0.0
         for i in range(N):
-            moved = 0.0
+            row_change = 0.0
             for t in range(steps):
-                moved += abs(models.jacobian[t, i, N + j])
-            effect = max(effect, moved / stages.state_size[i])
+                row_change += abs(models.jacobian[t, i, N + j])
+            effect = max(effect, row_change / stages.state_size[i])
         for t in range(steps):
             largest = max(largest, abs(plan.controls[t, j]))
         stages.control_size[j] = max(1 / effect, largest)
@@ -462,7 +462,7 @@ def add_rows(t, stages, curves, forces, stage, slope):
                     stage[i, j] += curve * entry * slopes[at, j]
 
 
-def moved(t, row, stages):
+def row_change(t, row, stages):
     """The change of a row's value by the step in `stages.changes`."""
     slope, changes, total = stages.models.slopes[stages.rows.size * t + row], stages.changes, 0.0
     for i in range(N):

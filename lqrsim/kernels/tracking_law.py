@@ -19,7 +19,7 @@ def improve(t, sizes, given, work):
 @outline
 def eliminate(t, k, sizes, given, work):
     """Write the law, -(R + G'SG)^-1 (G'S [F E c] + undo): Gaussian elimination, which needs no pivots here."""
-    Y, m, width = sizes.moved, sizes.controls, sizes.entries + 1
+    Y, m, width = sizes.driven, sizes.controls, sizes.entries + 1
     row = width + m
     law, curve, right = m * width * (sizes.laws * t + k), m * m * k, row * ((Y + m) * k + Y)
     for a in range(m):
@@ -46,7 +46,7 @@ def eliminate(t, k, sizes, given, work):
 @outline
 def go_back(t, k, sizes, given, work):
     """Write the cost-to-go (S, D, s): its mean over commands that arrive and commands that get lost."""
-    Y, m, width, lost = sizes.moved, sizes.controls, sizes.entries + 1, sizes.lost
+    Y, m, width, lost = sizes.driven, sizes.controls, sizes.entries + 1, sizes.lost
     row, force = width + m, Y - m
     law, held, first, cost = m * width * (sizes.laws * t + k), m * width * t, row * (Y + m) * k, width * Y * k
     for j in range(m * width):

@@ -342,7 +342,7 @@ class Belief(Dynamics):
             ]
         strength = sympy.Float(process.strength) if process.strength != 1 else sympy.Integer(1)
         shaken = [[name(strength * entry) for entry in entries[i * process.size :][: process.size]] for i in rows]
-        mean, slopes = _moved(operations, rates, means, rows, self.robot, float(self.period or 0))
+        mean, slopes = _step_jacobian(operations, rates, means, rows, self.robot, float(self.period or 0))
         root = _lower(x[size:], n)
         turned = [[name(sum(slopes[i][k] * root[k][j] for k in range(j, n))) for j in range(n)] for i in range(n)]
         root = _cholesky(operations, [a + b for a, b in zip(turned, shaken, strict=True)], n)
@@ -472,7 +472,7 @@ def _lower(entries: Any, n: int) -> list[list[Any]]:
     return [list(entries[i * (i + 1) // 2 :][: i + 1]) for i in range(n)]
 
 
-def _moved(
+def _step_jacobian(
     operations: Operations, rates: list[Any], x: list[Any], rows: list[int], robot: Dynamics, dt: float
 ) -> tuple[list[Any], list[list[Any]]]:
     """The robot's state after a period, (n,), and the Jacobian of some states by these: those of `Dynamics.step`."""

@@ -133,12 +133,12 @@ def value(x, u, t, row, data):
 def slope(x, u, t, row, data, gradient):
     """Add its gradient (W,)."""
     if HULLS:
-        pulls = stack(3 * BALLS)
+        corner_slopes = stack(3 * BALLS)
         first, size = corners_of(part_of(row, data), data)
-        hull_distance(data, obstacle_at(t, row, data), x, first, size, pulls)
+        hull_distance(data, obstacle_at(t, row, data), x, first, size, corner_slopes)
         for i in range(N):
             for k in range(3 * size):
-                gradient[i] += pulls[k] * u[3 * first + k, i]
+                gradient[i] += corner_slopes[k] * u[3 * first + k, i]
         return
     normal, curve = stack(3), stack(3, 3)
     a, b, c = place(x, row, data)

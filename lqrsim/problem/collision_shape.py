@@ -102,7 +102,7 @@ class ShapeInWorld:
     hulls: tuple[int, ...] | None = None
 
     @property
-    def moved_by(self) -> tuple[int, ...]:
+    def depends_on(self) -> tuple[int, ...]:
         """The states that the places depend on, by their indices."""
         return self.dynamics.state_coordinates.position if self.centers is None else self.centers.depends_on
 
@@ -117,7 +117,7 @@ class ShapeInWorld:
 
     def placed(self, module: str, own: Array) -> tuple[Source, Array, tuple[UserFunction, ...]]:
         """The kernel of a module for these balls, with AT, BALLS and AXES; its data with its own; and its functions."""
-        centers, axes = self.centers, self.moved_by
+        centers, axes = self.centers, self.depends_on
         if centers is None:
             return source_of(module, AXES=axes), own, ()
         kernel = source_of(
@@ -143,7 +143,7 @@ class ShapeInWorld:
     def places(self, states: Array) -> Array:
         """The places at states (..., n)."""
         if self.centers is None:
-            return states[..., None, list(self.moved_by)]
+            return states[..., None, list(self.depends_on)]
         return evaluate(self.centers, self.balls, states)
 
     def clearance(self, places: Array, displaced: Array | None = None) -> Array:
@@ -164,17 +164,17 @@ class ShapeInWorld:
 
         Both belong to the nearest ball, or hull.
         """
-        knots, moved_by = np.arange(len(states))[:, None], list(self.moved_by)
+        knots, axes = np.arange(len(states))[:, None], list(self.depends_on)
         if self.centers is None:
-            places, slopes = self.places(states), np.eye(states.shape[1])[None, None, moved_by].repeat(len(states), 0)
+            places, slopes = self.places(states), np.eye(states.shape[1])[None, None, axes].repeat(len(states), 0)
         else:
             places, slopes = evaluate_slopes(self.centers, self.balls, states)
-        distances, pulls = hull_distances(self.world, places, self.sizes)
+        distances, corner_slopes = hull_distances(self.world, places, self.sizes)
         clearance = distances - self.radii[:, None]
         chosen = knots, clearance.argmin(axis=1), np.arange(len(self.world))
         corners = np.cumsum([0, *self.sizes[:-1]])[:, None] + np.arange(max(self.sizes))  # of each part
         moves = slopes[knots[..., None], np.minimum(corners, self.balls - 1)[chosen[1]]][..., list(along)]
-        return clearance[chosen], np.einsum("kocd,kocdi->koi", pulls[chosen][..., : moves.shape[-2]], moves)
+        return clearance[chosen], np.einsum("kocd,kocdi->koi", corner_slopes[chosen][..., : moves.shape[-2]], moves)
 
     def nearest(self, places: Array, displaced: Array) -> int:
         """The number of the obstacle that is nearest at places (B, 2 or 3), when displaced by (O, 3)."""
@@ -220,8 +220,8 @@ class GeomsInWorld(ShapeInWorld):
     geoms: CollisionGeoms
 
     @property
-    def moved_by(self) -> tuple[int, ...]:
-        return tuple(range(self.distances(0.0).moved))
+    def depends_on(self) -> tuple[int, ...]:
+        return tuple(range(self.distances(0.0).leading_states))
 
     @property
     def in_plane(self) -> bool:
@@ -254,7 +254,7 @@ class GeomsInWorld(ShapeInWorld):
         return self.geoms.travel(before[..., 0, :], after[..., 0, :])
 
     def inside(self, state: Array) -> tuple[str, str] | None:
-        if not len(self.world) or np.isnan(state[list(self.moved_by)]).any():
+        if not len(self.world) or np.isnan(state[list(self.depends_on)]).any():
             return None
         state = np.where(np.isnan(state), 0.0, state)  # velocities and activations, which move no geom
         distances = self.geoms.clearances(self.dynamics, self.world, state)

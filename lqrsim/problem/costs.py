@@ -70,7 +70,7 @@ class CostTerm(Term):
           numbers: what the loss reads; in its `data` they begin at `residual.numbers`. `factor` is an index in them.
           first: the first step at which it acts.
         """
-        sizes = {"ROWS": max(1, residual.rows), "MOVED": residual.moved, "FIRST_STEP": first}
+        sizes = {"ROWS": max(1, residual.rows), "LEADING_STATES": residual.leading_states, "FIRST_STEP": first}
         return cls(
             residual.filling(source_of(kernel, **sizes).filled(loss=loss)),
             np.concatenate([residual.data, numbers]),

@@ -297,12 +297,12 @@ class Dynamics:
         """
         return iter(())
 
-    def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, "Dynamics", Array]]:
+    def approaches(self, states: Array, change: Array) -> Iterator[tuple[str, "Dynamics", Array]]:
         """Motions of the robot that touch a body and take it along, in words: geometry alone, and so not feasible.
 
         Args:
           states: (T+1, n) of a plan in which nothing touches the body.
-          moves: (n,) by how much its states are to change until the end; zero for all others.
+          change: (n,) by how much its states are to change until the end; zero for all others.
 
         Returns:
           For each, dynamics in which the robot passes through the body, and the motion (T+1, n), NaN for states that

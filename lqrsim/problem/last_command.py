@@ -83,9 +83,9 @@ class LastCommand(Dynamics):
     def softened(self, states: Array) -> Iterator[tuple[str, Dynamics]]:
         return ((name, LastCommand(softer)) for name, softer in self.of.softened(self._own(states)))
 
-    def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, Dynamics, Array]]:
+    def approaches(self, states: Array, change: Array) -> Iterator[tuple[str, Dynamics, Array]]:
         m = len(self.control_coordinates)
-        for words, dynamics, motion in self.of.approaches(self._own(states), self._own(moves)):
+        for words, dynamics, motion in self.of.approaches(self._own(states), self._own(change)):
             yield words, LastCommand(dynamics), np.pad(motion, [(0, 0), (0, m)], constant_values=np.nan)
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:

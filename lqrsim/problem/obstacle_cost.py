@@ -76,7 +76,7 @@ class ObstacleCost(KeepsClear, Cost):
         shape, reach = self.in_world(dynamics), FAR / self.sharpness
         distances = shape.distances(reach)
         if distances is not None:
-            numbers, axes = np.array([self.sharpness, self.weight, reach]), tuple(range(distances.moved))
+            numbers, axes = np.array([self.sharpness, self.weight, reach]), tuple(range(distances.leading_states))
             return CostTerm.of_residual(
                 distances, source_of(__name__, AT=distances.numbers), numbers, first=1, nonconvex_in=axes, factor=WEIGHT
             )
@@ -84,7 +84,7 @@ class ObstacleCost(KeepsClear, Cost):
         numbers = np.concatenate([[self.sharpness, self.weight, len(shape.world), count], shape.parts, tables])
         source, data, functions = shape.placed(__name__, numbers)
         return CostTerm(
-            source, data, nonconvex_in=shape.moved_by or None, factor=len(data) - len(numbers) + WEIGHT,
+            source, data, nonconvex_in=shape.depends_on or None, factor=len(data) - len(numbers) + WEIGHT,
             functions=functions, exact_hessian=shape.centers is None,
         )  # fmt: skip
 
@@ -143,7 +143,7 @@ def derivatives(x, u, t, data, hessian, gradient):
                     total += derivatives_of_ball(
                         centres[c], centres[c + 1], centres[c + 2], radius, tables, data, force, stiffness
                     )
-                    add_moved(sharpness, force, stiffness, jacobian, c, hessian, gradient)
+                    add_in_states(sharpness, force, stiffness, jacobian, c, hessian, gradient)
         else:
             height = x[AXES[2]] if len(AXES) == 3 else 0.0
             total = derivatives_of_ball(
@@ -156,7 +156,7 @@ def derivatives(x, u, t, data, hessian, gradient):
     return total
 
 
-def add_moved(sharpness, force, stiffness, jacobian, first, hessian, gradient):
+def add_in_states(sharpness, force, stiffness, jacobian, first, hessian, gradient):
     """Add the derivatives in the states of a ball's cost, given those in its centre, divided by the sharpness."""
     product = stack(3)
     for a in range(len(AXES)):
@@ -179,26 +179,26 @@ def tables_at(t, data):
 
 def cost_of_hull(centres, part, table, data):
     """The cost of a hull, divided by the weight."""
-    at, total, pulls = AT + RADII + PARTS + part, 0.0, stack(3 * max(BALLS, 1))
+    at, total, corner_slopes = AT + RADII + PARTS + part, 0.0, stack(3 * max(BALLS, 1))
     first, size = int(data[at]), int(data[at + 1]) - int(data[at])
     for k in range(int(data[AT + OBSTACLES])):
-        distance = hull_distance(data, table + ROW * k, centres, first, size, pulls) - data[AT + RADII + part]
+        distance = hull_distance(data, table + ROW * k, centres, first, size, corner_slopes) - data[AT + RADII + part]
         total += exponential(-data[AT + SHARPNESS] * distance)
     return total
 
 
 def derivatives_of_hull(centres, jacobian, part, table, data, hessian, gradient):
     """The cost of a hull; add its derivatives, without the curvature of the distances."""
-    at, total, pulls, moves = AT + RADII + PARTS + part, 0.0, stack(3 * max(BALLS, 1)), stack(len(AXES))
+    at, total, corner_slopes, moves = AT + RADII + PARTS + part, 0.0, stack(3 * max(BALLS, 1)), stack(len(AXES))
     first, size, sharpness = int(data[at]), int(data[at + 1]) - int(data[at]), data[AT + SHARPNESS]
     for k in range(int(data[AT + OBSTACLES])):
-        distance = hull_distance(data, table + ROW * k, centres, first, size, pulls) - data[AT + RADII + part]
+        distance = hull_distance(data, table + ROW * k, centres, first, size, corner_slopes) - data[AT + RADII + part]
         cost = data[AT + WEIGHT] * exponential(-sharpness * distance)
         total += cost
         for a in range(len(AXES)):
             moves[a] = 0.0
             for i in range(3 * size):
-                moves[a] += sharpness * pulls[i] * jacobian[3 * first + i, AXES[a]]
+                moves[a] += sharpness * corner_slopes[i] * jacobian[3 * first + i, AXES[a]]
         for a in range(len(AXES)):
             gradient[AXES[a]] -= cost * moves[a]
             for b in range(len(AXES)):

@@ -318,12 +318,12 @@ class Problem(OneVersion):
         def cut(table: Array) -> Array:
             return table[np.minimum(rows, len(table) - 1)]
 
-        def moved(one: Any) -> Any:
+        def at_knots(one: Any) -> Any:
             return one._with_rows(cut) if one.by_knot else one
 
         return replace(
-            self, segments=tuple(knots), constraints=[moved(constraint) for constraint in self.constraints],
-            stage_cost=CostSum(tuple(moved(cost_term) for cost_term in terms_of(self.stage_cost))),
+            self, segments=tuple(knots), constraints=[at_knots(constraint) for constraint in self.constraints],
+            stage_cost=CostSum(tuple(at_knots(cost_term) for cost_term in terms_of(self.stage_cost))),
         )  # fmt: skip
 
     def _bound_anew(self) -> "Problem":
@@ -416,8 +416,8 @@ class Problem(OneVersion):
             return about if about.ndim == 1 else about[: self.steps]
         weights = [cost.weight if cost.weight.ndim == 2 else cost.weight[: self.steps] for cost in costs]
         abouts = [cost.about if cost.about.ndim == 1 else cost.about[: self.steps] for cost in costs]
-        pulls = sum(weight @ about[..., None] for weight, about in zip(weights, abouts, strict=True))
-        return np.linalg.solve(sum(weights), pulls)[..., 0]
+        weighted = sum(weight @ about[..., None] for weight, about in zip(weights, abouts, strict=True))
+        return np.linalg.solve(sum(weights), weighted)[..., 0]
 
     @property
     def obstacle_costs(self) -> tuple[Any, ...]:

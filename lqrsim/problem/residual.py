@@ -20,11 +20,11 @@ class Residual(Term):
 
     Attributes:
       parts: the name of each row.
-      moved: number of states, from the first one on, that the numbers depend on.
+      leading_states: number of states, from the first one on, that the numbers depend on.
     """
 
     parts: tuple[str, ...]
-    moved: int
+    leading_states: int
 
     @property
     def rows(self) -> int:
@@ -39,7 +39,7 @@ class Residual(Term):
 # from AT on, the numbers below, and the table of what is subtracted from the rows, step by step; the last ones hold
 # from their step on.
 ROWS = 1  # number of rows
-MOVED = 1  # number of states, from the first on, that the residual depends on
+LEADING_STATES = 1  # number of states, from the first on, that the residual depends on
 FIRST_STEP = 0  # the first step at which a cost acts: 1 for what cannot change at a given start
 AT = 0
 # From there on: numbers of steps in the table, and of columns; then the column of each row.
@@ -69,9 +69,9 @@ def derivatives(x, u, t, data, hessian, gradient):
             cost, slope, curvature = loss(residual[row], row, data)
             total += cost
             if slope != 0 or curvature != 0:
-                for i in range(MOVED):
+                for i in range(LEADING_STATES):
                     gradient[i] += slope * moves[row, i]
-                    for j in range(MOVED):
+                    for j in range(LEADING_STATES):
                         hessian[i, j] += curvature * moves[row, i] * moves[row, j]
     return total
 
@@ -82,7 +82,7 @@ def row_value(at, u, t, row, data):
     return at[row] - data[AT + COLUMNS + ROWS + min(t, steps - 1) * each + column]
 
 
-def row_slope(at, moves, t, row, data, gradient):
+def row_slope(at, jacobian, t, row, data, gradient):
     """Add its gradient, given the whole residual and its derivatives in the states."""
     for i in range(N):
-        gradient[i] += moves[row, i]
+        gradient[i] += jacobian[row, i]

@@ -80,24 +80,24 @@ class Plan:
             raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the plan")
         filled = horizon == "moving"
 
-        def moved(array: npt.ArrayLike) -> Array:
+        def shift(array: npt.ArrayLike) -> Array:
             return left_after(steps, array, filled=filled)
 
         plan, value = self.trajectory, self.cost_to_go
         if value is not None:
-            value = Quadratic(moved(value.hessian), moved(value.gradient), moved(value.constant))
+            value = Quadratic(shift(value.hessian), shift(value.gradient), shift(value.constant))
         parts = {
             "policy": self.policy.shifted(steps, horizon=horizon),
-            "trajectory": Trajectory(moved(plan.states), moved(plan.controls), plan.dt),
+            "trajectory": Trajectory(shift(plan.states), shift(plan.controls), plan.dt),
             "cost_to_go": value,
             "multipliers": tuple(
-                replace(multiplier, values=moved(multiplier.values)) for multiplier in self.multipliers
+                replace(multiplier, values=shift(multiplier.values)) for multiplier in self.multipliers
             ),
         }
-        return replace(self, **parts, **self._shifted_parts(steps, moved))
+        return replace(self, **parts, **self._shifted_parts(steps, shift))
 
-    def _shifted_parts(self, steps: int, moved: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
-        """Further fields that `shifted` changes, with their new values; `moved` shifts an array."""
+    def _shifted_parts(self, steps: int, shift: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
+        """Further fields that `shifted` changes, with their new values; `shift` shifts an array."""
         return {}
 
 

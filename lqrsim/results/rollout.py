@@ -17,7 +17,7 @@ from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, 
 from lqrsim.results.solution_parts import Trajectory
 
 LISTED = 10  # largest number of trials in a summary, as in a notebook
-MOVED = "goal moved during the run"  # among the disturbances of a run
+GOAL_MOVED = "goal moved during the run"  # among the disturbances of a run
 
 # MuJoCo's warnings, in the order of mjtWarning.
 WARNINGS = (
@@ -355,7 +355,7 @@ class Rollout:
         """
         disturbances = "; ".join(self.disturbances) or "undisturbed"
         lines = [f"{self.robot} in {self.scene}, {disturbances}, seed {self.seed}"]
-        if MOVED in self.disturbances:
+        if GOAL_MOVED in self.disturbances:
             lines.append("  trials are to reach the goal where it was last; the plan was made for another")
         else:
             lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]

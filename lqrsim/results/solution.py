@@ -136,10 +136,10 @@ class Solution(Plan):
             )
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
-    def _shifted_parts(self, steps: int, moved: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
+    def _shifted_parts(self, steps: int, shift: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
         return {
             "inverse_policy": None, "cost_to_come": None, "candidates": (),
-            "clearance": None if self.clearance is None else moved(self.clearance),
+            "clearance": None if self.clearance is None else shift(self.clearance),
             "detail": f"the rest of a solution after {steps} steps; {self.detail}".removesuffix("; "),
         }  # fmt: skip
 

@@ -369,16 +369,16 @@ class MjcfDynamics(Dynamics):
         for softness in SOFTER:
             yield f"{softness:g}", self.stating(softness=softness)
 
-    def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
+    def approaches(self, states: Array, change: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
         nv = self.physics.model.nv
-        motion = moves[:nv] if moves[:nv].any() else moves[nv : 2 * nv]  # a velocity points the way
+        motion = change[:nv] if change[:nv].any() else change[nv : 2 * nv]  # a velocity points the way
         if not motion.any():
             return
         approaches = Approaches(self.mjcf, states, motion)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
             dynamics = self.stating(obstacles=(*self._stated["obstacles"], *approaches.thing))
             for words, positions in approaches:
-                yield words, dynamics, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
+                yield words, dynamics, np.pad(positions, [(0, 0), (0, len(change) - nv)], constant_values=np.nan)
 
     def stating(self, **stated: Any) -> "MjcfDynamics":
         """The same with other arguments of its `MjcfPhysics`."""

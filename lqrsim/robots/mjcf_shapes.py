@@ -63,7 +63,7 @@ class MjcfGeoms(CollisionGeoms):
         return GeomDistances(
             source=source_of(mjcf_distances, ROWS=max(1, len(rows))), data=data,
             parts=tuple(self.scene.model.body(body).name for body, _ in rows),
-            obstacles=tuple(number for _, number in rows), moved=self.scene.model.nv,
+            obstacles=tuple(number for _, number in rows), leading_states=self.scene.model.nv,
             functions=(MjcfMemory.of(mjcf_dynamics),),
         )  # fmt: skip
 
@@ -174,7 +174,7 @@ class SelfClearance(Constraint):
         count = max(1, len(described))
         distances = Residual(
             source_of(mjcf_distances, ROWS=count), mjcf_obstacles.distance_data(model, self._pairs, rows, count, reach),
-            parts=tuple(described), moved=model.nv, functions=(MjcfMemory.of(mjcf_dynamics),),
+            parts=tuple(described), leading_states=model.nv, functions=(MjcfMemory.of(mjcf_dynamics),),
         )  # fmt: skip
 
         def describe(row: int) -> str:

@@ -83,10 +83,10 @@ class ContactModes:
     """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
 
     Attributes:
-      look: called before each part of a long computation, which its exception ends.
+      check_time: called before each part of a long computation, which its exception ends.
     """
 
-    look: Callable[[], None] = staticmethod(lambda: None)
+    check_time: Callable[[], None] = staticmethod(lambda: None)
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._model, self._substeps = model, substeps

@@ -45,11 +45,11 @@ class Approaches:
         the nearest first.
     """
 
-    def __init__(self, mjcf: MjcfModel, states: Array, moves: Array) -> None:
+    def __init__(self, mjcf: MjcfModel, states: Array, change: Array) -> None:
         self._mjcf, self._model, self._steps = mjcf, mjcf.model, len(states) - 1
         model = self._model
-        self._data, self._positions, self._moves = mujoco.MjData(model), states[:, : model.nv], moves
-        root = int(model.body_weldid[model.dof_bodyid[np.argmax(np.abs(moves))]])
+        self._data, self._positions, self._change = mujoco.MjData(model), states[:, : model.nv], change
+        root = int(model.body_weldid[model.dof_bodyid[np.argmax(np.abs(change))]])
         carried: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)  # what the body carries, with it
         for body in range(model.nbody):  # parents come first
             carried[body] = body == root or (body > 0 and carried[model.body_parentid[body]])
@@ -89,7 +89,7 @@ class Approaches:
         shares = np.clip((np.arange(self._steps + 1) - begin) / max(end - begin, 1), 0.0, 1.0)
         way = np.empty((self._steps + 1, 3))
         for t, share in enumerate(shares**2 * (3 - 2 * shares)):
-            self._place(self._positions[t] + share * self._moves)
+            self._place(self._positions[t] + share * self._change)
             way[t] = self._data.geom_xpos[self.thing].mean(axis=0)
         return way
 

@@ -207,7 +207,7 @@ class _Search:
         self._sparing = _LIGHT * self._weights
         limited = model.actuator_forcelimited.astype(bool)
         for tendon in np.flatnonzero(model.tendon_actfrclimited).tolist():
-            limited |= _pulls(model, tendon)
+            limited |= _on_tendon(model, tendon)
         self._limited = np.flatnonzero(np.repeat(limited, model.actuator_outnum))
         self._limited_dofs = model.jnt_dofadr[np.flatnonzero(model.jnt_actfrclimited)]
 
@@ -363,12 +363,12 @@ def _force_limits(model: mujoco.MjModel, forces: Array, now: Array) -> Iterator[
                 np.array([most[number] - largest]),
             )
     for tendon in np.flatnonzero(model.tendon_actfrclimited).tolist():
-        outputs = outs[_pulls(model, tendon)]
+        outputs = outs[_on_tendon(model, tendon)]
         least, most = model.tendon_actfrcrange[tendon, :, None] - now[outputs].sum()
         yield forces[outputs].sum(axis=0)[None], least, most
 
 
-def _pulls(model: mujoco.MjModel, tendon: int) -> npt.NDArray[np.bool_]:
+def _on_tendon(model: mujoco.MjModel, tendon: int) -> npt.NDArray[np.bool_]:
     """Which actuators pull at a tendon."""
     return (model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON.value) & (model.actuator_trnid[:, 0] == tendon)
 
@@ -460,15 +460,18 @@ def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
         mujoco.mj_inverse(model, data)
         return positions, data.qfrc_inverse[free].copy()
 
-    moved = np.zeros(len(free))
-    positions, forces = missing(moved)
+    displacement = np.zeros(len(free))
+    positions, forces = missing(displacement)
     for _ in range(_NEWTON):
-        slopes = [missing(moved + change)[1] - missing(moved - change)[1] for change in _SMALL * np.eye(len(free))]
+        slopes = [
+            missing(displacement + change)[1] - missing(displacement - change)[1]
+            for change in _SMALL * np.eye(len(free))
+        ]
         step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), forces, rcond=1e-6)[0]
         for share in 0.5 ** np.arange(_HALVES):
-            trial, trial_forces = missing(moved + share * step)
+            trial, trial_forces = missing(displacement + share * step)
             if np.linalg.norm(trial_forces) < np.linalg.norm(forces):
-                moved, positions, forces = moved + share * step, trial, trial_forces
+                displacement, positions, forces = displacement + share * step, trial, trial_forces
                 break
         else:
             break

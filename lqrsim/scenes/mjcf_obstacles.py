@@ -235,7 +235,7 @@ def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) 
         return np.zeros(0, dtype=bool)
     always = _touch(model, placed(model), pairs)
     if carried:
-        always &= ~_moved_by(model, pairs, _FREE)
+        always &= ~_carried_by(model, pairs, _FREE)
     remaining = np.flatnonzero(always)
     for data in posed(model, _random_positions(model)) if len(remaining) else ():
         always[remaining] = [_close(model, data, pair) for pair in pairs[remaining]]
@@ -245,7 +245,7 @@ def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) 
     return always
 
 
-def _moved_by(model: mujoco.MjModel, pairs: Pairs, *kinds: int) -> npt.NDArray[np.bool_]:
+def _carried_by(model: mujoco.MjModel, pairs: Pairs, *kinds: int) -> npt.NDArray[np.bool_]:
     """Flags (K,) of the pairs whose moving geom is carried by a joint of one of these kinds."""
     bodies = model.geom_bodyid[pairs[:, 0]].tolist()
     moved = {body: any(kind in kinds for kind, _ in _joints(model, body)) for body in set(bodies)}
@@ -271,7 +271,7 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
 
     It stands there at rest; with a free joint, in a keyframe also counts.
     """
-    floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
+    floating, moving = _carried_by(model, pairs, _FREE), _carried_by(model, pairs, _FREE, _SLIDE)
     if not moving.any():
         return set()
     supports, reach = set[int](), _NEAR + 2 * _LOWERED

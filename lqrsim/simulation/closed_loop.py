@@ -32,7 +32,7 @@ from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
 from lqrsim.results.plan import Plan
-from lqrsim.results.rollout import MOVED, MovingObstacles, Rollout
+from lqrsim.results.rollout import GOAL_MOVED, MovingObstacles, Rollout
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
@@ -388,7 +388,7 @@ class ClosedLoop:
             same_unit = self._target(moved).unit == self._target(goal).unit
             stated = (self.goal_radius, self.goal_tolerance) if same_unit else (None, None)
             goal, radius = moved, self._target(moved).radius(plant.robot.radius, *stated)
-        changed = () if moved is None else (MOVED,)
+        changed = () if moved is None else (GOAL_MOVED,)
         begun = () if self.starts is None else ("given first states",)
         passing = () if self.moving is None else (f"moving obstacles {', '.join(self.moving.names)}",)
         records.turn_to_plan(self.state_coordinates)

@@ -276,9 +276,9 @@ class SimulatorPhysics(Physics):
 
     def prepare(self, *, altered: bool) -> None:
         self._simulations = self._simulator.start(self._states, self._factors, self.plant.timestep)
-        self._look()
+        self._read_states()
 
-    def _look(self) -> None:
+    def _read_states(self) -> None:
         """Read the states. A state with an entry that is not finite becomes NaN."""
         self._states = states_of(self._simulator, self._simulations, self._states.shape)
         lost = ~np.isfinite(self._states).all(axis=1)
@@ -299,7 +299,7 @@ class SimulatorPhysics(Physics):
         period = Period([], [], [], np.full(len(controls), self.parts))
         for part in range(self.parts):
             self._simulator.step(self._simulations, controls, wrench, wind, self._part)
-            self._look()
+            self._read_states()
             period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
             period.states.append(self.state())
             period.frames.append(self.frame())
@@ -308,7 +308,7 @@ class SimulatorPhysics(Physics):
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
         self._simulator.place(self._simulations, self._states + jumps)
-        self._look()
+        self._read_states()
         period.states[-1], period.frames[-1] = self.state(), self.frame()
 
 

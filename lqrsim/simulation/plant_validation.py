@@ -200,11 +200,11 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
                 )
 
 
-def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:
+def _remedy(plant: "Plant", names: list[str], jacobian: Array) -> str:
     """A message that says how each position state moves the body, and how to correct this."""
-    exact = np.abs(np.round(moves) - moves).max() <= OFF
-    rows = np.round(moves)
-    directions = [_direction(row) for row in (rows if exact else moves)]
+    exact = np.abs(np.round(jacobian) - jacobian).max() <= OFF
+    rows = np.round(jacobian)
+    directions = [_direction(row) for row in (rows if exact else jacobian)]
     moved = ", ".join(f"{name} along {direction}" for name, direction in zip(names, directions, strict=True))
     motion = f"MuJoCo moves body {plant.robot.body!r} by a metre of {moved}"
     if exact and (np.abs(rows).sum(axis=1) == 1).all() and (rows.sum(axis=1) == 1).all():

@@ -36,7 +36,7 @@ ROUNDING = 1e-9  # violation that is not mentioned
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class PlanErrors:
     """What a plan does between its knots."""
 
     step_error: float  # see `BetweenKnots`
@@ -65,18 +65,18 @@ class Look:
         return BetweenKnots(self.step_error, self.end_error, violations)
 
 
-def look(problem: Problem, plan: Trajectory) -> Look:
-    """Look at a plan between its knots, at a problem's inequalities; the problem's dt is the plan's."""
+def measure(problem: Problem, plan: Trajectory) -> PlanErrors:
+    """What a plan does between its knots, with a problem's inequalities; the problem's dt is the plan's."""
     motion = Motion(in_c_order(plan.states), in_c_order(plan.controls))
     step_error, end_error = _errors(problem, motion)
     worst, shares = _violations(problem, motion)
-    return Look(step_error, end_error, worst, shares)
+    return PlanErrors(step_error, end_error, worst, shares)
 
 
 def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
     """What a plan for a problem does between its knots; its duration is the plan's."""
     stated = replace(problem, dt=plan.dt, duration=None, time_weight=0.0, accuracy=None, between_knots=False)
-    return look(stated, plan).record(stated)
+    return measure(stated, plan).record(stated)
 
 
 def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
@@ -103,7 +103,7 @@ def _errors(problem: Problem, plan: Motion) -> tuple[float, float]:
 
 
 def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array]]:
-    """The largest violation of each constraint's rows in each period, and where it is; see `Look`.
+    """The largest violation of each constraint's rows in each period, and where it is; see `PlanErrors`.
 
     A start that violates a row, and so cannot be helped, leaves out the first period.
     """
@@ -198,7 +198,7 @@ def solve_between_knots(
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)
-        errors = look(at_knots, solution.trajectory)
+        errors = measure(at_knots, solution.trajectory)
         coarse = problem.accuracy is not None and errors.step_error > problem.accuracy
         missed = problem.between_knots and errors.missed > tolerance
         if not (coarse or missed):

@@ -245,11 +245,11 @@ class Ladder:
         with budget.stop.heeding():
             restored = restore(
                 self._stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), watch=watch,
-                stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes), hurried=budget.hurried,
+                stationary=lambda plan, shares: self._keep_evidence(plan, shares, sizes), hurried=budget.hurried,
             )  # fmt: skip
         return restored
 
-    def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
+    def _keep_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
         result = self._point.result(*plan)
         if not result.violation > FAR * self._allowed:

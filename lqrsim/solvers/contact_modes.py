@@ -73,7 +73,7 @@ class ModeModel:
     """
 
     def __init__(self, problem: Problem, modes: ContactModes, plan: CostedPlan) -> None:
-        self.look = modes.look
+        self.check_time = modes.check_time
         states, controls, steps = plan.states, plan.controls, problem.steps
         n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
         self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
@@ -145,7 +145,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     Args:
       across: a switch that must be crossed by `depth` instead; the change is then as small as possible.
     """
-    model.look()
+    model.check_time()
     try:
         factor = scipy.linalg.cholesky(curvature, lower=True)
     except np.linalg.LinAlgError:
@@ -176,23 +176,23 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
         target = np.zeros(size + 1)
         target[-1] = 1.0
         try:
-            pulls, _ = scipy.optimize.nnls(matrix, target, maxiter=30 * matrix.shape[1])
+            forces, _ = scipy.optimize.nnls(matrix, target, maxiter=30 * matrix.shape[1])
         except RuntimeError:
             return None
-        residual = matrix @ pulls - target
+        residual = matrix @ forces - target
         if not abs(residual[-1]) > 1e-13:  # the rows contradict each other
             return None
         nearest = free - residual[:size] / residual[-1]
         weights[:] = 0.0
-        weights[active] = -pulls / residual[-1]
+        weights[active] = -forces / residual[-1]
         missed = np.flatnonzero(rows @ nearest - bounds < -1e-9 * (1 + np.abs(bounds)))
         if not len(np.setdiff1d(missed, active)):
             break
         active = np.union1d(np.flatnonzero(weights > 0), missed)
     change = scipy.linalg.solve_triangular(factor.T, nearest, lower=False)
-    pulls = np.zeros(len(model.values) + 2 * size)
-    pulls[which] = weights / lengths
-    multipliers, lower, upper = np.split(pulls, [len(model.values), len(model.values) + size])
+    forces = np.zeros(len(model.values) + 2 * size)
+    forces[which] = weights / lengths
+    multipliers, lower, upper = np.split(forces, [len(model.values), len(model.values) + size])
     decrease = -float(model.gradient @ change + 0.5 * change @ curvature @ change)
     return ModeStep(change, decrease, multipliers, (lower - upper).reshape(model.low.shape))
 
@@ -210,9 +210,9 @@ def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: Mode
       earlier: linearised plans, the latest last. step: the step whose multipliers are used.
     """
     n = len(model.last[1])
-    lacking, costate, pulls = np.zeros_like(model.hessian), model.last[1], model.sides * step.multipliers
+    lacking, costate, signed = np.zeros_like(model.hessian), model.last[1], model.sides * step.multipliers
     for t in reversed(range(len(model.periods))):
-        period, pull = model.periods[t], pulls[model.first[t] : model.first[t + 1]]
+        period, pull = model.periods[t], signed[model.first[t] : model.first[t + 1]]
         held = period.switches.names[pull != 0]
         bend, where, before, rate = np.zeros((model.points.shape[1],) * 2), None, None, np.zeros(0)
         for points, periods in (*earlier, (model.points, model.periods)):
@@ -353,8 +353,8 @@ class Descent:
         moves = scipy.linalg.cho_solve(factor, slopes.T)
         system = slopes @ moves
         scale = 1 / np.sqrt(np.maximum(np.diag(system), 1e-300))
-        pulls = np.linalg.lstsq(scale[:, None] * system * scale, scale * missing, rcond=1e-10)[0]
-        return moves @ (scale * pulls)
+        forces = np.linalg.lstsq(scale[:, None] * system * scale, scale * missing, rcond=1e-10)[0]
+        return moves @ (scale * forces)
 
     def _crossed(self, step: ModeStep) -> CostedPlan | None:
         """A cheaper plan across a switch that the present plan is pressed against; None if there is none."""
@@ -364,13 +364,14 @@ class Descent:
                 return best
         return None
 
-    def pulls(self) -> tuple[list[Switches], Array]:
+    def switch_multipliers(self) -> tuple[list[Switches], Array]:
         """The multipliers of the switches of each period, by name, and of the limits of the controls, (T, m)."""
         step = minimize(self.model, self.model.hessian)
         multipliers = np.zeros(len(self.model.values)) if step is None else step.multipliers
         parts = np.split(multipliers, self.model.first[1:-1])
-        pulls = [Switches(period.switches.names, part) for period, part in zip(self.model.periods, parts, strict=True)]
-        return pulls, np.zeros_like(self.model.low) if step is None else step.limits
+        periods = zip(self.model.periods, parts, strict=True)
+        by_period = [Switches(period.switches.names, part) for period, part in periods]
+        return by_period, np.zeros_like(self.model.low) if step is None else step.limits
 
     def _go_to(self, plan: CostedPlan) -> None:
         """Adopt a plan, and linearise about it."""
@@ -382,7 +383,7 @@ class Descent:
 
 def linearized(problem: Problem, modes: ContactModes, state: Array, control: Array) -> Period:
     """A period. If no switch is near, the compiled derivatives are used, which are as good and faster."""
-    modes.look()
+    modes.check_time()
     end, switches = modes.step(state, control)
     if len(switches.names):
         return modes.linearize(state, control)
@@ -430,11 +431,11 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
     if not np.isfinite(plan.cost) or not any(len(modes.step(x, u)[1].names) for x, u in pairs):
         return None
 
-    def look() -> None:
+    def check_time() -> None:
         if run.budget.stop.due:
             raise OutOfTime
 
-    modes.look = look
+    modes.check_time = check_time
     descent = None
     try:
         descent = Descent(problem, modes, plan, run.final, run.budget)
@@ -454,15 +455,15 @@ def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, statu
     """The result of a descent that ended with this status, and its certificate."""
     problem, plan, gain = run.problem, descent.plan, descent.model.gain
     law = compiled.law_about(plan.states, plan.controls, gain)
-    pulls, limits = descent.pulls()
-    optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls, limits)
+    multipliers, limits = descent.switch_multipliers()
+    optimality, value = optimality_in_mode(problem, modes, plan, gain, multipliers, limits)
     motion = Motion(plan.states, plan.controls)
     result = RunResult(
         status=Status.STALLED, plan=motion, law=law, cost=plan.cost, violation=0.0, values={"cost_to_go": value}
     )
     certificate = run.certified(result).certificate
     assert certificate is not None
-    contacts = surroundings(problem, descent.model, plan, pulls)
+    contacts = surroundings(problem, descent.model, plan, multipliers)
     certificate = replace(certificate, optimality=optimality, contacts=contacts)
     detail = f"within its contact modes, against {contacts.pressed} switches"
     if status is Status.CONVERGED:
@@ -477,7 +478,7 @@ def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, statu
 
 
 def optimality_in_mode(
-    problem: Problem, modes: ContactModes, plan: CostedPlan, gain: Array, pulls: Sequence[Switches], limits: Array
+    problem: Problem, modes: ContactModes, plan: CostedPlan, gain: Array, multipliers: Sequence[Switches], limits: Array
 ) -> tuple[float, Quadratic]:
     """A bound on the relative decrease of cost within the plan's own mode, and the policy's cost-to-go.
 
@@ -486,7 +487,7 @@ def optimality_in_mode(
     a separate recursion, not the model from which the plan was found.
 
     Args:
-      pulls: nonnegative multipliers of the switches of each period, by name. limits: multipliers of the control limits,
+      multipliers: nonnegative, of the switches of each period, by name. limits: multipliers of the control limits,
         (T, m), negative for upper limits.
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
@@ -501,7 +502,7 @@ def optimality_in_mode(
         period, hessian, gradient = linearized(problem, modes, x, u), np.zeros((n + m, n + m)), np.zeros(n + m)
         cost += costs.cost_quadratic(x, u, t, data.stage, hessian, gradient)
         switches = period.switches
-        pull = np.nan_to_num(pulls[t].at(switches.names))
+        pull = np.nan_to_num(multipliers[t].at(switches.names))
         decrease += float(pull @ np.abs(switches.values))
         signed = np.where(switches.values < 0, -pull, pull)
         joint = hessian + period.jacobian.T @ ahead @ period.jacobian
@@ -521,9 +522,11 @@ def optimality_in_mode(
     return decrease / max(abs(plan.cost), 1e-300), Quadratic(hessian, slope - bent, constant)
 
 
-def surroundings(problem: Problem, model: ModeModel, plan: CostedPlan, pulls: Sequence[Switches]) -> ContactCertificate:
+def surroundings(
+    problem: Problem, model: ModeModel, plan: CostedPlan, multipliers: Sequence[Switches]
+) -> ContactCertificate:
     """The true cost near a plan: across each switch that the plan is pressed against, and at random samples."""
-    pressed = np.flatnonzero(np.concatenate([pull.values for pull in pulls]) > 0).tolist()
+    pressed = np.flatnonzero(np.concatenate([pull.values for pull in multipliers]) > 0).tolist()
     plans = [beyond(problem, plan, model, which) for which in pressed]
     cheapest = min((crossed.cost for crossed in plans if crossed is not None), default=np.inf)
     draws, reach = np.random.default_rng(0), np.minimum(model.high - model.low, 1e3)

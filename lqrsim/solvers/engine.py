@@ -262,10 +262,10 @@ class SolveRun:
 
     # The phases of a run.
 
-    def solve(self, *, look_back: bool = True) -> RunResult:
+    def solve(self, *, return_best: bool = True) -> RunResult:
         """Smooth; near an optimum take Newton's steps; if the method fails, take the safeguard's steps.
 
-        With `look_back`, a stopped run returns its best plan, which needs another pass for a policy.
+        With `return_best`, a stopped run returns its best plan, which needs another pass for a policy.
         """
         self.smooth(len(self._rows))
         if self.ending.outcome == declarations.IN_VALLEY:
@@ -281,7 +281,7 @@ class SolveRun:
         if lost or (result.success and not self.second_order):
             return result
         if ending.outcome == declarations.TIMED_OUT or (self.settings.safeguard and not self.budget.left):
-            return self.best(result) if look_back else result
+            return self.best(result) if return_best else result
         if result.success:
             return self.newton(patient=True)
         return self.safeguard(result) if self.settings.safeguard else result

@@ -119,7 +119,7 @@ def gradients(
         columns.append([(4 * fine - coarse) / 3 for fine, coarse in zip(narrow, wide, strict=True)])
         errors.append(abs(float(narrow[0] - wide[0])) / 3)
     partials = [np.stack(derivatives, axis=-1) for derivatives in zip(*columns, strict=True)]
-    moves = optimum.moves(*partials[1:]) if plan else (None, None)
+    moves = optimum.sensitivities(*partials[1:]) if plan else (None, None)
     return Gradients(partials[0], np.array(errors), optimum.changing, *moves)
 
 
@@ -196,7 +196,7 @@ class _Optimum:
         stages.give_back()
         return parts
 
-    def moves(self, start: Array, arrived: Array, rows: Array, slopes: Array) -> tuple[Array, Array]:
+    def sensitivities(self, start: Array, arrived: Array, rows: Array, slopes: Array) -> tuple[Array, Array]:
         """The gradients of states (T+1, n, P) and controls (T, m, P), from those of `values`."""
         stages, n = self._stages, self._stages.n
         stages.linearize(self._plan, self._costates, self._forces, 0.0)

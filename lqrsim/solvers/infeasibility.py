@@ -55,7 +55,7 @@ def evidence(
       sizes: typical sizes of each constraint's rows, (rows,). allowed: the tolerance.
       control_size, state_size: typical sizes of controls and states.
     """
-    missed, slopes, alone, holding = _pulls(problem, work, plan, shares, sizes, allowed)
+    missed, slopes, alone, holding = _violation_slopes(problem, work, plan, shares, sizes, allowed)
     if not missed > 0:
         return None
     left, size, pull, pressed = _balance(problem, plan, slopes, alone, control_size, state_size)
@@ -67,7 +67,7 @@ def evidence(
     return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))
 
 
-def _pulls(
+def _violation_slopes(
     problem: Problem, work: Workspace, plan: RunResult, shares: list[Array], sizes: list[Array], allowed: float
 ) -> tuple[float, Array, Array, list[tuple[float, str]]]:
     """The total violation, relative to the rows' sizes, and its slopes.

@@ -109,12 +109,12 @@ class InteriorRun:
         """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
         dynamics, dt, draws = self._problem.dynamics, self._problem.dt, np.random.default_rng(0)
 
-        def moved(one: Array, size: Array) -> Array:
+        def perturbed(one: Array, size: Array) -> Array:
             return one + BESIDE * size * draws.choice([-1.0, 1.0], len(one))
 
         for x, u in zip(found.plan.states[:-1], found.plan.controls, strict=True):
             here = np.hstack(dynamics.linearize(x, u, dt)[:2])
-            beside = moved(x, found.sizes.states), moved(u, found.sizes.controls)
+            beside = perturbed(x, found.sizes.states), perturbed(u, found.sizes.controls)
             if np.abs(np.hstack(dynamics.linearize(*beside, dt)[:2]) - here).max() > JUMP * np.abs(here).max():
                 return True
         return False

@@ -25,7 +25,7 @@ from lqrsim.solvers.parallel import workers
 STARTS = 7
 ASIDE = 3  # number of starts for passing a constraint on another side
 SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
-PULL = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
+PATH_WEIGHT = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # sideways bend of the paths, relative to the distance from start to goal
 FOLD = 0.9  # bend for states that move collision spheres: an arm must fold up before it passes an obstacle
 # States that contacts hold, such as the tilt of a robot on a floor, are drawn to their start. HOLD is the weight,
@@ -62,7 +62,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     Args:
       count: the number of starts; by default `STARTS` if there are obstacles.
     """
-    weight_of_path = pull(problem)
+    weight_of_path = path_weight(problem)
     if weight_of_path == 0 or problem.start is None or problem.goal is None:
         return [("nominal control", None)]
     moving = _moving(problem)
@@ -226,14 +226,15 @@ def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
 
 def check_starts(problem: Problem, count: int | None) -> None:
     """Raises InputError if more than one start is requested although there is nothing to go round."""
-    if count is not None and count > 1 and pull(problem) == 0 and not (any(passable(problem)) and detours(problem)):
+    several = count is not None and count > 1
+    if several and path_weight(problem) == 0 and not (any(passable(problem)) and detours(problem)):
         raise InputError(
             f"starts: got {count}, want 1: there is nothing to go round. More starts need a start and a goal apart from"
             " each other, and an ObstacleCost or a constraint on states between them"
         )
 
 
-def pull(problem: Problem) -> float:
+def path_weight(problem: Problem) -> float:
     """The weight of the path in the first iteration; 0 if there is nothing to go round."""
     moving = _moving(problem)
     if not moving or problem.start is None or problem.goal is None:
@@ -241,7 +242,7 @@ def pull(problem: Problem) -> float:
     if np.array_equal(problem.start[moving], problem.goal[moving]):
         return 0.0
     costs = [cost for cost in problem.obstacle_costs if len(cost.kept_clear.world)]
-    return max((PULL * cost.contact_curvature for cost in costs), default=0.0)
+    return max((PATH_WEIGHT * cost.contact_curvature for cost in costs), default=0.0)
 
 
 def _moving(problem: Problem) -> list[int]:

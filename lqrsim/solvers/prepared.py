@@ -283,7 +283,7 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
     try:
         if run.initial_guess.multipliers:
             return meet_constraints(run, None)
-        result = run.solve(look_back=False)
+        result = run.solve(return_best=False)
         if run.problem.constraints and result.success and not run.budget.stop.due:
             result = meet_constraints(run, result)
         return result

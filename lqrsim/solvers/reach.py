@@ -114,7 +114,7 @@ def approaches(problem: Problem, found: RunResult, places: list[int]) -> Iterato
         yield words, replace(problem, dynamics=dynamics, constraints=constraints).with_costs(stage_cost=stage)
 
 
-def moved_otherwise(problem: Problem, states: Array, places: list[int]) -> bool:
+def can_change(problem: Problem, states: Array, places: list[int]) -> bool:
     """Whether other controls would change one of these states: then the plan is on a plateau, and no optimum."""
     if any(problem.dynamics.untouched_body(states, i) for i in places):
         return True

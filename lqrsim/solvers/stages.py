@@ -167,7 +167,7 @@ class Stages:
         costates, slopes = about.to_go.gradient, plan.controls
         self._module.prepare(
             interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, MEASURES)),
-            survey=(about, plan), look=(about, plan, costates, 0.0), adjoint=(about, costates, slopes),
+            survey=(about, plan), write_models=(about, plan, costates, 0.0), adjoint=(about, costates, slopes),
             trial=(about, plan, about.models.arrived), read_rows=(about, plan, about.rows.numbers),
             least_curvatures=(about, about.rows.force, slopes, slopes[0]),
         )  # fmt: skip
@@ -196,7 +196,7 @@ class Stages:
         Constraints with multipliers up to `least` count as linear.
         """
         self.force[...] = multipliers
-        self.call("look", self.about, plan, costates, float(least))
+        self.call("write_models", self.about, plan, costates, float(least))
 
     def least_curvatures(self, weights: Array, held: Array) -> Array | None:
         """The least curvature (m,) of each control along the plan; None unless the reduced Hessian is definite.

@@ -53,7 +53,7 @@ from lqrsim.solvers.multistart import (
     detours,
     guides,
     passable,
-    pull,
+    path_weight,
     pushes,
     reweighted,
     sinusoidal_controls,
@@ -287,12 +287,12 @@ class Search:
         self._default = self._settings.start is None and self._settings.starts is None
         self.tried = not self._settings.safeguard
         self._finished: list[tuple[SolveRun, RunResult]] = []
-        self._looked: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
+        self._unmoved_of: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
         # A plan and states that miss their goal, which no control changes along it; the best plan that brings them
         # nearer, with the name of its start; the approaches that were tried; and the name and the cost of the cheapest
         # start that brings them nearer.
         self._still: tuple[RunResult, list[int]] | None = None
-        self._moved: tuple[str, RunResult] | None = None
+        self._best_nearer: tuple[str, RunResult] | None = None
         self._approached: list[str] = []
         self._nearer: tuple[str, float] | None = None
         self._softer: list[Candidate] = []  # plans for softer contacts
@@ -521,12 +521,12 @@ class Search:
     @property
     def touches(self) -> bool:
         """Whether the best plan touches a constraint that may be passed on another side."""
-        if self._settings.start is not None or not self.best[0].second_order or pull(self._problem) > 0:
+        if self._settings.start is not None or not self.best[0].second_order or path_weight(self._problem) > 0:
             return False
         touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
         return any(multipliers.values.any() for multipliers in touched)
 
-    def look_aside(self) -> None:
+    def try_detours(self) -> None:
         """Finish plans from paths to the left and to the right."""
         problem, tried = self._problem, {name for name, _ in self._named}
         for name, trajectory in detours(problem, self._settings.starts).items():
@@ -590,7 +590,7 @@ class Search:
             cost = float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0])
             if not (np.isfinite(cost) and reach.differ(plan, before, places)):
                 return False
-            nearer = self._moves(plan)
+            nearer = self._comes_nearer(plan)
             plans.append((not nearer, cost, name, begin))
             return nearer and cost < SAVES * before.cost
 
@@ -614,8 +614,8 @@ class Search:
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
             self._offer(run, other, better=before.violation >= other.violation and other.cost < self.best[1].cost)
-            if self._moves(other) and (self._moved is None or other.cost < self._moved[1].cost):
-                self._moved = name, other
+            if self._comes_nearer(other) and (self._best_nearer is None or other.cost < self._best_nearer[1].cost):
+                self._best_nearer = name, other
 
     def _solve_through(self, through: Problem) -> RunResult:
         """Plan along an approach through the body."""
@@ -623,7 +623,7 @@ class Search:
         with through.dynamics.solving(self._threads), run.budget.limited(APPROACH):
             return refine(run, Known()).kept()
 
-    def _moves(self, plan: RunResult | Motion) -> bool:
+    def _comes_nearer(self, plan: RunResult | Motion) -> bool:
         """Whether a plan brings states nearer to their goal that no control changed along the first plan."""
         return self._still is not None and reach.comes_nearer(self._problem, plan, *self._still)
 
@@ -633,7 +633,7 @@ class Search:
         Where only one of them moves a body that was out of reach, the cost decides. To leave it alone converges easily.
         """
         best = self.best[1]
-        if self._moves(found) == self._moves(best):
+        if self._comes_nearer(found) == self._comes_nearer(best):
             return found.rank < best.rank
         return found.violation <= best.violation and found.cost < best.cost
 
@@ -642,10 +642,10 @@ class Search:
         best, allowed = self.best[1], self._settings.violation_tolerance(self._problem)
         if not np.isfinite(best.cost):
             return []
-        if self._looked[0] is not best:
+        if self._unmoved_of[0] is not best:
             places = reach.unmoved(self._problem, best.states, best.controls, best.cost, allowed)
-            self._looked = best, places
-        return self._looked[1]
+            self._unmoved_of = best, places
+        return self._unmoved_of[1]
 
     @property
     def has_left_given(self) -> bool:
@@ -703,7 +703,7 @@ class Search:
         are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
         less: for the softest contacts, it would leave the body alone again.
         """
-        problem, moved = self._problem, self._moved
+        problem, moved = self._problem, self._best_nearer
         begin = self.best[1] if moved is None else moved[1]
         self._soft = [
             (name, dataclasses.replace(problem, dynamics=dynamics))
@@ -837,7 +837,7 @@ class Search:
         elif self._cut_short and np.isfinite(result.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}".removeprefix("; "))
-        elif not stop.due or (self._still is not None and not self._moves(result)):
+        elif not stop.due or (self._still is not None and not self._comes_nearer(result)):
             result = self._told_of_unmoved(result)
         detail = name_risk(chosen, result) if result.status is Status.RISK_TOO_HIGH else result.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -853,7 +853,7 @@ class Search:
         if not places:
             return found
         parts = reach.described(problem, found.states, places), self._of_approaches(found), found.detail
-        otherwise = reach.moved_otherwise(problem, found.states, places)
+        otherwise = reach.can_change(problem, found.states, places)
         status = Status.STALLED if found.success and otherwise else found.status
         names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
         remedy = f"leave {names} out of the goal, which no control that was tried changes"
@@ -918,13 +918,13 @@ class Search:
     def may_soften(self) -> bool:
         """Whether softer contacts may lead to a better plan: none has converged, or the best leaves a body alone."""
         best = self.best[1]
-        alone = self._moved is not None and not self._moves(best)
+        alone = self._best_nearer is not None and not self._comes_nearer(best)
         return self._default and self.may_go_on and (alone or not best.success)
 
     @property
     def is_guided(self) -> bool:
         """Whether obstacles in the cost push the plan."""
-        return pull(self._problem) > 0
+        return path_weight(self._problem) > 0
 
     @property
     def _cut_short(self) -> bool:
@@ -1026,7 +1026,7 @@ FIRST = (
 ATTEMPTS = (
     *FIRST,
     Attempt("ways through trees of short plans", lambda search: search.may_grow, Search.grow_trees),
-    Attempt("paths to the left and to the right", lambda search: search.touches, Search.look_aside),
+    Attempt("paths to the left and to the right", lambda search: search.touches, Search.try_detours),
     Attempt("a plan beside a saddle", lambda search: search.is_at_saddle, Search.leave_saddles),
     Attempt(
         "pushes by one control at a time, and approaches to a body that nothing touches",

@@ -29,8 +29,8 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.stress.multilevel_splitting import CountedScore, Rounds, Score, failure_probability
 
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
-DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than MOVED
-MOVED = 0.01  # fraction of the distance
+DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than PROGRESS
+PROGRESS = 0.01  # fraction of the distance
 SPREAD = 0.5  # the length s of the steps of the pairs; each number of e is standard normal, over the root of the size
 TOLERANCE = 0.01  # share of the distance that may be left to gain
 GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of the grid
@@ -99,7 +99,7 @@ def smallest_failure(
     with keeping(lambda _: so_far()):
         for number in range(rounds):
             # The oldest rounds were around another point.
-            discount = DISCOUNT if history[-1] < (1 - MOVED) * history[-2:][0] else 1.0
+            discount = DISCOUNT if history[-1] < (1 - PROGRESS) * history[-2:][0] else 1.0
             halves = discount * halves + _gradients(counted, best, pairs, rng)
             remaining = _remaining(halves)
             nearer = _nearer(counted, best, halves.sum(axis=0))

@@ -23,7 +23,7 @@ from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.scenes.world import Obstacle, World
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.recorded_trial import drawn_geoms, model_of, robot_body
-from lqrsim.view.style import AROUND, LOOKS, MARGIN, PLAN, RUNS, SOLID, Panel, Style
+from lqrsim.view.style import AROUND, LAYOUTS, MARGIN, PLAN, RUNS, SOLID, Panel, Style
 
 EDGE = "#5b6470"
 OUTLINES = 24  # number of ellipses whose outlines are drawn
@@ -37,8 +37,8 @@ NOTHING = 0.5  # m around a plan that stays at a place, if the robot has no radi
 CELLS = 200  # across a view, of the grid on which obstacles' outlines are found
 RINGS = np.array([-1.1, -1.0, -0.8, 0.0, 0.8, 1.0, 1.1])  # grid lines through a small obstacle, in its half sizes
 NEAR = "closer than the robot's radius"
-THING = "#a6761d"  # colour of what a run moved
-MOVED = 0.01  # way of an object that counts as moved, relative to the extent of the robot's
+MOVED_COLOUR = "#a6761d"  # colour of what a run moved
+LEAST_MOTION = 0.01  # way of an object that counts as moved, relative to the extent of the robot's
 SHAPES = "sphere", "capsule", "cylinder", "box"  # other geoms are drawn as their bounding boxes
 CERTIFIED = RUNS[0]
 SEEN = 80  # across a view, of the grid on which sensors are shown
@@ -80,7 +80,7 @@ class Views:
     paths: Sequence[DrawnPath]  # the plan is last, on top, with marks at its ends
     tubes: Sequence[TubeArea] = ()
     certified: Ellipsoids | None = None  # with a thick outline
-    moved: Sequence["MovedObject"] = ()
+    objects: Sequence["MovedObject"] = ()
     balls: Sequence[tuple[Array, float, str]] = ()  # centres (3,) and radii, with their colours
     limits: tuple[Array, Array] | None = None  # lowest and highest corner; by default around the places
     sensed: tuple[Belief, Array] | None = None  # and states (k, n): how well its sensors see the places is drawn
@@ -99,7 +99,7 @@ class Views:
         """The panels of the views: wide ones if they are long."""
         low, high = self.corners
         shapes = [slenderness((high - low)[list(plane)]) for plane in self.planes]
-        wide, look = max(shapes) < LONG, LOOKS[style]
+        wide, look = max(shapes) < LONG, LAYOUTS[style]
         width = look.width / (1 if wide else look.columns) - AROUND[1] * look.text / 72
         return [Panel(width * min(shape, 1.0), wide) for shape in shapes]
 
@@ -135,7 +135,7 @@ class Views:
             axes.plot(*start, "o", color=PLAN, markersize=6, zorder=3, label="start")
             axes.plot(*end, "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
             letters = "xyz" if in_space else self.space.plane
-            draw_moved(axes, self.moved, ["xyz".index(letters[i]) for i in along])
+            draw_objects(axes, self.objects, ["xyz".index(letters[i]) for i in along])
         return views
 
 
@@ -281,7 +281,7 @@ def moved_objects(rollout: Rollout, trial: int) -> list[MovedObject]:
         path[number] = data.xipos
         if number in (0, len(frames) - 1):
             geoms.append([_visible(model, data, tree) for tree, _ in objects])
-    least = MOVED * float(np.ptp(np.vstack([rollout.planned_places, rollout.places(trial)]), axis=0).max())
+    least = LEAST_MOTION * float(np.ptp(np.vstack([rollout.planned_places, rollout.places(trial)]), axis=0).max())
     return [
         MovedObject(model.body(body).name or f"body {body}", path[:, body], first, last)
         for (_, body), first, last in zip(objects, *geoms, strict=True)
@@ -302,16 +302,16 @@ def _visible(model: mujoco.MjModel, data: mujoco.MjData, tree: int) -> list[Obst
     return visible
 
 
-def draw_moved(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -> None:
+def draw_objects(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -> None:
     """Draw objects at the beginning and at the end of a run, and their paths, in a plane of the world's axes."""
     for moved in objects:
         low, high = moved.path.min(axis=0), moved.path.max(axis=0)
-        for geoms, line, face in ((moved.first, ":", "none"), (moved.last, "-", (THING, 0.3))):
-            looks = {"facecolor": face, "edgecolor": THING, "linestyle": line, "zorder": 2.4}
+        for geoms, line, face in ((moved.first, ":", "none"), (moved.last, "-", (MOVED_COLOUR, 0.3))):
+            looks = {"facecolor": face, "edgecolor": MOVED_COLOUR, "linestyle": line, "zorder": 2.4}
             for geom in geoms:
                 axes.fill(*_outline(geom, low, high, plane).T, **looks)
         label = f"{moved.name.replace('_', ' ')}, moved"
-        axes.plot(*moved.path[:, plane].T, color=THING, linewidth=1.0, zorder=2.5, label=label)
+        axes.plot(*moved.path[:, plane].T, color=MOVED_COLOUR, linewidth=1.0, zorder=2.5, label=label)
 
 
 def draw_sensed(axes: Axes, belief: Belief, states: Array, low: Array, high: Array, along: list[int]) -> None:

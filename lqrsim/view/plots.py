@@ -29,7 +29,7 @@ from lqrsim.view import figure_parts
 from lqrsim.view import style as styles
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.figure_parts import CERTIFIED, DrawnPath, TubeArea, Views, moved_objects, planes_of
-from lqrsim.view.style import LIMIT, LOOKS, PLAN, RUNS, Panel, Style, arrange, legend_below
+from lqrsim.view.style import LAYOUTS, LIMIT, PLAN, RUNS, Panel, Style, arrange, legend_below
 
 MOMENTS = 7  # number of times at which the balls of a robot are drawn
 AREA = "area: "  # prefix of the label of a tube
@@ -109,13 +109,13 @@ def _sensed(belief: Belief | None, solution: Solution) -> tuple[Belief, Array] |
 def _strips(count: int, style: Style) -> tuple[int, Panel]:
     """In how many columns so many strips are drawn, and their panel."""
     wide = count > STRIPS
-    rows = -(-count // int(LOOKS[style].width / NARROW)) if wide else count
+    rows = -(-count // int(LAYOUTS[style].width / NARROW)) if wide else count
     return -(-count // rows), _strip_panel(rows, style, wide=wide)
 
 
 def _strip_panel(rows: int, style: Style, *, wide: bool = False) -> Panel:
     """The panel of strips below one another: the layout counts their titles and numbers with its height."""
-    return Panel(rows * (STRIP + LINES_OF_STRIP * LOOKS[style].text / 72), wide)
+    return Panel(rows * (STRIP + LINES_OF_STRIP * LAYOUTS[style].text / 72), wide)
 
 
 def _grid(figure: Figure, place: SubplotSpec, count: int, across: int) -> list[Axes]:
@@ -148,7 +148,7 @@ def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: Wo
             tubes.append(TubeArea(ellipsoids, f"{AREA}{name}, {ellipsoids.label}", _paler(color, 0.6), color))
     return Views(
         title="path", space=space, world=world, radius=first.radius, places=places, planes=planes_of(places),
-        paths=[*driven, plan], tubes=tubes, moved=moved,
+        paths=[*driven, plan], tubes=tubes, objects=moved,
     )  # fmt: skip
 
 
@@ -180,7 +180,7 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
             for knot, colour in zip(moments, colours, strict=True)
             for centre, radius in zip(alive[knot], radii, strict=True)
         ],
-        moved=moved_objects(first, trial),
+        objects=moved_objects(first, trial),
     )
 
 

@@ -47,7 +47,7 @@ STYLE = {
 Style = Literal["screen", "page", "column"]
 
 
-class Look(NamedTuple):
+class Layout(NamedTuple):
     """The width of a figure in inches, the size of its text in points, and the panels side by side in it."""
 
     width: float
@@ -56,7 +56,11 @@ class Look(NamedTuple):
 
 
 # Journals' text is 3.4 inches wide in a column and 7.1 in two, and text in figures at least 7 points high.
-LOOKS: dict[Style, Look] = {"screen": Look(11.0, 9.0, 2), "page": Look(7.1, 7.0, 2), "column": Look(3.4, 7.0, 1)}
+LAYOUTS: dict[Style, Layout] = {
+    "screen": Layout(11.0, 9.0, 2),
+    "page": Layout(7.1, 7.0, 2),
+    "column": Layout(3.4, 7.0, 1),
+}
 ROUNDING = 1e-6  # an axis whose range is a smaller part of its values shows that they are equal
 ASIDE = 0.025  # of the middle of such an axis: what is shown on both sides of it
 AROUND = 7.0, 7.0  # lines of text in height and in width that a panel's title, numbers and labels take
@@ -78,7 +82,7 @@ def figure(
     for place in places:
         if place.suffix.lower() not in METADATA:
             raise InputError(f"path: got {excerpt(place.name)}, want a name that ends in one of: {', '.join(METADATA)}")
-    look = LOOKS[style]
+    look = LAYOUTS[style]
     text = {"font.size": look.text, "axes.titlesize": look.text * STYLE["axes.titlesize"] / STYLE["font.size"]}
     with contextlib.ExitStack() as stack:
         unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
@@ -110,7 +114,7 @@ def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") ->
 
     Where the columns are equally high, as below two views side by side, other columns begin.
     """
-    look = LOOKS[style]
+    look = LAYOUTS[style]
     columns = look.columns
 
     def heights_of(section: list[list[int]]) -> list[float]:
