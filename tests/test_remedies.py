@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from failing_solves import CASES, UPRIGHT, mass, problem, reach, swing
 
 import lqrsim as ls
 from lqrsim.results.solution_parts import Iteration, Status
+from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import budget
 
 
@@ -136,3 +138,32 @@ def test_each_status_that_is_no_success_has_a_case() -> None:
     assert {case.status for case in CASES.values()} == {
         status.name for status in Status if not status.success and status not in untried
     }
+
+
+@pytest.mark.parametrize(("aside", "mass", "pillar"), [(0.2, 1.0, "pillar"), (-0.18, 3.0, "post")])
+def test_what_a_plan_grazes_is_named_and_among_the_obstacles_it_is_passed(
+    aside: float, mass: float, pillar: str
+) -> None:
+    """Without obstacles only MuJoCo's contacts keep a disc from a pillar: plans slide along it and do not converge.
+
+    With elliptic cones, there is no descent within contact modes either.
+    """
+    text = f"""<mujoco><option timestep="0.02" cone="elliptic"/><worldbody>
+      <geom name="{pillar}" type="cylinder" size="0.2 0.5" pos="0.5 {aside} 0"/>
+      <body name="disc"><joint name="disc_x" type="slide" axis="1 0 0"/><joint name="disc_y" type="slide" axis="0 1 0"/>
+        <geom type="sphere" size="0.1" mass="{mass}"/></body></worldbody>
+      <actuator><motor name="fx" joint="disc_x" ctrlrange="-9 9"/><motor name="fy" joint="disc_y" ctrlrange="-9 9"/>
+      </actuator></mujoco>"""
+    scene = scene_from_xml(text, "disc")
+
+    def solved(clearance: float | None, **obstacles: Any) -> ls.Solution:
+        robot = ls.MjcfRobot(scene, **obstacles)
+        stated = robot.problem(robot.at(), robot.at(disc_x=1.0), steps=30, dt=0.04, clearance=clearance)
+        return ls.smooth(stated, starts=1, max_iterations=60, threads=1)
+
+    grazing, passing = solved(None, obstacles=False), solved(0.01, obstacles=[pillar])
+    assert not grazing.success, grazing.summary()
+    assert grazing.remedy.startswith(f"the plan grazes {pillar} at ")
+    assert passing.success, passing.summary()
+    away = np.linalg.norm(passing.trajectory.states[:, :2] - [0.5, aside], axis=1) - 0.3
+    assert away.min() > 0.01 - 1e-6  # the tolerance of constraints

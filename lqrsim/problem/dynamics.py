@@ -282,6 +282,13 @@ class Dynamics:
         """Whether a contact or a limit acts in one of some states (k, n)."""
         return False
 
+    def grazed(self, states: Array) -> tuple[int, list[str]]:
+        """The first step at which a plan (T+1, n) grazes geoms that are fixed to the world, and the names of these.
+
+        Those that it touches at its start or at its end do not count.
+        """
+        return 0, []
+
     def untouched_body(self, states: Array, state: int) -> str:
         """The body that a state moves, by its index, if nothing that moves touches it along a plan; or empty."""
         return ""

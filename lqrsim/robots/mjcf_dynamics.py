@@ -36,6 +36,7 @@ from lqrsim.scenes.mujoco_log import unlogged
 RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
 _DIFFERENCE = 1e-6  # step of `mjd_transitionFD`, that of MuJoCo's own tests
+_GRAZED = 1e-3  # m; a plan along a geom is this close to it, in contact or just not
 _CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
 _KINDS = mujoco.mjtConstraint.__members__.items()
 _ONE_SIDED = [int(kind) for name, kind in _KINDS if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
@@ -340,6 +341,18 @@ class MjcfDynamics(Dynamics):
         positions = self._qpos_of(states[np.isfinite(states).all(axis=1)])
         poses = posed(self.physics.model, positions, mujoco.mj_fwdPosition)
         return any(np.isin(data.efc_type, _ONE_SIDED).any() for data in poses)
+
+    @unlogged()
+    def grazed(self, states: Array) -> tuple[int, list[str]]:
+        model, touched = copy.copy(self.physics.model), list[set[int]]()
+        model.geom_margin[:] += _GRAZED
+        for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
+            geoms = np.unique(data.contact.geom)
+            touched.append(set(geoms[model.body_weldid[model.geom_bodyid[geoms]] == 0].tolist()))
+        met = set[int]().union(*touched) - touched[0] - touched[-1]
+        if not met:
+            return 0, []
+        return next(t for t, geoms in enumerate(touched) if geoms & met), [model.geom(i).name for i in sorted(met)]
 
     @unlogged()
     def untouched_body(self, states: Array, state: int) -> str:

@@ -181,6 +181,13 @@ def remedy_of(
     if inside := problem.goal_inside:
         geoms = any("geoms" in term.shape for term in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
+    step, met = problem.dynamics.grazed(found.states) if np.isfinite(found.states).all() else (0, [])
+    if met:
+        grazed = (
+            f"the plan grazes {' and '.join(met)} at {step * problem.dt:.4g} s: if that is only to be passed, let it"
+        )
+        more = {Status.TIME_LIMIT: "; or raise time_limit", Status.MAX_ITERATIONS: "; or raise max_iterations"}
+        return f"{grazed} be among the obstacles= of MjcfRobot, with a clearance{more.get(status, '')}"
     if status is Status.TIME_LIMIT and log:
         took = sum(iteration.seconds for iteration in log)
         similar = "or begin with start=solution of a similar problem"
