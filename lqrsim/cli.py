@@ -59,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except KeyboardInterrupt as stop:
         for note in getattr(stop, "__notes__", ()):
-            process.print_error(f"lqrsim: {note}")
+            if not note.startswith("lqrsim: "):  # those are for users of Python
+                process.print_error(f"lqrsim: {note}")
         if as_command:
             process.end_stopped()
         process.print_error("lqrsim: stopped")

@@ -15,6 +15,7 @@ from typing import Any, get_args, get_type_hints
 import av
 import numpy as np
 import pytest
+from failing_solves import CASES
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -137,9 +138,50 @@ def test_a_solve_that_is_stopped_keeps_its_best_plan(
     monkeypatch.undo()
     kept = ls.load(tmp_path / "stopped.npz", ls.Solution)
     assert (kept.status, len(kept.iterations)) == (ls.Status.INTERRUPTED, rows)
-    assert kept.summary() in capsys.readouterr().out
+    assert console.summary_of(kept) in capsys.readouterr().out
     assert (tmp_path / "solution.npz").read_bytes() == whole
     assert main(["solve", "quadrotor", "--start", str(tmp_path / "stopped.npz"), "--out", str(tmp_path / "on")]) == 0
+
+
+@pytest.mark.parametrize(
+    "remedy", sorted({*(status.remedy for status in ls.Status), *(case.remedy for case in CASES.values())})
+)
+def test_a_remedy_that_a_command_prints_names_its_options(remedy: str, solved: Path) -> None:
+    """Of the solver's options those that the command has, too: any that is left would be one for Python."""
+    solution = dataclasses.replace(ls.load(solved, ls.Solution), remedy=remedy)
+    printed = next((line for line in console.summary_of(solution).splitlines() if "remedy:" in line), "")
+    options = {field.name for field in dataclasses.fields(Solve)}
+    assert not {name for name in re.findall(r"(\w+)=", printed) if name in options}
+    assert not {name for name in re.findall(r"(?<!-)\b[a-z]+_[a-z_]+\b", printed) if name in options}
+    assert {name.replace("-", "_") for name in re.findall(r"--([a-z-]+)", printed)} <= options
+
+
+def test_a_file_that_is_there_is_replaced_and_the_output_says_so(
+    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    solution = ls.load(solved, ls.Solution)
+    for remark in ("", " in place of an older one"):
+        console.save(solution, tmp_path / "solution.npz")
+        assert capsys.readouterr().out == f"wrote {tmp_path / 'solution.npz'}{remark}\n"
+
+
+def test_python_runs_the_package_as_the_command() -> None:
+    run = subprocess.run([sys.executable, "-m", "lqrsim", "--version"], capture_output=True, text=True, check=True)
+    assert run.stdout == f"lqrsim {ls.__version__}\n"
+
+
+def test_a_stopped_command_says_nothing_about_exceptions(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object, **options: Any) -> None:
+        ls.smooth(ls.scenarios.differential_drive().problem, callback=interrupt)
+
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solving.List, "run", stopped)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == "lqrsim: stopped\n"
 
 
 def test_solve_says_that_it_did_not_converge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -139,6 +139,8 @@ def test_a_robot_above_its_ground_is_told_how_to_stand_on_it(joints: str) -> Non
     )
     assert f"; z is not held: {2.1 * 9.81:.3g} N are missing; what stands on the ground starts" in str(robot)
     assert robot._held(robot.at_rest(robot.at())).held  # what the text names helps
+    assert "  obstacles: none\n  ground, which is no obstacle: unnamed_geom_0" in str(robot)
+    assert "  ground" not in str(ls.MjcfRobot(robot.scene, floors=False))
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,22 @@ def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> Non
     assert scenario.name == "cart"
 
 
+def test_start_and_goal_are_settled_where_contacts_carry_the_robot(tmp_path: Path) -> None:
+    """A box on a slide, above its floor: MuJoCo's contact is a spring, which its weight pushes in."""
+    file = tmp_path / "box.xml"
+    file.write_text(
+        """<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 0.3"><joint name="z" type="slide"/>
+        <geom type="box" size="0.1 0.1 0.1" mass="2"/><body><joint name="arm" axis="0 0 1"/><geom size="0.05"/></body>
+        </body></worldbody><actuator><motor joint="arm"/></actuator></mujoco>""",
+        encoding="utf-8",
+    )
+    problem = resolve(f"{file},goal={{'arm': 0.5}},settled=True").problem
+    for state, arm in ((problem.start, 0.0), (problem.goal, 0.5)):
+        np.testing.assert_allclose(state[:2], [-0.2, arm], rtol=0, atol=1e-3)
+    with pytest.raises(InputError, match="settled: got 1, want True or False"):
+        resolve(f"{file},settled=1")
+
+
 def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
     file = tmp_path / "box.xml"
     post = '<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/></worldbody>'

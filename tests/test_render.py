@@ -599,3 +599,26 @@ def test_import_leaves_the_environment_alone() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split() == ["True"]
+
+
+def test_a_rope_is_drawn_between_its_sites(tmp_path: Path) -> None:
+    """In a picture's pose its points are those of MuJoCo's own forward kinematics."""
+    path = tmp_path / "pendulum.xml"
+    path.write_text(
+        """<mujoco><worldbody><site name="top" pos="0 0 1"/><body><joint name="x" type="slide" axis="1 0 0"/>
+        <geom size="0.1"/><site name="eye"/></body></worldbody>
+        <tendon><spatial name="rope"><site site="top"/><site site="eye"/></spatial></tendon>
+        <actuator><motor joint="x"/></actuator></mujoco>""",
+        encoding="utf-8",
+    )
+    robot = ls.MjcfRobot(path)
+    problem = robot.problem(robot.at(), robot.at(x=0.3), steps=10, weights=1e5, effort=1e-3)
+    run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem))
+    recorded = RecordedTrial(run, 0)
+    data, whole = mujoco.MjData(recorded.model), mujoco.MjData(recorded.model)
+    recorded.pose(data, run.times[-1])
+    whole.qpos[:] = data.qpos
+    mujoco.mj_forward(recorded.model, whole)
+    assert whole.ten_length[0] > 1.04  # moved by 0.3 m to the side
+    np.testing.assert_array_equal(data.wrap_xpos, whole.wrap_xpos)
+    assert data.ten_wrapnum[0] == 2

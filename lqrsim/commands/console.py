@@ -2,12 +2,14 @@
 
 import contextlib
 import os
+import re
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,6 +23,16 @@ if TYPE_CHECKING:
 
 # The result that the running command prints with `--json`; None without.
 _RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
+
+
+# The options of `lqrsim solve`, for those of the solver in the texts of remedies.
+_OPTIONS = {
+    r"\bstart=(solution|\[\.\.\.\])": "--start FILE.npz",
+    r'\b(stop|finish)="(\w+)"': r"--\1 \2",
+    r"\btime_limit\b": "--time-limit",
+    r"\bmax_iterations\b": "--max-iterations",
+    r"\bcontrol_limits\b": "--control-limits",
+}
 
 
 class Runnable(Protocol):
@@ -69,9 +81,15 @@ def wants_result() -> bool:
     return _RESULT.get() is not None
 
 
-def wrote(path: Path) -> None:
+def save(result: Any, path: Path) -> None:
+    """Save a result. An older file of that name is replaced, and the line about it says so."""
+    is_older = path.exists()
+    wrote(ls.save(result, path), remark=" in place of an older one" if is_older else "")
+
+
+def wrote(path: Path, *, remark: str = "") -> None:
     """Say that a file or folder was written."""
-    say(f"wrote {path}")
+    say(f"wrote {path}{remark}")
     output = _RESULT.get()
     if output is not None:
         output.setdefault("wrote", []).append(path)
@@ -140,8 +158,16 @@ def solve(scenario: "ls.Scenario", solver: str = "smooth", **options: object) ->
 
     say(Iteration.HEADER)
     solution = solutions.solve(scenario, solver, callback=show, **options)
-    say(solution.summary())
+    say(summary_of(solution))
     return solution
+
+
+def summary_of(solution: "ls.Solution") -> str:
+    """The summary of a solution, whose remedy has the options of `lqrsim solve` where it has those of the solver."""
+    remedy = solution.remedy
+    for pattern, option in _OPTIONS.items():
+        remedy = re.sub(pattern, option, remedy)
+    return replace(solution, remedy=remedy).summary()
 
 
 def load_with_scenario(path: Path, named: str | None) -> "tuple[ls.Solution, ls.Scenario]":

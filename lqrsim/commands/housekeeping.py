@@ -57,7 +57,7 @@ class Demo:
             folder = self.out / folder_name(scenario)
             console.say(f"\n== {reference}: {scenario.summary}")
             solution = replace(console.solve(scenario), scenario=from_anywhere(reference))
-            console.wrote(ls.save(solution, folder / "solution.npz"))
+            console.save(solution, folder / "solution.npz")
             tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
             if remark:
                 console.say(remark)
@@ -77,7 +77,7 @@ class Demo:
                     rollout = ls.simulate(scenario.plant(), plan, controller=law, progress=progress, **options)
                 console.say(rollout.summary())
                 runs[name] = tube.added_to(rollout) if tube is not None and name == "disturbed" else rollout
-                console.wrote(ls.save(runs[name], folder / f"{name}.npz"))
+                console.save(runs[name], folder / f"{name}.npz")
                 rows.append(_row(reference, name, solution, rollout))
             undisturbed = runs["undisturbed"]
             worst, unit = float(undisturbed.tracking_error.max()), undisturbed.tracking_unit

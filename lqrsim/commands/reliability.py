@@ -254,7 +254,7 @@ class FunnelCommand(StudyOptions):
         def write(found: "Funnel") -> int:
             console.say(found.summary())
             console.result(funnel=as_json.of_funnel(found))
-            console.wrote(ls.save(found, folder / "funnel.npz"))
+            console.save(found, folder / "funnel.npz")
             if space.position and set(space.position) <= set(found.chosen):
                 world, radius = scenario.scene.world, scenario.robot.radius
                 console.wrote(ls.view.plot_funnel(found, folder / "funnel.png", world=world, radius=radius))

@@ -113,11 +113,11 @@ class Solve:
             solved = console.solve(scenario, self.solver, **options)
         except KeyboardInterrupt as stop:
             if (best := getattr(stop, "solution", None)) is not None:  # a file of its own: solution.npz may be better
-                console.say(best.summary())
-                console.wrote(ls.save(replace(best, scenario=reference), folder / "stopped.npz"))
+                console.say(console.summary_of(best))
+                console.save(replace(best, scenario=reference), folder / "stopped.npz")
             raise
         solution = replace(solved, scenario=reference)
-        console.wrote(ls.save(solution, folder / "solution.npz"))
+        console.save(solution, folder / "solution.npz")
         console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
             from lqrsim.problem.belief import Belief
@@ -232,7 +232,7 @@ class Simulate:
         if remark:
             console.say(remark)
         rollout = rollout if tube is None else tube.added_to(rollout)
-        console.wrote(ls.save(rollout, folder / "rollout.npz"))
+        console.save(rollout, folder / "rollout.npz")
         console.say(rollout.tally())
         if console.wants_result():
             run = as_json.of_rollout(rollout, scenario.problem)

@@ -111,7 +111,7 @@ class Replay:
             console.say(f"NOT as in the table: {difference}")
         if not different:
             console.say("identical to the table")
-        console.wrote(ls.save(rollout, self.out))
+        console.save(rollout, self.out)
         if console.wants_result():
             run = as_json.of_rollout(rollout, results.trials.scenario.problem)
             console.result(cell=cell, run=run, differences=different)

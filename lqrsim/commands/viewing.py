@@ -215,7 +215,7 @@ class View:
         from lqrsim.scenarios.solutions import given, remarks
 
         solution = given(scenario, path)
-        console.say(solution.summary())
+        console.say(console.summary_of(solution))
         for remark in remarks(scenario, solution):
             console.say(f"{path} {remark}")
         return solution

@@ -129,6 +129,7 @@ class MjcfRobot(Robot):
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
         default = in_the_way(model, candidates, number, floors=floors)
         geoms = chosen_geoms(model, obstacles, default, who)
+        self._candidates = candidates if floors and obstacles is True else []
         self.scene, self.mjcf = scene_of(mjcf, geoms, (*KINDS, *OTHER_KINDS)), mjcf
         self._stated: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
@@ -487,8 +488,15 @@ class MjcfRobot(Robot):
             "past their limits at rest": past,
             "touching at rest": [" and ".join(pair) for pair in contacts_of(model, self.configuration(rest_state)[0])],
             "obstacles": list(self.scene.world.names) or ["none"],
+            "ground, which is no obstacle": self._ground(),
             "carried, without contacts, by": list(dict.fromkeys(mounts)),
         }
+
+    def _ground(self) -> list[str]:
+        """Names of the geoms that would be obstacles if `floors` were False."""
+        model = self.mjcf.model
+        avoidable = in_the_way(model, self._candidates, model.body(self.body).id, floors=False)
+        return [model.geom(geom).name for geom in avoidable if geom not in self.scene.geoms]
 
     @property
     def joint_limits(self) -> StateBounds:
