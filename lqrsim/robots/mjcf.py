@@ -443,7 +443,8 @@ class MjcfRobot(Robot):
             model, driven = self.dynamics.physics.model, {actuator.joint for actuator in self.mjcf.actuators}
             falls = falling(model, self.configuration(self.at())[0])
             if model.dof_jntid[worst] in falls and self.mjcf.joints[model.dof_jntid[worst]].name not in driven:
-                shortfall += "; what stands on the ground starts from robot.at_rest(robot.at()), on the command line with at_rest=True"
+                shortfall += "; what stands on the ground starts from robot.at_rest(robot.at())"
+                shortfall += ", on the command line with at_rest=True"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",
