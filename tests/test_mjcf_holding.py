@@ -120,6 +120,20 @@ def test_too_weak_an_actuator_is_short_by_what_its_limit_leaves(joint: str, actu
     assert robot._held(robot.at()).missed == pytest.approx([-(WEIGHT - 0.4)], rel=1e-6)
 
 
+def test_bodies_that_overlap_are_named_where_nothing_settles() -> None:
+    text = """<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+        <body name="car" pos="0 0 0.3"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="2"/>
+        <body name="fork" pos="0.1 0.12 0"><joint name="steer" axis="0 0 1"/><geom size="0.01" contype="0"/>
+        <body name="wheel"><joint axis="0 1 0"/><geom size="0.04"/></body></body></body></worldbody>
+        <actuator><motor joint="steer"/></actuator>{}</mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(text.format(""), "car"))
+    with pytest.raises(ls.InputError, match=r"(car and wheel|wheel and car) touch, which an <exclude>"):
+        robot.settled(robot.at())
+    excluded = '<contact><exclude body1="car" body2="wheel"/></contact>'
+    robot = ls.MjcfRobot(scene_from_xml(text.format(excluded), "car"))
+    assert robot.settled(robot.at())[2] < 0.3
+
+
 @pytest.mark.parametrize(
     "joints",
     [

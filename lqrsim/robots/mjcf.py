@@ -284,6 +284,9 @@ class MjcfRobot(Robot):
         if residual > _REST * float(model.body_mass.sum()):
             names = self.scene.world.names
             hint = f"; obstacles such as {names[0]} carry nothing: obstacles= chooses others" if names else ""
+            touching = [pair for pair in contacts_of(model, self.configuration(state)[0]) if "world" not in pair]
+            if touching:  # by construction: their contact pushes them apart, and nothing is at rest
+                hint = f"; {' and '.join(touching[0])} touch, which an <exclude> in the <contact> section allows"
             raise InputError(
                 f"state: got no state of rest nearby: {residual:.3g} N or N m are left, want a state in which the"
                 f" robot touches its support, or is above it{hint}"
