@@ -128,10 +128,10 @@ def test_bodies_that_overlap_are_named_where_nothing_settles() -> None:
         <actuator><motor joint="steer"/></actuator>{}</mujoco>"""
     robot = ls.MjcfRobot(scene_from_xml(text.format(""), "car"))
     with pytest.raises(ls.InputError, match=r"(car and wheel|wheel and car) touch, which an <exclude>"):
-        robot.settled(robot.at())
+        robot.at_rest(robot.at())
     excluded = '<contact><exclude body1="car" body2="wheel"/></contact>'
     robot = ls.MjcfRobot(scene_from_xml(text.format(excluded), "car"))
-    assert robot.settled(robot.at())[2] < 0.3
+    assert robot.at_rest(robot.at())[2] < 0.3
 
 
 @pytest.mark.parametrize(

@@ -53,11 +53,11 @@ def test_start_and_goal_are_settled_where_contacts_carry_the_robot(tmp_path: Pat
         </body></worldbody><actuator><motor joint="arm"/></actuator></mujoco>""",
         encoding="utf-8",
     )
-    problem = resolve(f"{file},goal={{'arm': 0.5}},settled=True").problem
+    problem = resolve(f"{file},goal={{'arm': 0.5}},at_rest=True").problem
     for state, arm in ((problem.start, 0.0), (problem.goal, 0.5)):
         np.testing.assert_allclose(state[:2], [-0.2, arm], rtol=0, atol=1e-3)
     with pytest.raises(InputError, match="settled: got 1, want True or False"):
-        resolve(f"{file},settled=1")
+        resolve(f"{file},at_rest=1")
 
 
 def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
