@@ -221,7 +221,12 @@ def test_the_status_of_a_search_without_success_is_true(seed: int) -> None:
     assert solution.status is Status.INFEASIBLE
     assert solution.detail.startswith(f"even in {longest:g} s the goal of {far:g} m for x is missed by ")
     assert solution.remedy.startswith(f"allow more time than {longest:g} s, relax ")
-    assert ls.smooth(problem(way=far, duration=(1.0, 2 * longest))).success
+    spent = sum(candidate.iterations for candidate in solution.candidates)
+    assert solution.detail.endswith(f"; {spent} iterations in all solves")
+    longer = ls.smooth(problem(way=far, duration=(1.0, 2 * longest)))
+    assert longer.success
+    spent = len(longer.iterations) + sum(candidate.iterations for candidate in longer.candidates)
+    assert spent <= int(longer.detail.removesuffix(" iterations in all solves"))
     assert "\n  remedy:" in str(solution)
 
 
