@@ -10,7 +10,7 @@ import pytest
 from linear_plans import by_hand
 from matplotlib.patches import Circle
 from PIL import Image
-from planar_arm import LINK, PlanarArm
+from planar_arm import HEIGHT, LENGTH, LINK, PlanarArm
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -57,6 +57,23 @@ def test_a_run_records_where_its_balls_were(plant: ls.Plant, plan: ls.Solution, 
     assert plant.model.body(body).name == "hand"
     np.testing.assert_array_equal(place, [0.4, 0, 0])
     assert ls.simulate(plant, plan, frames=False).balls is None
+
+
+class Bare(PlanarArm):
+    balls = None  # pyright: ignore[reportAssignmentType]
+
+
+def test_without_balls_the_outermost_part_stands_for_it(plant: ls.Plant) -> None:
+    """The middle of the last link, by the sums of the joints' angles; nothing where a run has ended."""
+    states = np.random.default_rng(0).uniform(-3.0, 3.0, (2, 5, 6))
+    states[1, 3:] = np.nan
+    record = ls.Plant(Bare(), plant.scene).record_of_balls(states[0], states)
+    assert record is not None
+    angles, lengths = np.cumsum(states[..., :3], axis=-1), LENGTH * np.array([1.0, 1.0, 0.5])
+    level = np.stack([np.cos(angles) @ lengths, np.sin(angles) @ lengths], axis=-1)
+    np.testing.assert_allclose(record.driven[..., 0, :2], level, atol=1e-12)
+    np.testing.assert_allclose(record.planned[:, 0, :2], level[0], atol=1e-12)
+    np.testing.assert_allclose(record.planned[..., 2], HEIGHT, atol=1e-12)
 
 
 def test_its_file_is_the_same_run(run: ls.Rollout, tmp_path: Path) -> None:
