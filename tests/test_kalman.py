@@ -3,6 +3,7 @@
 It is the compiled filter that runs, through `OffsetFree.start`. The trials are NumPy's.
 """
 
+from itertools import product
 from typing import Any
 
 import hypothesis
@@ -224,6 +225,21 @@ def test_it_is_consistent_in_a_thousand_trials(case: int) -> None:
         )
         out = ((np.array(means) < low) | (np.array(means) > high)).sum()
         assert out <= binom.ppf(0.999, steps + 1, 0.05), (out, means)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.06])
+def test_an_unknown_is_refused_if_it_moves_what_no_sensor_sees(lag: float) -> None:
+    """A push on either state, on both or on none, where the second moves the first or not, and one of them is read."""
+    for first, second, coupled, read in product([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [0, 1]):
+        system = linear([[-0.5, coupled], [0.0, -0.3]], [[1.0], [1.0]], [[first], [second]])
+        uncertainty = Uncertainty(unknowns=(CONSTANT,), lag=lag, **NOISE)
+        options: dict[str, Any] = {"tolerate": 0.5, "effort": 2.0, "sensors": (f"s{read}",)}
+        seen = second if read else first or second * coupled
+        if (first or second) and not seen:
+            with pytest.raises(ls.InputError, match="unknowns: got d0, which no measurement sees"):
+                ls.OffsetFree(system.problem, system.solution, uncertainty, **options)
+        else:
+            ls.OffsetFree(system.problem, system.solution, uncertainty, **options)
 
 
 def test_a_wrong_noise_is_found_out() -> None:
