@@ -216,10 +216,10 @@ def test_of_unknowns_only_white_ones_are_noise_of_readings(cage, plan, problem):
     control = [slope(*(row * exact.model.uncertainty.control), *np.zeros(6)) for row in np.eye(4)]
     wanted = sensors.each("noise") ** 2 + np.square(control).sum(axis=0)
     lasting = Unknown("force_x", 0.3), Unknown("force_z", 0.3, time_constant=0.5)
-    white = Unknown({"force_x": 0.6, "force_z": 0.8}, 0.3, time_constant=0.0)
+    white = Unknown({"force_y": 0.6, "force_z": 0.8}, 0.3, time_constant=0.0)
     for sensing in (exact, filter_of(*lasting)):
         np.testing.assert_allclose(sensing.noise[t], wanted, atol=1e-6)
-    pushed = slope(*np.zeros(4), 0.18, 0, 0.24, 0, 0, 0)
+    pushed = slope(*np.zeros(4), 0, 0.18, 0.24, 0, 0, 0)
     np.testing.assert_allclose(filter_of(*lasting, white).noise[t], wanted + pushed**2, atol=1e-6)
 
 
