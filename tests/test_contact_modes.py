@@ -10,6 +10,7 @@ import pytest
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import sled
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -31,10 +32,10 @@ from lqrsim.solvers.contact_modes import (
 
 H, DT, STEPS = 0.005, 0.02, 12  # s; a physics step, a control period, and how many of these
 # A slide that a motor pushes to its limit at 1 m, and a ball over the floor.
-SLIDE = """<mujoco><option timestep="0.005" gravity="0 0 0" tolerance="1e-14" integrator="INTEGRATOR"/>
-  <compiler autolimits="true"/><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-1 1"/>
-  <geom size="0.1" mass="MASS"/></body></worldbody>
-  <actuator><motor joint="x" gear="50" ctrlrange="-1 1"/></actuator></mujoco>"""
+SLIDE = sled(
+    joint='range="-1 1"', geom='size="0.1" mass="MASS"', actuators='<motor joint="x" gear="50" ctrlrange="-1 1"/>',
+    option='timestep="0.005" gravity="0 0 0" tolerance="1e-14" integrator="INTEGRATOR"',
+)  # fmt: skip
 BALL = """<mujoco><option timestep="0.005" tolerance="1e-14" integrator="INTEGRATOR"/><compiler autolimits="true"/>
   <worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 0.1"><joint name="x" type="slide" axis="0 0 1"/>
   <geom size="0.1" mass="MASS"/></body></worldbody><actuator><motor joint="x" gear="50" ctrlrange="-1 1"/></actuator>

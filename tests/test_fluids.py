@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mechanisms import sled
 from sampling import examples
 from tracking import track
 
 import lqrsim as ls
 from lqrsim.disturbances import Dryden, Effect, Gusts, MeanWind, preset
 
-SPHERE = """
-<mujoco>
-  <option density="{density}" viscosity="{viscosity}" gravity="0 0 0" timestep="0.002" integrator="RK4" {more}/>
-  <worldbody>
-    <body name="sphere"><joint name="x" type="slide" axis="1 0 0"/><geom size="{radius}" mass="{mass}" {shape}/></body>
-  </worldbody>
-  <actuator><motor name="push" joint="x"/></actuator>
-</mujoco>
-"""
+SPHERE = sled(
+    geom='size="{radius}" mass="{mass}" {shape}',
+    option='density="{density}" viscosity="{viscosity}" gravity="0 0 0" timestep="0.002" integrator="RK4" {more}',
+)
 DT, STEPS = 0.02, 50
 ANY = settings(max_examples=examples(20), suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import arm, motors
+from mechanisms import arm, motors, sled
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -104,15 +104,12 @@ def test_derivatives_of_a_linear_file_have_a_closed_form(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mass, stiffness, damping, gear, lag = (rng.uniform(0.5, 2, 5) * [1, 10, 1, 5, 0.1]).tolist()
     integrator, h, substeps = rng.choice(["Euler", "implicitfast"]), 0.004, int(rng.integers(1, 8))
-    robot = ls.MjcfRobot(
-        scene_from_xml(
-            f"""<mujoco><option timestep="{h}" integrator="{integrator}"/><worldbody><body><joint name="x" type="slide"
-            axis="1 0 0" stiffness="{stiffness!r}" damping="{damping!r}"/><geom size="0.1" mass="{mass!r}"/></body>
-            </worldbody><actuator><general joint="x" gear="{gear!r}" dyntype="filter" dynprm="{lag!r}"/></actuator>
-            </mujoco>""",
-            "mass",
-        )
-    )
+    xml = sled(
+        joint=f'stiffness="{stiffness!r}" damping="{damping!r}"', geom=f'size="0.1" mass="{mass!r}"',
+        actuators=f'<general joint="x" gear="{gear!r}" dyntype="filter" dynprm="{lag!r}"/>',
+        option=f'timestep="{h}" integrator="{integrator}"',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "mass"))
     velocity = np.array([-h * stiffness, mass, h * gear, 0.0]) / (mass + h * damping)
     step = np.stack([h * velocity + [1, 0, 0, 0], velocity, [0, 0, 1 - h / lag, h / lag], [0, 0, 0, 1]])
     expected = np.linalg.matrix_power(step, substeps)
@@ -1306,12 +1303,12 @@ DRY = """<mujoco model="dry"><option timestep="0.005" integrator="implicitfast"/
 @given(mass=st.floats(0.3, 3.0), loss=st.floats(0.2, 3.0), push=st.floats(0.5, 1.0), speed=st.floats(0.5, 2.0))
 def test_dry_friction_is_coulombs_while_a_joint_moves(mass: float, loss: float, push: float, speed: float) -> None:
     """A block that slides loses its friction from each push, whatever its speed: steps in closed form."""
-    xml = f"""<mujoco><option timestep="0.005"/><worldbody><body>
-      <joint name="way" type="slide" axis="1 0 0" frictionloss="{loss!r}"/>
-      <geom type="sphere" size="0.1" mass="{mass!r}"/></body></worldbody>
-      <actuator><motor joint="way" gear="10"/></actuator></mujoco>"""
+    xml = sled(
+        joint=f'frictionloss="{loss!r}"', geom=f'type="sphere" size="0.1" mass="{mass!r}"',
+        actuators='<motor joint="x" gear="10"/>', option='timestep="0.005"',
+    )  # fmt: skip
     robot = ls.MjcfRobot(scene_from_xml(xml, "dry"))
-    state = robot.dynamics.step(robot.at(way_velocity=speed), [push], 0.05)
+    state = robot.dynamics.step(robot.at(x_velocity=speed), [push], 0.05)
     h, rate, way, velocity = 0.005, (10 * push - loss) / mass, 0.0, speed
     for _ in range(10):
         velocity += h * rate

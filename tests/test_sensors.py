@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from mechanisms import sled
 from sampling import examples
 from tracking import hover
 
@@ -34,16 +35,13 @@ IMU = [
     Sensor("quadrotor_position", noise=0.02, rate=10.0, delay=0.04),
 ]
 MET = [ControlNoise(0.02), Gusts(0.1), InitialStateError({"m": 0.02, "m/s": 0.02, "rad": 0.02, "rad/s": 0.02})]
-CART = """<mujoco><option timestep="0.02"/>
-  <worldbody>
-  <body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="0.3"/><geom size=".1" mass="1"/></body>
-  <body name="post" pos="0 5 0"><geom size=".1"/><site name="lamp"/></body></worldbody>
-  <actuator><motor joint="x" ctrlrange="-50 50"/></actuator>
-  <sensor>
+CART = sled(
+    joint='damping="0.3"', limits=[50], option='timestep="0.02"',
+    things='<body name="post" pos="0 5 0"><geom size=".1"/><site name="lamp"/></body>', more="""<sensor>
     <jointpos name="place" joint="x" noise="0.2" nsample="3" interval="0.04" delay="0.02"/>
     <jointvel name="speed" joint="x"/><jointvel name="slow" joint="x" cutoff="0.5"/>
-    <framepos name="lamp" objtype="site" objname="lamp"/><clock name="time"/>
-  </sensor></mujoco>"""
+    <framepos name="lamp" objtype="site" objname="lamp"/><clock name="time"/></sensor>""",
+)  # fmt: skip
 
 
 class Reading(ls.Controller):
