@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 from shooting import Shooting
 from whole_problems.claims import contradictions
 
@@ -67,14 +66,6 @@ class Dense:
         system = np.block([[self.H, -C.T], [C, np.zeros((len(C), len(C)))]])
         found = np.linalg.solve(system, np.concatenate([-self.g, d]))
         return found[: len(self.g)], found[len(self.g) :]
-
-    def least(self, case: ls.Problem, values: Callable[[Array], Array], equal: Callable[[Array], Array]) -> float:
-        """What SLSQP finds from nothing, with numbers that are not to be negative and numbers that are to be zero."""
-        kept = [{"type": "ineq", "fun": values}, {"type": "eq", "fun": equal}]
-        options = {"maxiter": 500, "ftol": 1e-12}
-        found = minimize(self.cost, np.zeros(len(self.g)), method="SLSQP", constraints=kept, options=options)
-        assert found.success
-        return float(found.fun)
 
 
 class TestGoalState:
@@ -221,18 +212,12 @@ class TestInequality:
             ls.SymbolicConstraint(power_left, parameters={"room": room}),
         ]
         case = problem(*kept, soft=soft)
-        solution, dense = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Dense(case)
-        z = dense.pack(solution.trajectory)
-
-        def values(z: Array) -> Array:
-            u, v = dense.controls @ z, dense.states[:-1, 1] @ z
-            return np.concatenate([most - u, most + u, room - u * v])
-
-        least = dense.least(case, values, lambda z: dense.states[-1] @ z - [1, 0])
+        solution, shooting = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Shooting(case)
+        values = shooting.rows(shooting.pack(solution.trajectory), equality=False)
+        least = shooting.least(np.zeros(shooting.size))[1]
         assert solution.status is Status.CONVERGED, solution.summary()
         assert solution.cost == pytest.approx(least, rel=1e-4)
-        assert values(z).min() >= 0
-        assert values(z).min() <= 2e-6  # it acts
+        assert 0 <= values.min() <= 2e-6  # it acts
         assert all(one.values.any() for one in solution.multipliers)
         assert all((one.values >= 0).all() for one in solution.multipliers[1:])
         assert contradictions(case, solution) == []
@@ -250,14 +235,9 @@ class TestStateBounds:
     @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_are_kept_at_every_step(self, soft: bool) -> None:
         case = problem(ls.GoalState([1, 0]), ls.StateBounds(v=(-0.1, 0.55)), soft=soft)
-        solution, dense = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Dense(case)
+        solution, shooting = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Shooting(case)
         speeds = solution.trajectory.states[:, 1]
-
-        def values(z: Array) -> Array:
-            v = dense.states[:, 1] @ z
-            return np.concatenate([v[:-1] + 0.1, 0.55 - v[:-1]])
-
-        least = dense.least(case, values, lambda z: dense.states[-1] @ z - [1, 0])
+        least = shooting.least(np.zeros(shooting.size))[1]
         assert solution.status is Status.CONVERGED, solution.summary()
         assert speeds.min() >= -0.1
         assert 0.55 - 2e-6 <= speeds.max() <= 0.55
