@@ -428,8 +428,8 @@ def brief(value: object) -> str:
 def without_addresses(text: str) -> str:
     """A repr with objects named by their kind, such as "a Replanner", in place of Python's name and address."""
 
-    def kind(found: re.Match[str]) -> str:
-        name = found[1]
+    def kind(match: re.Match[str]) -> str:
+        name = match[1]
         return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
     return _OBJECT.sub(kind, _ADDRESS.sub("", text))

@@ -203,7 +203,7 @@ class Progress:
         self._begun = self._last_line = 0.0
         self._before = 0
 
-    def __call__(self, done: int, total: int, found: str = "") -> None:
+    def __call__(self, done: int, total: int, status: str = "") -> None:
         """Show that `done` of `total` are done, and the result so far."""
         now = time.monotonic()
         if self._bar is None:
@@ -212,7 +212,7 @@ class Progress:
             self._bar = bar(desc=self._what, unit=f" {self._unit}s", total=total, **options)
             if 1 < done < total:  # a campaign that is resumed
                 say(f"{done} of {total} {self._unit}s are done, {total - done} to go")
-        self._bar.set_postfix_str(found, refresh=False)
+        self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(done - self._bar.n)
         last = done == total and now - self._begun > self._every
         if self._watched or not (now - self._last_line > self._every or last):
@@ -222,7 +222,7 @@ class Progress:
         if done > self._before:
             rate = (done - self._before) / (now - self._begun)
             line += f", {rate:.3g} {self._unit}s/s, {self._bar.format_interval((total - done) / rate)} left"
-        say(line + (f"; {found}" if found else ""))
+        say(line + (f"; {status}" if status else ""))
 
     def close(self) -> None:
         if self._bar is not None:

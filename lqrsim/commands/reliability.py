@@ -40,8 +40,8 @@ class FailureOptions(StudyOptions):
         check_count("shown", getattr(self, "shown", 1))
         console.check_output("--out", folder)
 
-        def write(found: Any) -> int:
-            return self._write(found, folder)
+        def write(result: Any) -> int:
+            return self._write(result, folder)
 
         try:
             with console.keeping(write), console.progress(*self.SEARCH) as progress:
@@ -56,7 +56,7 @@ class FailureOptions(StudyOptions):
         """The result of the search, with these callbacks."""
         raise NotImplementedError
 
-    def _write(self, found: Any, folder: Path) -> int:
+    def _write(self, result: Any, folder: Path) -> int:
         """Write a result, and print it. Returns the exit code."""
         raise NotImplementedError
 
@@ -83,12 +83,12 @@ class Rare(FailureOptions):
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "RareFailures":
         return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
 
-    def _write(self, found: "RareFailures", folder: Path) -> int:
-        console.say(found.summary())
-        failures = len(found.splitting.failures)
+    def _write(self, result: "RareFailures", folder: Path) -> int:
+        console.say(result.summary())
+        failures = len(result.splitting.failures)
         others = min(failures, self.shown) - 1
         console.say(f"the worst of {failures:,} failures, as trial 0, and {others} others:")
-        console.say(found.save(folder, shown=self.shown).summary())
+        console.say(result.save(folder, shown=self.shown).summary())
         _wrote(folder, "rare.json", ("rollout.npz", "rare.json", "certificate.npz"))
         return 0
 
@@ -111,9 +111,9 @@ class Break(FailureOptions):
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
         return problem.smallest_failure(**stated(self, problem.smallest_failure, **callbacks))
 
-    def _write(self, found: "SmallestFailure", folder: Path) -> int:
-        console.say(found.summary())
-        console.say(found.save(folder).summary())
+    def _write(self, result: "SmallestFailure", folder: Path) -> int:
+        console.say(result.summary())
+        console.say(result.save(folder).summary())
         _wrote(folder, "break.json", ("rollout.npz", "break.json"))
         return 0
 
@@ -145,14 +145,14 @@ class Harden(FailureOptions):
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
         return ls.stress.harden(problem, **stated(self, ls.stress.harden, **callbacks))
 
-    def _write(self, found: "HardenedPlan", folder: Path) -> int:
-        console.say(found.verdict())
-        shown, files = found.save(folder, shown=self.shown), ["solution.npz", "harden.json"]
+    def _write(self, result: "HardenedPlan", folder: Path) -> int:
+        console.say(result.verdict())
+        shown, files = result.save(folder, shown=self.shown), ["solution.npz", "harden.json"]
         if shown is not None:
             console.say(shown.summary())
             files += ["rollout.npz", "rare.json", "certificate.npz"]
         _wrote(folder, "harden.json", files)
-        return 0 if found.success else 1
+        return 0 if result.success else 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,14 +251,14 @@ class FunnelCommand(StudyOptions):
             disturbances.append(disturbance.scaled(self.strength))
         options = stated(self, ls.funnel, **study.closed_loop, disturbances=disturbances)
 
-        def write(found: "Funnel") -> int:
-            console.say(found.summary())
-            console.result(funnel=as_json.of_funnel(found))
-            console.save(found, folder / "funnel.npz")
-            if space.position and set(space.position) <= set(found.chosen):
+        def write(result: "Funnel") -> int:
+            console.say(result.summary())
+            console.result(funnel=as_json.of_funnel(result))
+            console.save(result, folder / "funnel.npz")
+            if space.position and set(space.position) <= set(result.chosen):
                 world, radius = scenario.scene.world, scenario.robot.radius
-                console.wrote(ls.view.plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
-            return 0 if found.levels.any() else 1
+                console.wrote(ls.view.plot_funnel(result, folder / "funnel.png", world=world, radius=radius))
+            return 0 if result.levels.any() else 1
 
         with console.keeping(write), console.progress("looking", "knot") as progress:
             funnel = ls.funnel(**options, progress=progress)

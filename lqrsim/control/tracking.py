@@ -94,11 +94,11 @@ def choose_tolerances(
     least = narrowest(model, predicted.width)
     worth = predicted.worth(least)
 
-    def lost(found: LoopMoments, laws: Laws, i: int) -> int:
+    def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
         law = laws[0][i], laws[1][i]
-        limited = found.saturation[i].mean() > LIMITED
-        far = LOST * np.sqrt(_squares(counted, found.covariance[i]).max())
-        count = runs_lost(problem, solution, law, found.mean[i], found.covariance[i], counted, far)
+        limited = moments.saturation[i].mean() > LIMITED
+        far = LOST * np.sqrt(_squares(counted, moments.covariance[i]).max())
+        count = runs_lost(problem, solution, law, moments.mean[i], moments.covariance[i], counted, far)
         if count or not limited or truth is None or not truth.uncertainty.unknowns:
             return count
         run = Feedback(_policy_of(solution, law))

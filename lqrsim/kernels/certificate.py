@@ -30,7 +30,7 @@ SQUARES = 1e-28
 OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-9, 1e-2
 
 
-def certify(settings, own, plan, policy, to_go, model, found):
+def certify(settings, own, plan, policy, to_go, model, row):
     """Write cost, residuals and predicted decrease of a plan and its policy.
 
     The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
@@ -43,7 +43,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
       own: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
         them to `to_go`. The Hessians of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
-      found: row of CERTIFICATE, written; before, `typical` may have the least typical cost where nothing is curved.
+      row: row of CERTIFICATE, written; before, `typical` may have the least typical cost where nothing is curved.
         scale: size of the curved part of the cost without cancellation; rounding errors are relative to it.
         typical: the cost of changing each state and control by its range along the plan, or a control by its size.
         dynamics_residual: the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1.
@@ -118,9 +118,9 @@ def certify(settings, own, plan, policy, to_go, model, found):
         if not residual[i] <= worst * size[i]:
             worst = residual[i] / size[i]
     if uncurved > 0:  # where nothing is curved, as with a cost of the final state alone, the cost itself is typical
-        decrease += uncurved / (2 * WEIGHT * max(typical, abs(cost), found.typical))
-    found.cost, found.scale, found.typical, found.dynamics_residual = cost, scale, typical, worst
-    found.policy_residual, found.beyond_limits, found.decrease = off_policy, limits, decrease
+        decrease += uncurved / (2 * WEIGHT * max(typical, abs(cost), row.typical))
+    row.cost, row.scale, row.typical, row.dynamics_residual = cost, scale, typical, worst
+    row.policy_residual, row.beyond_limits, row.decrease = off_policy, limits, decrease
 
 
 def cost_of_change(stage, sizes):
@@ -311,7 +311,7 @@ def box_decrease(matrix, slope, lowest, highest, best):
     return decrease
 
 
-def reduced_curvature(settings, plan, model, found):
+def reduced_curvature(settings, plan, model, row):
     """Write the least curvature of the cost of a plan in the controls, while later controls respond at their best.
 
     The recursion is that of Newton's method, with exact Hessians, about a plan without constraints. A control that its
@@ -319,12 +319,12 @@ def reduced_curvature(settings, plan, model, found):
 
     Args:
       plan: Motion that satisfies the dynamics. model: ProblemModel, with second derivatives of the dynamics.
-      found: row of CERTIFICATE; `curvature` is written, -1 unless the reduced Hessian is positive definite.
+      row: row of CERTIFICATE; `curvature` is written, -1 unless the reduced Hessian is positive definite.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     S, costate, none, least, most, states = stack(N, N), stack(N), zeros(M), stack(M), zeros(M), plan.states
     hessian, gradient, low, high = stage.hessian, stage.gradient, model.limits.low, model.limits.high
-    found.curvature = -1.0
+    row.curvature = -1.0
     fill(least, M, inf)
     cost_of_order(states[settings.steps], none, settings.steps, model.final, 1.0, hessian, gradient)
     copy_matrix(hessian, N, N, S)
@@ -357,7 +357,7 @@ def reduced_curvature(settings, plan, model, found):
     for i in range(M):
         if most[i] > 0:
             curvature = min(curvature, least[i] / most[i])
-    found.curvature = curvature
+    row.curvature = curvature
 
 
 def reduce_stage(hessian, least, S):

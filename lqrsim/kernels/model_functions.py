@@ -208,7 +208,7 @@ def cost_of_each(count, t, plans, cost, costs):
 
 
 @compact
-def states_within(steps, parts, again, plan, model, found):
+def states_within(steps, parts, again, plan, model, out):
     """Write the states (steps parts, N) at the ends of `parts` equal parts of each period, with the controls held.
 
     Args:
@@ -219,5 +219,5 @@ def states_within(steps, parts, again, plan, model, found):
         if again or t == 0:
             copy(plan.states[t], N, z)
         for k in range(parts):
-            advance(z, plan.controls[t], model, model.dt / parts, found[t * parts + k])
-            copy(found[t * parts + k], N, z)
+            advance(z, plan.controls[t], model, model.dt / parts, out[t * parts + k])
+            copy(out[t * parts + k], N, z)

@@ -161,16 +161,16 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
     return tuple(terms)
 
 
-def _check_bounds(found: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
+def _check_bounds(all_bounds: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
     """Raises InputError if a bound does not have a number for each knot, or those of a state leave nothing between."""
     names = dynamics.state_coordinates.names
-    for i, sides in (item for bounds in found for item in bounds.items()):
+    for i, sides in (item for bounds in all_bounds for item in bounds.items()):
         for side in sides:
             if isinstance(side, np.ndarray) and len(side) != knots:
                 want = f"one, or one for each of {knots} knots"
                 raise InputError(f"StateBounds: {names[i]}: got {len(side)} numbers, want {want}")
-    for i in {i for bounds in found for i in bounds}:
-        lows, highs = zip(*(bounds[i] for bounds in found if i in bounds), strict=True)
+    for i in {i for bounds in all_bounds for i in bounds}:
+        lows, highs = zip(*(bounds[i] for bounds in all_bounds if i in bounds), strict=True)
         sides = functools.reduce(np.maximum, lows), functools.reduce(np.minimum, highs)
         low, high = (np.broadcast_to(side, knots) for side in sides)
         if crossed := np.flatnonzero(~(low < high)).tolist():

@@ -123,25 +123,25 @@ class ContactModes:
         )
         return np.concatenate([data.qpos, data.qvel]), Switches(names[order], values[order])
 
-    def _runge_kutta(self, stage: int, found: list[tuple[Names, Array]]) -> None:
+    def _runge_kutta(self, stage: int, switches: list[tuple[Names, Array]]) -> None:
         """A physics step of `mj_RungeKutta`, whose four stages each have their own contacts."""
         model, data, h = self._model, self._data, self._model.opt.timestep
         qpos, qvel, time = data.qpos.copy(), data.qvel.copy(), data.time
         mujoco.mj_forward(model, data)
-        self._observe(stage, data.qpos, found)
+        self._observe(stage, data.qpos, switches)
         speeds, rates = [qvel], [data.qacc.copy()]
         for number, share in enumerate((0.5, 0.5, 1.0)):
             data.qpos[:] = qpos + h * share * speeds[number]
             data.qvel[:], data.time = qvel + h * share * rates[number], time + h * share
             mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
-            self._observe(stage + number + 1, data.qpos, found)
+            self._observe(stage + number + 1, data.qpos, switches)
             speeds.append(data.qvel.copy())
             rates.append(data.qacc.copy())
         weights = np.array([1.0, 2.0, 2.0, 1.0]) / 6
         data.qpos[:], data.qvel[:] = qpos + h * weights @ speeds, qvel + h * weights @ rates
         data.time = time + h
 
-    def _observe(self, stage: int, qpos: Array, found: list[tuple[Names, Array]]) -> None:
+    def _observe(self, stage: int, qpos: Array, switches: list[tuple[Names, Array]]) -> None:
         """Add the switches of a stage at these positions (nq,), whose forces are in the data."""
         model, seen = self._model, self._seen
         seen.qpos[:] = qpos
@@ -149,13 +149,13 @@ class ContactModes:
         limits, first = _among(seen.efc_type, _LIMITS), stage * _STAGE
         if limits.any():
             distances = (seen.efc_pos - seen.efc_margin)[limits] + _NEAR
-            found.append((first + _limits(self._ahead, seen, limits), distances))
+            switches.append((first + _limits(self._ahead, seen, limits), distances))
         if seen.ncon:
             geoms, wide_margin, geom_margin = seen.contact.geom, self._ahead.geom_margin, model.geom_margin
             # Versions of MuJoCo differ in whether the margin of two geoms is their sum or their maximum.
             summed = np.abs(seen.contact.includemargin - wide_margin[geoms].sum(axis=1)) < 1e-9
             margins = np.where(summed, geom_margin[geoms].sum(axis=1), geom_margin[geoms].max(axis=1))
-            found.append((first + _contacts(geoms), seen.contact.dist - margins))
+            switches.append((first + _contacts(geoms), seen.contact.dist - margins))
         data = self._data
         if data.nefc == 0:
             return
@@ -164,12 +164,12 @@ class ContactModes:
         mujoco.mj_mulJacVec(model, data, excess, data.qacc)
         excess -= data.efc_aref
         if limits.any():
-            found.append((first + _FORCE + _limits(model, data, limits), excess[limits]))
+            switches.append((first + _FORCE + _limits(model, data, limits), excess[limits]))
         if contacts.any():
             numbers = data.efc_id[contacts]
             edges = np.arange(len(numbers)) - np.searchsorted(numbers, numbers)
             names = first + _FORCE + _contacts(data.contact.geom)[numbers] + edges
-            found.append((names, excess[contacts]))
+            switches.append((names, excess[contacts]))
 
     def linearize(self, state: Array, control: Array) -> Period:
         """The control period and its derivatives, by differences that stay in its contact mode.

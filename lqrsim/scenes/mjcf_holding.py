@@ -179,9 +179,9 @@ def holding(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> Holding:
     search = _Search(rest)
     # Targets of velocity are left at 0 if other controls can hold.
     low, high = (np.where(rest.slow, rest.neutral, side) for side in (rest.low, rest.high))
-    solution = search.found(low, high)
+    solution = search.solve(low, high)
     if rest.slow.any() and not solution.held:
-        solution = search.found(rest.low, rest.high)
+        solution = search.solve(rest.low, rest.high)
     return solution
 
 
@@ -221,7 +221,7 @@ class _Search:
         missing, moving = missing / self._size, moving * self._weights[self._rest.model.nu :]
         return float(missing @ missing) + float(moving @ moving)
 
-    def found(self, low: Array, high: Array) -> Holding:
+    def solve(self, low: Array, high: Array) -> Holding:
         """The controls and activations that hold within these ranges (nz,), or a least score nearby."""
         rest, model = self._rest, self._rest.model
         self._low, self._high = low, high

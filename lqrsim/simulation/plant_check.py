@@ -323,19 +323,19 @@ def _in_simulator(
 
 
 def _worst_of(
-    found: list[_Sample], robot: Robot, period: float, tolerance: float, touching: Counter[tuple[str, str]]
+    samples: list[_Sample], robot: Robot, period: float, tolerance: float, touching: Counter[tuple[str, str]]
 ) -> PlantCheck:
     """The result over all samples, with the sample in which the worst state has its largest error."""
-    errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in found])
-    changes = np.array([np.abs(sample.predicted - sample.before) for sample in found])
-    space, first = robot.dynamics.state_coordinates, found[0]
+    errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in samples])
+    changes = np.array([np.abs(sample.predicted - sample.before) for sample in samples])
+    space, first = robot.dynamics.state_coordinates, samples[0]
     check = PlantCheck(
         names=space.names, units=space.units, errors=errors.max(axis=0), changes=changes.max(axis=0), period=period,
         state=first.before, control=first.control, simulated=first.simulated, predicted=first.predicted,
-        tolerance=tolerance, samples=len(found),
+        tolerance=tolerance, samples=len(samples),
         contacts=tuple((*pair, count) for pair, count in touching.most_common()),
     )  # fmt: skip
-    worst = found[int(errors[:, check.names.index(check.worst)].argmax())]
+    worst = samples[int(errors[:, check.names.index(check.worst)].argmax())]
     return replace(
         check, state=worst.before, control=worst.control, simulated=worst.simulated, predicted=worst.predicted
     )

@@ -36,7 +36,7 @@ FAR = 0.01  # relative decrease of cost that is still predicted; a plan with mor
 
 def assemble(
     problem: Problem,
-    found: RunResult,
+    result: RunResult,
     log: Sequence[Iteration],
     *,
     solver: str,
@@ -44,20 +44,20 @@ def assemble(
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
     """Copy the result of a run into a Solution."""
-    assert found.certificate is not None
-    falls = bool(log) and found.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
-    if falls and not found.success and found.status is not Status.NOT_POSITIVE_DEFINITE:
-        found = replace(found, status=Status.DIVERGED, detail="the cost falls without bound")
-    states, controls, law = found.states.copy(), found.controls.copy(), (found.law[0].copy(), found.law[1].copy())
-    inverse_law = found.values.get("inverse_law")
+    assert result.certificate is not None
+    falls = bool(log) and result.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
+    if falls and not result.success and result.status is not Status.NOT_POSITIVE_DEFINITE:
+        result = replace(result, status=Status.DIVERGED, detail="the cost falls without bound")
+    states, controls, law = result.states.copy(), result.controls.copy(), (result.law[0].copy(), result.law[1].copy())
+    inverse_law = result.values.get("inverse_law")
     if inverse_law is not None:
         inverse_law = inverse_law[0].copy(), inverse_law[1].copy()
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
     policy = partial(compiled.policy_of, problem)
-    unstable = unstable_step(problem, states, controls, sound=found.success)
-    doubts = (_near_singular(problem, found), _fragile(problem, found)) if np.isfinite(states).all() else ()
-    said = found.detail, _usable(found, options), *doubts, unstable.detail if unstable else ""
+    unstable = unstable_step(problem, states, controls, sound=result.success)
+    doubts = (_near_singular(problem, result), _fragile(problem, result)) if np.isfinite(states).all() else ()
+    said = result.detail, _usable(result, options), *doubts, unstable.detail if unstable else ""
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -67,19 +67,19 @@ def assemble(
     }
     return Solution._assembled(
         later,
-        status=found.status,
+        status=result.status,
         detail="; ".join(part for part in said if part),
-        remedy=remedy_of(problem, found, log, options, shorter=unstable.remedy if unstable else ""),
+        remedy=remedy_of(problem, result, log, options, shorter=unstable.remedy if unstable else ""),
         policy=policy(*law, nominal[:-1]),
-        cost_to_go=copy_of(found.values.get("cost_to_go")),
-        cost_to_come=copy_of(found.values.get("cost_to_come")),
+        cost_to_go=copy_of(result.values.get("cost_to_go")),
+        cost_to_come=copy_of(result.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=tuple(log),
-        certificate=found.certificate,
-        gap=found.gap,
+        certificate=result.certificate,
+        gap=result.gap,
         solver=solver,
         options=options,
-        multipliers=found.multipliers,
+        multipliers=result.multipliers,
         candidates=candidates,
         versions=versions(),
         goal=problem.weighed_goal,
@@ -92,13 +92,13 @@ def parts_of(problem: Problem) -> dict[str, str]:
     return {name: printable(" ".join(text.split()))[: 10 * LINE] for name, text in problem.parts.items() if text}
 
 
-def _usable(found: RunResult, options: dict[str, object]) -> str:
+def _usable(result: RunResult, options: dict[str, object]) -> str:
     """What the certificate says of a plan that is finished but not optimal, because time or iterations ended; or empty.
 
     It is empty for a plan that misses a constraint, which the detail names.
     """
-    plan, tolerance, allowed = found.certificate, options.get("tolerance"), options.get("constraint_tolerance")
-    if found.status not in (Status.TIME_LIMIT, Status.MAX_ITERATIONS) or plan is None or not np.isfinite(plan.cost):
+    plan, tolerance, allowed = result.certificate, options.get("tolerance"), options.get("constraint_tolerance")
+    if result.status not in (Status.TIME_LIMIT, Status.MAX_ITERATIONS) or plan is None or not np.isfinite(plan.cost):
         return ""
     missed = plan.violation > (allowed if isinstance(allowed, float) else 0.0)
     if missed or plan.start or plan.limits or not (plan.dynamics_residual <= MOTION and plan.policy_residual <= LAW):
@@ -114,13 +114,13 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
     )
 
 
-def _near_singular(problem: Problem, found: RunResult) -> str:
+def _near_singular(problem: Problem, result: RunResult) -> str:
     """Where a rotation of the plan is nearly singular, in words; or empty.
 
     All rotation vectors of whole turns are the same attitude; and a tilt of half a turn is the same attitude in each
     direction, with another turn. Next to them a small error of the attitude is a large one of the states.
     """
-    space, states = problem.dynamics.state_coordinates, found.states
+    space, states = problem.dynamics.state_coordinates, result.states
     for first, turn in zip(space.rotation_vectors, space.turns, strict=True):
         entries = [first + i for i in range(3) if i != turn]
         period, close, multiple, where = 2 * np.pi, WHOLE, "a whole turn", "rotation vectors"
@@ -149,35 +149,35 @@ def _regular_axis(vectors: Array) -> str | None:
     return axis if tilts[axis] < np.pi - HALF else None
 
 
-def _fragile(problem: Problem, found: RunResult) -> str:
+def _fragile(problem: Problem, result: RunResult) -> str:
     """Where the policy leaves the plan from a start that differs by rounding, in words; or empty.
 
     Where a contact begins or ends, a step may jump, and rounding decides which way. Only then is it looked at.
     """
-    states, space = found.states, problem.dynamics.state_coordinates
+    states, space = result.states, problem.dynamics.state_coordinates
     if not problem.dynamics.touches(states):
         return ""
     for draw in range(BESIDE):
         signs = np.sign(np.sin(1.0 + (1 + draw) * np.arange(1, len(space) + 1)))
-        run, _ = compiled.rollout(problem, *found.law, states[0] + LITTLE * signs)
+        run, _ = compiled.rollout(problem, *result.law, states[0] + LITTLE * signs)
         if said := departure(space, run, states, problem.dt):
             return f"from a start that differs by {LITTLE:g} in each state, the policy {said}"
     return ""
 
 
 def remedy_of(
-    problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object], *, shorter: str
+    problem: Problem, result: RunResult, log: Sequence[Iteration], options: dict[str, object], *, shorter: str
 ) -> str:
     """The remedy for this case; if none is known, the usual one for the status. Empty for a success that needs none.
 
     `shorter` names the steps to take where those of the plan are unstable.
     """
-    status = found.status
+    status = result.status
     lost = status in (Status.NOT_FINITE, Status.NOT_POSITIVE_DEFINITE, Status.DIVERGED)
     if lost and options.get("safeguard") is False:
         return "solve with safeguard=True, whose steps only lower the cost"
-    if shorter or status.success or found.remedy:
-        return shorter or found.remedy
+    if shorter or status.success or result.remedy:
+        return shorter or result.remedy
     if inside := problem.goal_inside:
         geoms = any("geoms" in term.shape for term in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
@@ -192,9 +192,9 @@ def remedy_of(
         took = sum(iteration.seconds for iteration in log)
         similar = "or begin with start=solution of a similar problem"
         return f"raise time_limit: {len(log)} iterations took {took:.2g} s; {similar}"
-    if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
+    if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not result.violation > 0:
         fell = log[-1].improvement * abs(log[-1].cost)
-        costs = f"by {fell:.2g}; the plan costs {found.cost:.6g}"
+        costs = f"by {fell:.2g}; the plan costs {result.cost:.6g}"
         return f"raise max_iterations: the cost still fell in the last one, {costs}"
     limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
     paper = options.get("finish", "newton") is None or options["stop"] == "cost"
@@ -203,23 +203,23 @@ def remedy_of(
     if paper and can_be_exact(problem) and helps and status is not Status.TIME_LIMIT:
         better = "the interior point" if bounded else "Newton's method"
         return f'solve with finish="newton" and stop="optimal": {better} finds plans where this method does not'
-    if status is Status.NOT_FINITE and not np.isfinite(found.states).all():
+    if status is Status.NOT_FINITE and not np.isfinite(result.states).all():
         begin = "begin with start=[...], controls under which the states stay in their domain"
         return begin if "form" in options else f"solve with smooth, or {begin}"
-    if status is Status.INFEASIBLE and found.against:
-        relaxed = f"relax {found.against[0].rsplit(' at ', 1)[0]}"
+    if status is Status.INFEASIBLE and result.against:
+        relaxed = f"relax {result.against[0].rsplit(' at ', 1)[0]}"
         return f"allow more time than {problem.dt * problem.steps:g} s, {relaxed}, or ask for less of what is missed"
-    if status is Status.NOT_POSITIVE_DEFINITE and (flat := _flat_controls(problem, found)):
+    if status is Status.NOT_POSITIVE_DEFINITE and (flat := _flat_controls(problem, result)):
         return f"the cost is not curved in {', '.join(flat)}: give control_limits, or add a ControlCost"
     return status.remedy
 
 
-def _flat_controls(problem: Problem, found: RunResult) -> list[str]:
+def _flat_controls(problem: Problem, result: RunResult) -> list[str]:
     """The controls in which the stage cost is not curved at the first step of a plan."""
-    n, names = found.states.shape[1], problem.control_coordinates.names
+    n, names = result.states.shape[1], problem.control_coordinates.names
     joint = n + len(names)
     hessian, gradient = np.zeros((joint, joint)), np.zeros(joint)
-    state, control = found.states[0].copy(), found.controls[0].copy()
+    state, control = result.states[0].copy(), result.controls[0].copy()
     stage = compiled.arguments(problem).stage
     compiled.costs_module(problem).cost_quadratic(state, control, 0, stage, hessian, gradient)
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]

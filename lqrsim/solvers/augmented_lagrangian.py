@@ -55,42 +55,43 @@ def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> Solv
     return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
 
 
-def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
+def _with_constraints(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResult]:
     """Continue from the result without the constraints; also return the run that has the answer in its memory."""
     if run.budget.over:
-        if found.success and not run.work.keeps(run.work.constraint_values(*found.plan)):
+        if result.success and not run.work.keeps(run.work.constraint_values(*result.plan)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
-            found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
-        return run, found
-    if found.success:
-        return run, meet_constraints(run, found)
-    return _first_feasible(run, found)
+            result = dataclasses.replace(result, status=status, detail="before the constraints could be met")
+        return run, result
+    if result.success:
+        return run, meet_constraints(run, result)
+    return _first_feasible(run, result)
 
 
-def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STALE) -> RunResult:
+def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: int = STALE) -> RunResult:
     """Continue from the result without the constraints or, without one, from another solution's multipliers.
 
     `stale` is the number of undamped iterations without progress after which damped iterations follow.
     """
     lagrangian = AugmentedLagrangian(run)
-    if found is None:
+    if unconstrained is None:
         run.roll_out()
         lagrangian.evaluate(*run.work.last)
         run.weigh_noise(run.work.last)
     else:
-        lagrangian.evaluate(*found.plan)
+        lagrangian.evaluate(*unconstrained.plan)
         if lagrangian.kept:
-            return found
+            return unconstrained
         lagrangian.start()
-        run.weigh_noise(found.plan)
-        found = dataclasses.replace(found, plan=Motion(*map(np.copy, found.plan)))  # the arrays will be overwritten
-    undamped = _undamped(run, lagrangian, known=found is None, patience=stale)
+        run.weigh_noise(unconstrained.plan)
+        plan = Motion(*map(np.copy, unconstrained.plan))  # the arrays will be overwritten
+        unconstrained = dataclasses.replace(unconstrained, plan=plan)
+    undamped = _undamped(run, lagrangian, known=unconstrained is None, patience=stale)
     if undamped.success or not run.settings.safeguard or run.budget.over:
         return undamped
-    return _damped(run, lagrangian, found, undamped)
+    return _damped(run, lagrangian, unconstrained, undamped)
 
 
-def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
+def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResult]:
     """Find a plan that keeps the constraints without the cost of obstacles, then add that cost.
 
     This helps if not even the problem without the constraints is solved, because deep inside obstacles their cost
@@ -98,7 +99,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     """
     problem, budget = run.problem, run.budget
     if not (run.settings.safeguard and any(cost.contact_curvature for cost in problem.obstacle_costs)):
-        return run, found
+        return run, result
     plain = problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, 0.0))
     without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))
     with budget.without_costs():
@@ -116,8 +117,8 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     run = _again(run, problem, initial_guess)
     if first.multipliers:
         return run, meet_constraints(run, None)
-    found = run.solve()
-    return run, meet_constraints(run, found) if found.success and not budget.over else found
+    result = run.solve()
+    return run, meet_constraints(run, result) if result.success and not budget.over else result
 
 
 def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, patience: int) -> RunResult:
@@ -161,12 +162,12 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
 
 
 def _damped(
-    run: SolveRun, lagrangian: "AugmentedLagrangian", found: RunResult | None, undamped: RunResult
+    run: SolveRun, lagrangian: "AugmentedLagrangian", unconstrained: RunResult | None, undamped: RunResult
 ) -> RunResult:
     """The safeguard: from the plan without constraints, or the last plan with constraints, whichever is better."""
     work = run.work
     plans = [(work.last, undamped.cost)]
-    plans += [(found.plan, found.cost)] if found is not None else []
+    plans += [(unconstrained.plan, unconstrained.cost)] if unconstrained is not None else []
     plans = [(plan, cost) for plan, cost in plans if np.isfinite(cost)]
     if not plans:
         return undamped

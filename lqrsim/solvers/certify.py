@@ -83,10 +83,10 @@ def no_value(states: Array) -> CostToGo:
 
 
 def certificate_of(
-    problem: Problem, found: np.void, states: Array, *, violation: float, least: float = 0.0
+    problem: Problem, row: np.void, states: Array, *, violation: float, least: float = 0.0
 ) -> Certificate:
     """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote."""
-    cost, scale, typical, motion, law, beyond, decrease, _ = (float(found[name]) for name in CERTIFICATE.names or ())
+    cost, scale, typical, motion, law, beyond, decrease, _ = (float(row[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):
         start = float(np.abs(states[0] - problem.initial.numbers).max())

@@ -98,7 +98,7 @@ class Ladder:
                 break
         return self._answer()
 
-    def finish_found(self) -> RunResult | None:
+    def finish_interior(self) -> RunResult | None:
         assert self.guess.found is not None
         return self._remember(self._point.finish(self.guess.found))
 
@@ -195,11 +195,11 @@ class Ladder:
         assert self.smoothed is not None
         return self._at_a_price(self.smoothed)
 
-    def _after_multipliers(self, found: RunResult, *, most: float = np.inf) -> RunResult | None:
+    def _after_multipliers(self, result: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
-        plan = copied(found)
+        plan = copied(result)
         self._point.without_multipliers()
-        usable = np.isfinite(found.cost) and found.cost <= most and np.isfinite(plan.states).all()
+        usable = np.isfinite(result.cost) and result.cost <= most and np.isfinite(plan.states).all()
         if self._budget.stop.due or not usable:
             return None
         return self._interior(plan, LITTLE)
@@ -269,15 +269,15 @@ class Ladder:
         """The result of the interior point from a plan."""
         return self._remember(self._point.solve(plan, barrier, multipliers=multipliers, stale=stale))
 
-    def _remember(self, found: RunResult | None) -> RunResult | None:
+    def _remember(self, result: RunResult | None) -> RunResult | None:
         """Keep a result if it is the best so far."""
-        if found is not None and (self._best is None or found.rank < self._best.rank):
-            self._best = found.kept()
-        return found
+        if result is not None and (self._best is None or result.rank < self._best.rank):
+            self._best = result.kept()
+        return result
 
-    def _worse(self, found: RunResult) -> bool:
+    def _worse(self, result: RunResult) -> bool:
         """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding."""
-        return self._given is not None and self._run.costs_more(found, self._given)
+        return self._given is not None and self._run.costs_more(result, self._given)
 
     def _answer(self) -> RunResult:
         """The best result, certified."""
@@ -314,7 +314,7 @@ ATTEMPTS = (
     Attempt(
         "the optimum of the search for a free duration, which is only finished",
         lambda tried: tried.guess.found is not None,
-        Ladder.finish_found,
+        Ladder.finish_interior,
     ),
     Attempt(
         "the plan of another solution, with its multipliers",

@@ -420,13 +420,13 @@ def beyond(problem: Problem, plan: CostedPlan, model: ModeModel, which: int) -> 
     return min(plans, key=lambda one: one.cost)
 
 
-def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
+def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
     """Descend from a plan within its contact modes; certified. None if no switch is near it, or known."""
     problem, dynamics = run.problem, run.problem.dynamics
     modes = dynamics.contact_modes(problem.dt)
     if modes is None or problem.constraints or problem.noise_term or not isinstance(problem.initial, FixedState):
         return None
-    plan = CostedPlan(found.states.copy(), found.controls.copy(), found.cost)
+    plan = CostedPlan(result.states.copy(), result.controls.copy(), result.cost)
     pairs = zip(plan.states[:-1], plan.controls, strict=True)
     if not np.isfinite(plan.cost) or not any(len(modes.step(x, u)[1].names) for x, u in pairs):
         return None
@@ -444,11 +444,11 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
         if descent is None or descent.plan is plan:
             return None
         plan = Motion(descent.plan.states, descent.plan.controls)
-        found = RunResult(
+        result = RunResult(
             status=Status.TIME_LIMIT, detail="no time was left for a certificate within its contact modes", plan=plan,
             law=compiled.law_about(*plan, descent.model.gain), cost=descent.plan.cost, violation=0.0,
         )  # fmt: skip
-        return run.certified(found)
+        return run.certified(result)
 
 
 def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, status: Status) -> RunResult:

@@ -121,28 +121,28 @@ class ContinuousSolution:
         rows = [iteration.row(number) for number, iteration in enumerate(self.iterations, start=1)]
         return "\n".join([*([Iteration.HEADER, *rows] if rows else []), self.summary()])
 
-    def _at(self, what: str, found: Pass | None, t: npt.ArrayLike) -> tuple[Pass, Array]:
-        if found is None:
+    def _at(self, what: str, backward: Pass | None, t: npt.ArrayLike) -> tuple[Pass, Array]:
+        if backward is None:
             raise InputError(f"{what}: got a solution that is {self.status.value} before a pass ended, want a success")
         times, slack = real("t", t), 1e-9 * self.horizon  # rounding may put a time slightly outside
         outside = ~((times >= -slack) & (times <= self.horizon + slack))
         if outside.any():
             raise InputError(f"t: got {times[outside].flat[0]:g}, want seconds from 0 to {self.horizon:g}")
-        return found, np.clip(times, 0.0, self.horizon)
+        return backward, np.clip(times, 0.0, self.horizon)
 
-    def _value(self, what: str, found: Pass | None, t: npt.ArrayLike) -> Quadratic:
-        found, times = self._at(what, found, t)
-        value, _ = found.at(times)
+    def _value(self, what: str, backward: Pass | None, t: npt.ArrayLike) -> Quadratic:
+        backward, times = self._at(what, backward, t)
+        value, _ = backward.at(times)
         return Quadratic(value[..., :-1, :-1], value[..., :-1, -1], 0.5 * value[..., -1, -1])
 
-    def _law(self, what: str, found: Pass | None, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        found, times = self._at(what, found, t)
-        states, want = real("x", x), f"(..., {found.states}), one state or one for each of the times"
-        if states.shape[-1:] != (found.states,) or (times.ndim and states.shape[:-1] not in ((), times.shape)):
+    def _law(self, what: str, backward: Pass | None, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
+        backward, times = self._at(what, backward, t)
+        states, want = real("x", x), f"(..., {backward.states}), one state or one for each of the times"
+        if states.shape[-1:] != (backward.states,) or (times.ndim and states.shape[:-1] not in ((), times.shape)):
             raise InputError(f"x: got shape {states.shape}, want {want}")
         if not np.isfinite(states).all():
             raise InputError(f"x: got {excerpt(states)}, want finite numbers")
-        _, law = found.at(times)
+        _, law = backward.at(times)
         return np.einsum("...ij,...j->...i", law[..., :-1], states) + law[..., -1]
 
 

@@ -344,24 +344,24 @@ class SolveRun:
             status = Status.NOT_POSITIVE_DEFINITE  # its last models had no minimum without weights
         return self.damped_result(ending, status, detail)
 
-    def safeguard(self, found: RunResult) -> RunResult:
+    def safeguard(self, result: RunResult) -> RunResult:
         """Damped iterations from the best plan so far, after smoothing failed."""
-        work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
+        work, detail = self.work, f"the undamped method failed ({result.detail or result.status.meaning})"
         damped = None
         for least in ((NEARLY, NEAR), (0.0, 0.0)) if self.second_order else ((0.0, 0.0),):
             damped = self.damped(least=least)
             if not (self.second_order and damped.success) or self.budget.over:
                 break
-            found = self.newton(detail=detail, patient=True)
-            if found.success or self.budget.over:
-                return found
+            result = self.newton(detail=detail, patient=True)
+            if result.success or self.budget.over:
+                return result
         assert damped is not None
         if not np.isfinite(work.cost):
             # Nothing helps: report the failure.
-            given_up = found.status in (Status.MAX_ITERATIONS, Status.STALLED)
-            return replace(found, status=Status.DIVERGED if given_up else found.status, detail=detail, values={})
+            given_up = result.status in (Status.MAX_ITERATIONS, Status.STALLED)
+            return replace(result, status=Status.DIVERGED if given_up else result.status, detail=detail, values={})
         if self.second_order and damped.success:
-            return found
+            return result
         if self.second_order and not self.budget.over:
             # Newton's passes are about the plan, and need no inverse of the controls' weights.
             return self.newton(detail=detail, patient=True)
@@ -455,13 +455,13 @@ class SolveRun:
             values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
 
-    def best(self, found: RunResult) -> RunResult:
+    def best(self, last: RunResult) -> RunResult:
         """The best plan so far in place of the last one, with a policy and value functions about it."""
         cost = self.work.cost
-        if not np.isfinite(cost) or (not cost < found.cost and found.values):
-            return found
-        detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
-        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan did not
+        if not np.isfinite(cost) or (not cost < last.cost and last.values):
+            return last
+        detail = f"{last.detail}; the plan is the best so far" if last.detail else "the plan is the best so far"
+        status = Status.MAX_ITERATIONS if last.status is Status.DIVERGED else last.status  # this plan did not
         return self.about_plan(status, detail)
 
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
@@ -492,49 +492,49 @@ class SolveRun:
             violation=self._violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 
-    def certified(self, found: RunResult) -> RunResult:
+    def certified(self, result: RunResult) -> RunResult:
         """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
-        values = self.work.constraint_values(*found.plan)
+        values = self.work.constraint_values(*result.plan)
         violation = self.work.violation(values)
-        value = found.values.get("cost_to_go")
+        value = result.values.get("cost_to_go")
         certificate, wrong = certified(
-            self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, found, to_go, out)),
-            found.states, value, violation=violation, kept=self.work.keeps(values),
-            claimed=self.budget.log[-1].cost if found.success else None,
-            tolerance=self.final if found.status is Status.CONVERGED else None,
+            self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, result, to_go, out)),
+            result.states, value, violation=violation, kept=self.work.keeps(values),
+            claimed=self.budget.log[-1].cost if result.success else None,
+            tolerance=self.final if result.status is Status.CONVERGED else None,
             least=0.0 if self.initial_guess.found is None else self.initial_guess.found.scale,
         )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
             # The expected cost without penalties of constraints, which the cost-to-go of the solver has.
-            out, none = np.zeros(1, CERTIFICATE), no_value(found.states)
-            task, first, last, options, _, *others = self._check_arguments(declarations.EVALUATE, found, none, out)
+            out, none = np.zeros(1, CERTIFICATE), no_value(result.states)
+            task, first, last, options, _, *others = self._check_arguments(declarations.EVALUATE, result, none, out)
             self._loop(task, first, last, options, self._without_penalties(), *others)
             certificate = replace(certificate, cost=float(out[0]["cost"]))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
-        found = replace(found, certificate=certificate, cost=cost, violation=violation)
+        result = replace(result, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
-            found = replace(found, certificate=replace(certificate, curvature=self.bend(found).curvature))
+            result = replace(result, certificate=replace(certificate, curvature=self.bend(result).curvature))
         self._release_stages()
         if not wrong:
-            return found
+            return result
         if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
-            return replace(found, status=Status.NOT_POSITIVE_DEFINITE)
-        return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
+            return replace(result, status=Status.NOT_POSITIVE_DEFINITE)
+        return replace(result, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
-    def bend(self, found: RunResult) -> Bend:
+    def bend(self, result: RunResult) -> Bend:
         """The curvature at a result, by exact second derivatives; with a direction along which a saddle bends down."""
         problem = self.problem
         exact = self.second_order and has_curvature(problem) and problem.noise_term is None
-        if not (found.status is Status.CONVERGED and exact):
+        if not (result.status is Status.CONVERGED and exact):
             return Bend(Curvature.NOT_CHECKED)
         if not problem.constraints:
             out = np.zeros(1, CERTIFICATE)
-            self._loop(*self._check_arguments(declarations.CURVE, found, no_value(found.states), out))
+            self._loop(*self._check_arguments(declarations.CURVE, result, no_value(result.states), out))
             if out["curvature"][0] > FLAT:
                 return Bend(Curvature.MINIMUM)
-        stages, plan = self.stages, Motion(*map(in_c_order, found.plan))
+        stages, plan = self.stages, Motion(*map(in_c_order, result.plan))
         return curvature_at(
-            stages, plan, stages.of_constraints([multipliers.values for multipliers in found.multipliers])
+            stages, plan, stages.of_constraints([multipliers.values for multipliers in result.multipliers])
         )
 
     def _without_penalties(self) -> ProblemModel:
@@ -574,20 +574,20 @@ class SolveRun:
         result = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
         return self.certified(result) if np.isfinite(result.states).all() else result
 
-    def is_worse(self, found: RunResult, other: RunResult) -> bool:
+    def is_worse(self, plan: RunResult, other: RunResult) -> bool:
         """Whether a plan violates constraints more than another, or costs more if both violate them as much."""
         if not np.isfinite(other.cost):
             return False
-        missed, others = (self._missed(result) for result in (found, other))
-        return missed > others or (missed == others and self.costs_more(found, other))
+        missed, others = (self._missed(result) for result in (plan, other))
+        return missed > others or (missed == others and self.costs_more(plan, other))
 
-    def _missed(self, found: RunResult) -> float:
+    def _missed(self, result: RunResult) -> float:
         """The violation of a plan to two digits; 0 within the tolerances."""
-        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(*found.plan)):
+        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(*result.plan)):
             return 0.0
-        return float(f"{found.violation:.2g}")
+        return float(f"{result.violation:.2g}")
 
-    def costs_more(self, found: RunResult, other: RunResult) -> bool:
+    def costs_more(self, result: RunResult, other: RunResult) -> bool:
         """Whether a plan costs more than another, by more than rounding.
 
         What active constraints cost by ending inside, and the other plan saves by missing them within the tolerance, is
@@ -595,15 +595,15 @@ class SolveRun:
         is met, only the size of what cancels says what that is.
         """
         rounding = ROUNDING * abs(other.cost) + MARGIN_SQUARES * float(self.work.memory["negligible"])
-        for multipliers, pressing in zip(self.work.multipliers, found.multipliers, strict=False):
+        for multipliers, pressing in zip(self.work.multipliers, result.multipliers, strict=False):
             rounding += float(np.abs(pressing.values).sum()) * (multipliers.margin + other.violation)
-        return not found.cost <= other.cost + rounding
+        return not result.cost <= other.cost + rounding
 
-    def candidate(self, name: str, found: RunResult | None) -> Candidate:
-        """This run as a candidate of a search; `found` is its result if it was run to its end."""
-        plan = self.work.last if found is None else found
+    def candidate(self, name: str, result: RunResult | None) -> Candidate:
+        """This run as a candidate of a search; `result` is its result if it was run to its end."""
+        plan = self.work.last if result is None else result
         plan = Trajectory(plan.states.copy(), plan.controls.copy(), self.problem.dt)
-        cost, status = (self.cost, None) if found is None else (found.cost, found.status)
+        cost, status = (self.cost, None) if result is None else (result.cost, result.status)
         return Candidate(name, cost, len(self.budget.log), status, plan)
 
     # The compiled loop, and its arguments.
@@ -684,11 +684,11 @@ class SolveRun:
         return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.rough, 0.0, 0, 0, rows)
 
     def _check_arguments(
-        self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
+        self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
         return self._stated(
-            task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=found.plan, last_policy=Policy(*found.law),
+            task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=result.plan, last_policy=Policy(*result.law),
             certificate=certificate,
         )  # fmt: skip
 

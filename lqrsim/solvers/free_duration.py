@@ -298,12 +298,12 @@ class DurationSearch:
             remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
         ))  # fmt: skip
 
-    def _finished(self, ordinary: Problem, found: Found) -> Solution:
+    def _finished(self, ordinary: Problem, result: Found) -> Solution:
         """What becomes of a plan with its duration held. The log begins with that of the search for it."""
-        m, n = found.plan.controls.shape[1], found.plan.states.shape[1]
+        m, n = result.plan.controls.shape[1], result.plan.states.shape[1]
         summary = f"a plan of {ordinary.steps * ordinary.dt:.6g} s"
         gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
-        guess = InitialGuess(gain, found.plan.controls, summary, found=found, log=log)
+        guess = InitialGuess(gain, result.plan.controls, summary, found=result, log=log)
         return self._solved(ordinary, replace(self._settings, starts=None, start=guess))
 
     def _described(self, solution: Solution) -> Solution:
@@ -381,7 +381,7 @@ def find_duration(
     """
     assert problem.duration is not None
     low, high = problem.duration
-    by_segment = _with_found_segments(problem, begin, violation, budget, price) if problem.segments else None
+    by_segment = _with_timed_segments(problem, begin, violation, budget, price) if problem.segments else None
     if by_segment is not None:
         problem, begin = by_segment
     n = len(problem.dynamics.state_coordinates)
@@ -441,7 +441,7 @@ def _searched(
     return stages, prices, run(plan, FREED, tolerance)
 
 
-def _with_found_segments(
+def _with_timed_segments(
     problem: Problem, begin: Trajectory, violation: float, budget: Budget, price: float
 ) -> tuple[Problem, Trajectory] | None:
     """The problem with its segments at the knots where they end in time, and a plan with these, in equal steps.

@@ -37,9 +37,9 @@ class Evidence:
         return tuple(name for name in self.against if not worst.startswith(name.rsplit(" at ", 1)[0]))[:NAMED]
 
 
-def alike(found: Sequence[Evidence]) -> list[Evidence]:
+def alike(cases: Sequence[Evidence]) -> list[Evidence]:
     """The evidence with equally small violations, the least first; empty unless it is from `STARTS` starts."""
-    least = sorted(found, key=lambda one: one.missed)
+    least = sorted(cases, key=lambda one: one.missed)
     same = [case for case in least if case.missed <= (1 + ALIKE) * least[0].missed]
     return same if len(same) >= STARTS else []
 

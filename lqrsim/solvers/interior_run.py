@@ -93,28 +93,28 @@ class InteriorRun:
             )  # fmt: skip
         return None if result is None else self.finish(result)
 
-    def finish(self, found: Found) -> RunResult | None:
+    def finish(self, interior: Found) -> RunResult | None:
         """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
-        if not np.isfinite(found.plan.states).all():
+        if not np.isfinite(interior.plan.states).all():
             return None
-        if found.solved and (result := self._polished(found)) is not None and result.success:
+        if interior.solved and (result := self._polished(interior)) is not None and result.success:
             return result
-        result = self._rolled_out(found.plan, found.gain)
-        if found.flat and result.violation <= self.allowed and self._jumps(found):
-            found.measures._replace(cost=result.cost, gap=0.0, violation=result.violation).record(Laps(self._budget))
+        result = self._rolled_out(interior.plan, interior.gain)
+        if interior.flat and result.violation <= self.allowed and self._jumps(interior):
+            interior.measures._replace(cost=result.cost, gap=0.0, violation=result.violation).record(Laps(self._budget))
             return replace(result, status=Status.COST_CONVERGED, detail=KINKED)
         return result
 
-    def _jumps(self, found: Found) -> bool:
+    def _jumps(self, interior: Found) -> bool:
         """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
         dynamics, dt, draws = self._problem.dynamics, self._problem.dt, np.random.default_rng(0)
 
         def perturbed(one: Array, size: Array) -> Array:
             return one + BESIDE * size * draws.choice([-1.0, 1.0], len(one))
 
-        for x, u in zip(found.plan.states[:-1], found.plan.controls, strict=True):
+        for x, u in zip(interior.plan.states[:-1], interior.plan.controls, strict=True):
             here = np.hstack(dynamics.linearize(x, u, dt)[:2])
-            beside = perturbed(x, found.sizes.states), perturbed(u, found.sizes.controls)
+            beside = perturbed(x, interior.sizes.states), perturbed(u, interior.sizes.controls)
             if np.abs(np.hstack(dynamics.linearize(*beside, dt)[:2]) - here).max() > JUMP * np.abs(here).max():
                 return True
         return False
@@ -148,68 +148,68 @@ class InteriorRun:
             candidates.append(self.result(*self._run.work.roll_out(*law, plan.states[0]), law))
         return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
 
-    def _polished(self, found: Found) -> RunResult | None:
+    def _polished(self, interior: Found) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
         work = self._run.work
-        law = compiled.law_about(found.plan.states, *self._at_limits(found))
-        states, controls = work.roll_out(*law, found.plan.states[0])
+        law = compiled.law_about(interior.plan.states, *self._at_limits(interior))
+        states, controls = work.roll_out(*law, interior.plan.states[0])
         if not np.isfinite(states).all():
             return None
-        self._set_multipliers(found, work.constraint_values(states, controls), FIRMNESS)
+        self._set_multipliers(interior, work.constraint_values(states, controls), FIRMNESS)
         work.set_best(states, controls, cost := self._run.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
         with self._budget.joined_with_last(NAME):
             if has_curvature(self._problem):
-                result = self._newton(lagrangian, found.scale)
+                result = self._newton(lagrangian, interior.scale)
                 for _ in range(UPDATES):
                     if lagrangian.kept or not result.success:
                         break
                     lagrangian.update(growth=1.0)
-                    result = self._newton(lagrangian, found.scale)
+                    result = self._newton(lagrangian, interior.scale)
                 if not (result.success and lagrangian.kept):  # as where no other plan takes as little time
                     work.set_best(states, controls, cost)
-                    result = self._ended_inside(lagrangian, found)
+                    result = self._ended_inside(lagrangian, interior)
             else:
-                result = self._ended_inside(lagrangian, found)
+                result = self._ended_inside(lagrangian, interior)
         detail = ""
         if self._run.settings.elastic is not None and result.violation > self.allowed:
             detail = f"elastic: {lagrangian.worst()}"
-        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
+        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, interior, result))
         if result.success and lagrangian.kept:
             return result
         self.without_multipliers()
         return replace(result, status=Status.MAX_ITERATIONS)
 
-    def _ended_inside(self, lagrangian: AugmentedLagrangian, found: Found) -> RunResult:
+    def _ended_inside(self, lagrangian: AugmentedLagrangian, interior: Found) -> RunResult:
         """The plan in memory as it is: without second derivatives, the interior point ends inside the constraints.
 
         Penalties give the policy its gains across rows that press. The certificate is that of the multipliers alone.
         """
         work, laps = self._run.work, Laps(self._budget)
         result = self._run.about_plan(Status.CONVERGED)
-        self._set_multipliers(found, work.constraint_values(*work.best), FAINT * FIRMNESS)
+        self._set_multipliers(interior, work.constraint_values(*work.best), FAINT * FIRMNESS)
         lagrangian.evaluate(*work.best)
-        found.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
+        interior.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
         return result
 
-    def _at_limits(self, found: Found) -> tuple[Array, Array]:
+    def _at_limits(self, interior: Found) -> tuple[Array, Array]:
         """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""
-        controls, gain = found.plan.controls.copy(), found.gain.copy()
+        controls, gain = interior.plan.controls.copy(), interior.gain.copy()
         for side, sign in ((self._run.stages.low, -1.0), (self._run.stages.high, 1.0)):
-            room = np.abs(side - controls) / found.sizes.controls
-            force = sign * found.pressing * found.sizes.controls / found.scale
+            room = np.abs(side - controls) / interior.sizes.controls
+            force = sign * interior.pressing * interior.sizes.controls / interior.scale
             pressed = (room < AT_LIMIT) & (force > room)
             controls = np.where(pressed, side, controls)
             gain[pressed] = 0.0
         return controls, gain
 
-    def _set_multipliers(self, found: Found, values: list[Array], firmness: float) -> None:
-        """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
-        triples = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
+    def _set_multipliers(self, interior: Found, values: list[Array], firmness: float) -> None:
+        """Choose multipliers with which the augmented Lagrangian has the interior point's forces at these values."""
+        triples = zip(self._run.work.multipliers, interior.multipliers, values, strict=True)
         for k, (own, known, numbers) in enumerate(triples):
-            size = found.sizes.rows[self._run.stages.owners == k]
-            own.penalty = firmness * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            size = interior.sizes.rows[self._run.stages.owners == k]
+            own.penalty = firmness * interior.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
             presses = known > own.penalty * (numbers - own.margin)  # other forces are remnants of the barrier
             acts = np.isfinite(numbers) & (own.term.equality | presses)
@@ -221,13 +221,13 @@ class InteriorRun:
         lagrangian.evaluate(*result.plan)
         return result
 
-    def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
+    def _pressing(self, lagrangian: AugmentedLagrangian, interior: Found, result: RunResult) -> tuple[Multipliers, ...]:
         """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
         values = self._run.work.constraint_values(*result.plan)
         multipliers = []
         for k, updated in enumerate(lagrangian.multipliers()):
-            size = found.sizes.rows[self._run.stages.owners == k]
-            idle = updated.values * size / found.scale < values[k] / size
+            size = interior.sizes.rows[self._run.stages.owners == k]
+            idle = updated.values * size / interior.scale < values[k] / size
             idle &= not self._problem.constraint_terms[k].equality
             multipliers.append(replace(updated, values=np.where(idle, 0.0, updated.values)))
         return tuple(multipliers)

@@ -244,7 +244,7 @@ class PreparedSolver(OneVersion):
         return replace(plan, seconds=time.perf_counter() - clock)
 
     def _answer(
-        self, problem: Problem, best: "_Best", found: RunResult, budget: Budget, clock: float, iterating: float
+        self, problem: Problem, best: "_Best", result: RunResult, budget: Budget, clock: float, iterating: float
     ) -> Replan:
         # The next solve overwrites this memory.
         states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
@@ -253,7 +253,7 @@ class PreparedSolver(OneVersion):
             control_coordinates=self._controls,
         )  # fmt: skip
         return Replan(
-            status=found.status, detail=found.detail, improved=best.improved, policy=policy,
+            status=result.status, detail=result.detail, improved=best.improved, policy=policy,
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
             violation=best.violation, cost_to_go=copy_of(best.cost_to_go), multipliers=best.multipliers,
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
@@ -519,17 +519,17 @@ class _Best:
                 np.copyto(copy, array)
             self._keep(iteration.cost, iteration.violation, copies)
 
-    def consider(self, found: RunResult) -> None:
+    def consider(self, result: RunResult) -> None:
         """Adopt the final result if it converged and is as good as the best, or if it is better."""
-        cheaper = self._better(self.cost, self.violation, found.cost, found.violation)
-        as_good = found.success and (self.violation > self._none or not cheaper)
-        if as_good or self._beaten_by(found.cost, found.violation):
-            self.adopt(found)
+        cheaper = self._better(self.cost, self.violation, result.cost, result.violation)
+        as_good = result.success and (self.violation > self._none or not cheaper)
+        if as_good or self._beaten_by(result.cost, result.violation):
+            self.adopt(result)
 
-    def adopt(self, found: RunResult) -> None:
-        parts = *found.plan, *found.law, *(self._work.arrays.to_go if found.values else ())
-        self._keep(found.cost, found.violation, parts)
-        self.multipliers = found.multipliers
+    def adopt(self, result: RunResult) -> None:
+        parts = *result.plan, *result.law, *(self._work.arrays.to_go if result.values else ())
+        self._keep(result.cost, result.violation, parts)
+        self.multipliers = result.multipliers
 
     def _beaten_by(self, cost: float, violation: float) -> bool:
         return self._better(cost, violation, self.cost, self.violation)

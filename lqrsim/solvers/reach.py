@@ -60,10 +60,10 @@ def differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int
     return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NONE).any())
 
 
-def goal_left(problem: Problem, found: RunResult, given: RunResult) -> bool:
+def goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
     """Whether a plan has gone farther from the goal than a given one, to where the final cost has no slope."""
-    value, slope, _ = _final_cost(problem, found.states[-1])
-    before, steeper, _ = _final_cost(problem, given.states[-1])
+    value, slope, _ = _final_cost(problem, result.states[-1])
+    before, steeper, _ = _final_cost(problem, baseline.states[-1])
     return value > before and float(np.abs(slope).max()) < LEFT * float(np.abs(steeper).max())
 
 
@@ -94,17 +94,19 @@ def comes_nearer(problem: Problem, plan: RunResult | Motion, other: RunResult, p
     return bool(np.linalg.norm(ways[0]) < (1 - NEARER) * np.linalg.norm(ways[1]))
 
 
-def approaches(problem: Problem, found: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
+def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
     """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
     body to its goal, in words. Their solutions are starts in which the robot touches the body.
 
     The goals of the body itself are left out of the constraints, as it does not move there.
     """
-    for words, dynamics, about in problem.dynamics.approaches(found.states, missing(problem, found.states[-1], places)):
+    for words, dynamics, about in problem.dynamics.approaches(
+        result.states, missing(problem, result.states[-1], places)
+    ):
         drawn = ~np.isnan(about)
         ways = np.where(drawn, about, -np.inf).max(axis=0) - np.where(drawn, about, np.inf).min(axis=0)
         ways = np.maximum(ways, LEAST_WAY * ways.max())
-        weights = np.where(drawn[0], FOLLOWED * abs(found.cost) / (problem.steps * ways**2), 0.0)
+        weights = np.where(drawn[0], FOLLOWED * abs(result.cost) / (problem.steps * ways**2), 0.0)
         stage = problem.stage_cost + QuadraticCost(
             drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
         )

@@ -200,13 +200,13 @@ def integrate(
     return solution
 
 
-def _pieces(found: Any, sample: Callable[[float, Array], Array]) -> PPoly:
+def _pieces(solution: Any, sample: Callable[[float, Array], Array]) -> PPoly:
     """`sample(t, y)` along a solution of `integrate`, as polynomials of degree 7 between its steps."""
-    knots = found.t if found.t[-1] > found.t[0] else found.t[::-1]
+    knots = solution.t if solution.t[-1] > solution.t[0] else solution.t[::-1]
     lengths = np.diff(knots)
     times = (knots[:-1, None] + lengths[:, None] * _NODES).ravel()
     with np.errstate(all="ignore"):
-        points = np.array([sample(t, y) for t, y in zip(times.tolist(), found.sol(times).T, strict=True)])
+        points = np.array([sample(t, y) for t, y in zip(times.tolist(), solution.sol(times).T, strict=True)])
     points = points.reshape(len(lengths), 8, -1)
     scale = lengths[:, None] ** np.arange(7, -1, -1)
     return PPoly(np.einsum("kj,ijs->kis", _FIT, points) / scale.T[:, :, None], knots)

@@ -97,20 +97,20 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     return _bisect(run.fails_at, high)
 
 
-def name_risk(run: SolveRun, found: RunResult) -> str:
+def name_risk(run: SolveRun, result: RunResult) -> str:
     """The detail of an answer whose risk was too high: at which step, and which risk is not, if that can be told."""
     work, risk, steps = run.work, run.problem.risk, run.problem.steps
     if not np.isfinite(work.cost):
         work.set_best(*work.last)
     if not np.isfinite(work.best.states).all():
-        return found.detail
+        return result.detail
     failed = run.fails_at(risk)
     if failed < 0 or run.fails_at(0.0) >= 0:
-        return found.detail
+        return result.detail
     most = _bisect(run.fails_at, risk) * (1 - 1e-5)  # so that even the rounded number works
     too_high = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}"
     too_high += f", and at most {most:.5g} will do"
-    return f"{too_high}; {found.detail}" if found.detail else too_high
+    return f"{too_high}; {result.detail}" if result.detail else too_high
 
 
 def _bisect(fails: Fails, high: float) -> float:

@@ -552,12 +552,12 @@ class Search:
                 self._finished[0] = run, replace(best, status=status, detail=detail)
                 return
 
-    def _descend(self, run: SolveRun, found: RunResult) -> bool:
+    def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
         """Leave a saddle; return whether a plan was found that costs less."""
-        bend = run.bend(found)
+        bend = run.bend(at_saddle)
         if bend.direction is None:
             return False
-        saddle, direction = found.kept(), bend.direction
+        saddle, direction = at_saddle.kept(), bend.direction
         for far, sign in itertools.product(AWAY, (1, -1)):
             moved = Trajectory(
                 saddle.states + sign * far * direction.states, saddle.controls + sign * far * direction.controls,
@@ -627,15 +627,15 @@ class Search:
         """Whether a plan brings states nearer to their goal that no control changed along the first plan."""
         return self._still is not None and reach.comes_nearer(self._problem, plan, *self._still)
 
-    def _is_better(self, found: RunResult) -> bool:
+    def _is_better(self, result: RunResult) -> bool:
         """Whether a plan is better than the best.
 
         Where only one of them moves a body that was out of reach, the cost decides. To leave it alone converges easily.
         """
         best = self.best[1]
-        if self._comes_nearer(found) == self._comes_nearer(best):
-            return found.rank < best.rank
-        return found.violation <= best.violation and found.cost < best.cost
+        if self._comes_nearer(result) == self._comes_nearer(best):
+            return result.rank < best.rank
+        return result.violation <= best.violation and result.cost < best.cost
 
     def _unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""
@@ -754,29 +754,29 @@ class Search:
         return min(finite, key=lambda found: found.cost, default=self.best[1])
 
     def _stiffen(
-        self, found: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str], most: int
+        self, plans: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str], most: int
     ) -> RunResult | None:
         """Continue from these plans for each softness in turn, from fewer at each, and then for the true contacts.
 
         Args:
-          found: plans by the ends of their names. before: softnesses that they have passed. most: iterations at most
+          plans: plans by the ends of their names. before: softnesses that they have passed. most: iterations at most
             for the true contacts.
 
         Returns:
           The plan for the true contacts; None if no time is left for it.
         """
         for name, problem in soft:
-            most_soft = LOOK if len(found) > 1 else SOFT
-            found = {
+            most_soft = LOOK if len(plans) > 1 else SOFT
+            plans = {
                 origin: self._solve_softly(f"{name}{origin}", problem, policy_of(result, name), most_soft)
-                for origin, result in found.items()
+                for origin, result in plans.items()
                 if np.isfinite(result.cost)
-            } or found
+            } or plans
             if self._budget.stop.due:
                 return None
-            found = dict(sorted(found.items(), key=lambda pair: pair[1].cost)[: -(-len(found) // FEWER)])
-        origin = min(found, key=lambda origin: found[origin].cost)
-        run = self._add(policy_of(found[origin], "a plan for softer contacts"))
+            plans = dict(sorted(plans.items(), key=lambda pair: pair[1].cost)[: -(-len(plans) // FEWER)])
+        origin = min(plans, key=lambda origin: plans[origin].cost)
+        run = self._add(policy_of(plans[origin], "a plan for softer contacts"))
         with self._problem.dynamics.solving(self._threads), run.budget.limited(most):
             ended = self._finish(run, refine)
         stages = ", ".join([*before, *(name for name, _ in soft)])
@@ -799,10 +799,10 @@ class Search:
         search.attempt(FIRST)
         return search.best
 
-    def _keep_softer(self, name: str, run: SolveRun, found: RunResult) -> RunResult:
+    def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
         """Keep a plan for softer contacts as a candidate."""
-        self._softer.append(run.candidate(f"contacts of softness {name}", found))
-        return found
+        self._softer.append(run.candidate(f"contacts of softness {name}", result))
+        return result
 
     def _keep_modes(self, plan: RunResult) -> bool:
         """Continue from a plan within its contact modes, in which it may end next to a jump or at a kink.
@@ -847,14 +847,14 @@ class Search:
             options=settings.options(begun.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
 
-    def _told_of_unmoved(self, found: RunResult) -> RunResult:
+    def _told_of_unmoved(self, result: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
         problem, places = self._problem, self._unmoved()
         if not places:
-            return found
-        parts = reach.described(problem, found.states, places), self._of_approaches(found), found.detail
-        otherwise = reach.can_change(problem, found.states, places)
-        status = Status.STALLED if found.success and otherwise else found.status
+            return result
+        parts = reach.described(problem, result.states, places), self._of_approaches(result), result.detail
+        otherwise = reach.can_change(problem, result.states, places)
+        status = Status.STALLED if result.success and otherwise else result.status
         names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
         remedy = f"leave {names} out of the goal, which no control that was tried changes"
         if self._nearer is not None:
@@ -864,17 +864,17 @@ class Search:
             remedy = f"begin with start=[...], controls {clause}"
         if self._budget.stop.due:
             status, remedy = Status.TIME_LIMIT, ""
-        return replace(found, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
+        return replace(result, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
 
-    def _of_approaches(self, found: RunResult) -> str:
+    def _of_approaches(self, result: RunResult) -> str:
         """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
         if self._nearer is not None:
             name, cost = self._nearer
-            return f"{name} brings it nearer to its goal, at a cost of {cost:.3g} instead of {found.cost:.3g}"
+            return f"{name} brings it nearer to its goal, at a cost of {cost:.3g} instead of {result.cost:.3g}"
         if self._approached:
             tried = ", ".join(dict.fromkeys(self._approached))
             return f"nothing that was tried brings it nearer to its goal: {tried}"
-        untouched = any(self._problem.dynamics.untouched_body(found.states, i) for i in self._unmoved())
+        untouched = any(self._problem.dynamics.untouched_body(result.states, i) for i in self._unmoved())
         known = "nothing that is driven can collide with it, or it is to turn on the spot"
         return f"no approach is known: {known}" if self._still is not None and untouched else ""
 
@@ -903,9 +903,9 @@ class Search:
         run.budget.report_to(self._callback)
         return how(run, self._known if known is None else known)
 
-    def _offer(self, run: SolveRun, found: RunResult, *, better: bool | None = None) -> None:
+    def _offer(self, run: SolveRun, result: RunResult, *, better: bool | None = None) -> None:
         """Record a result; it becomes the best if `better` says so, by default if its rank does."""
-        self._finished.insert(0 if better else len(self._finished), (run, found))
+        self._finished.insert(0 if better else len(self._finished), (run, result))
         if better is None:
             self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
 
@@ -1046,17 +1046,17 @@ ATTEMPTS = (
 )
 
 
-def left_domain(problem: Problem, found: RunResult) -> str:
+def left_domain(problem: Problem, result: RunResult) -> str:
     """In words, when the states of a plan that is not finite leave their domain, and which; and what led there."""
-    names, finite = problem.dynamics.state_coordinates.names, np.isfinite(found.states)
+    names, finite = problem.dynamics.state_coordinates.names, np.isfinite(result.states)
     step = int(np.argmin(finite.all(axis=1)))
     left = [
         f"{name} {'is not a number' if np.isnan(number) else 'grows beyond all numbers'}"
-        for name, number in zip(names, found.states[step], strict=True)
+        for name, number in zip(names, result.states[step], strict=True)
         if not np.isfinite(number)
     ]
     place = f"at {step * problem.dt:.2f} s (step {step} of {problem.steps}) {' and '.join(left)}"
-    return "; ".join(part for part in (place, found.detail if "nan" not in found.detail else "") if part)
+    return "; ".join(part for part in (place, result.detail if "nan" not in result.detail else "") if part)
 
 
 def line_of_states(problem: Problem) -> Trajectory:
@@ -1067,6 +1067,6 @@ def line_of_states(problem: Problem) -> Trajectory:
     return Trajectory(np.linspace(problem.start, end, problem.steps + 1), controls.copy(), problem.dt)
 
 
-def policy_of(found: RunResult, summary: str) -> InitialGuess:
+def policy_of(result: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
-    return InitialGuess(found.law[0].copy(), found.law[1].copy(), summary)
+    return InitialGuess(result.law[0].copy(), result.law[1].copy(), summary)

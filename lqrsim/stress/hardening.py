@@ -190,9 +190,9 @@ def harden(
         used = next(seeds)
         begun = repetitions * (used - seed)
 
-        def tell(done: int, _: int, found: str) -> None:
+        def tell(done: int, _: int, text: str) -> None:
             if progress is not None:
-                progress(begun + done, total, f"{what}: {found}")
+                progress(begun + done, total, f"{what}: {text}")
 
         return search.failures(solution, used, tell)
 
