@@ -243,19 +243,19 @@ def _wait(until: Callable[[], Any], patience: float, lacking: Callable[[], str])
         time.sleep(1e-3)
 
 
-def _law_of(given: Bridgeable) -> tuple[Controller, float, int, Array]:
+def _law_of(source: Bridgeable) -> tuple[Controller, float, int, Array]:
     """The controller, its control period in s, the periods of its horizon, and the nominal state at its start (n,)."""
-    if isinstance(given, LiveReplanner):
-        policy, problem = given.active.plan.policy, given.problem
-        return FunctionController(given.step, problem.dynamics, policy.dt), policy.dt, problem.steps, policy.nominal[0]
-    if isinstance(given, OutputFeedbackPolicy):
-        return OutputFeedback(given), given.dt, given.steps, given.nominal[0, : len(given.state_coordinates)]
-    if isinstance(given, AffinePolicy):
-        return Feedback(given), given.dt, given.steps, given.nominal[0]
-    plan = given.plan if isinstance(given, Controller) else given
+    if isinstance(source, LiveReplanner):
+        policy, problem = source.active.plan.policy, source.problem
+        return FunctionController(source.step, problem.dynamics, policy.dt), policy.dt, problem.steps, policy.nominal[0]
+    if isinstance(source, OutputFeedbackPolicy):
+        return OutputFeedback(source), source.dt, source.steps, source.nominal[0, : len(source.state_coordinates)]
+    if isinstance(source, AffinePolicy):
+        return Feedback(source), source.dt, source.steps, source.nominal[0]
+    plan = source.plan if isinstance(source, Controller) else source
     wanted = "a plan, a policy, a Controller with a plan, or a live re-planner"
     policy = check_kind("controller", plan, Plan, wanted).policy
-    law = given if isinstance(given, Controller) else Feedback(policy)
+    law = source if isinstance(source, Controller) else Feedback(policy)
     return law, policy.dt, policy.steps, policy.nominal[0]
 
 

@@ -182,7 +182,7 @@ def _parse(arguments: list[str]) -> Any:
     try:
         with RULES, _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
             command = tyro.cli(Command, prog="lqrsim", args=arguments)
-        return _given_twice(command, arguments) or command
+        return _repeated_option(command, arguments) or command
     except SystemExit as end:
         if "--json" not in arguments or end.code != 2:
             raise
@@ -196,7 +196,7 @@ def _parse(arguments: list[str]) -> Any:
     return text or "got arguments that cannot be parsed"
 
 
-def _given_twice(command: Any, arguments: list[str]) -> str:
+def _repeated_option(command: Any, arguments: list[str]) -> str:
     """What is wrong with the first option that is given more than once, of which tyro takes the last; or nothing."""
     words = itertools.takewhile(lambda word: word != "--", arguments)
     # No value begins with "--": tyro takes it as a wrong option.

@@ -53,7 +53,7 @@ def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[s
     return _emitted(module), needed
 
 
-def are_there(names: list[str]) -> bool:
+def has_symbols(names: list[str]) -> bool:
     """Whether LLVM finds functions or variables of all these names."""
     llvm = _binding()
     return all(llvm.address_of_symbol(name) for name in names)

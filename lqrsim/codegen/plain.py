@@ -38,24 +38,24 @@ def plain_functions(
 
 
 def _run(
-    function: ScopedFunction, words: Mapping[str, Any], made: dict[Any, Any], caller: Caller | None
+    function: ScopedFunction, words: Mapping[str, Any], functions: dict[Any, Any], caller: Caller | None
 ) -> Callable[..., Any]:
-    """The Python function of a kernel; `made` holds the functions that were made earlier."""
+    """The Python function of a kernel; `functions` holds the functions that were made earlier."""
     key = id(function.scope), function.node.name
-    if key in made:
-        return made[key]
+    if key in functions:
+        return functions[key]
     code, names = _compiled(function.node, function.scope.source.what)
     namespace: dict[str, Any] = {}
     exec(code, namespace)
     run = namespace[function.node.name]
     called = run if caller is None else lambda *arguments: caller(function, run, arguments)
-    made[key] = called
+    functions[key] = called
     for name in names:
         match function.scope.find(name):
             case None:
                 continue
             case ScopedFunction() as other:
-                namespace[name] = _run(other, words, made, caller)
+                namespace[name] = _run(other, words, functions, caller)
             case Record():
                 namespace[name] = getattr(records, name)
             case Word(name=word):

@@ -25,7 +25,7 @@ from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.compiled_module import compilations, compiling
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.jitted import Jitted, JittedDerivatives
-from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
+from lqrsim.codegen.llvm import Loaded, has_symbols, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
 from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
 from lqrsim.machine import instruction_set
@@ -45,7 +45,7 @@ def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int]:
     from numba.core import registry
 
     # Creating numba's target registers the functions of its runtime.
-    if not (registry.cpu_target.target_context and are_there(known["needed"])):
+    if not (registry.cpu_target.target_context and has_symbols(known["needed"])):
         raise ValueError("it needs a function that is missing")
     loaded = Loaded(code)
     return loaded, loaded.address(_SYMBOL)
@@ -83,24 +83,24 @@ def _reason(error: Exception) -> str:
 LEVELS = ("symbolic", "compiled", "jax", "plain")
 
 
-def level_of(function: Any, asked: str | None) -> str:
+def level_of(function: Any, level: str | None) -> str:
     """The level of a function: the given level, or by default compiled for a numba function and symbolic for others."""
     if not callable(function):
         raise InputError(f"function: got {excerpt(function)}, want a function of (x, u, p)")
     is_compiled = hasattr(function, "py_func")
-    if asked is not None and not isinstance(asked, str):
-        raise InputError(f"level: got {excerpt(asked)}, want one of: {', '.join(LEVELS)}")
-    if asked is None:
+    if level is not None and not isinstance(level, str):
+        raise InputError(f"level: got {excerpt(level)}, want one of: {', '.join(LEVELS)}")
+    if level is None:
         return "compiled" if is_compiled else "symbolic"
-    if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
-        raise InputError(f"level: got {asked!r} for {name_of(function)}, want 'compiled' for a numba function")
-    if asked == "jax":
+    if check_name("level", level, LEVELS) != "compiled" and is_compiled:
+        raise InputError(f"level: got {level!r} for {name_of(function)}, want 'compiled' for a numba function")
+    if level == "jax":
         try:
             import jax  # noqa: F401
         except ImportError as error:
             got = "got 'jax', which needs JAX, want pip install 'lqrsim[jax]'"
             raise InputError(f"{name_of(function)}: level: {got}") from error
-    return asked
+    return level
 
 
 def name_of(function: Any) -> str:

@@ -77,7 +77,7 @@ class Reproduce:
         out = self.out
         console.check_output("--out", out)
         earlier = (
-            _kept(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
+            _saved(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
         )
         results, failures, begun = dict[str, ScriptResult](), list[Failure](), time.monotonic()
         with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
@@ -112,7 +112,7 @@ class Reproduce:
         return 1 if failures else 0
 
 
-def _kept(file: Path, *, quick: bool) -> dict[str, Any]:
+def _saved(file: Path, *, quick: bool) -> dict[str, Any]:
     """The results that an earlier call saved. Raises InputError if they cannot be read, or if --quick differs."""
     try:
         saved = json.loads(file.read_text(encoding="utf-8"))

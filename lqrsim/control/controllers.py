@@ -129,31 +129,31 @@ ControllerLike = Controller | AffinePolicy | OutputFeedbackPolicy | ControlFunct
 WANTED = "a policy, a Controller or a function of state (n,) and time in s that returns controls (m,)"
 
 
-def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dynamics) -> tuple[Controller, Plan]:
+def as_controller(controller: ControllerLike | None, plan: Plan | None, dynamics: Dynamics) -> tuple[Controller, Plan]:
     """The controller of a run on a robot with these dynamics, by default the plan's policy, and the plan of the run."""
     wanted = "a Plan, such as smooth(problem), which may be followed by another policy: controller=policy"
     check_kind("plan", plan, (Plan, type(None)), wanted)
     # What is planned in belief space has more states than the robot: its controller has the plan of the mean.
-    of_belief = isinstance(given, Controller) and isinstance(given.sensors, Belief)
-    if isinstance(given, Controller) and (plan is None or of_belief):
-        plan = check_kind(f"{type(given).__name__}.plan", given.plan, (Plan, type(None)), "a Plan or None")
+    of_belief = isinstance(controller, Controller) and isinstance(controller.sensors, Belief)
+    if isinstance(controller, Controller) and (plan is None or of_belief):
+        plan = check_kind(f"{type(controller).__name__}.plan", controller.plan, (Plan, type(None)), "a Plan or None")
     if plan is None:
         raise InputError(
             "plan: got none, want the plan that the run follows, such as smooth(problem); only"
             " controllers with a plan of their own, such as an OffsetFree, run without"
         )
-    match given:
+    match controller:
         case None:
             return Feedback(plan.policy), plan
         case Controller():
-            return given, plan
+            return controller, plan
         case AffinePolicy():
-            return Feedback(given), plan
+            return Feedback(controller), plan
         case OutputFeedbackPolicy():
-            return OutputFeedback(given), plan
+            return OutputFeedback(controller), plan
         case _:
-            check_function("controller", given, WANTED, arguments=2)
-            return FunctionController(given, dynamics, plan.trajectory.dt), plan
+            check_function("controller", controller, WANTED, arguments=2)
+            return FunctionController(controller, dynamics, plan.trajectory.dt), plan
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,7 @@ class ReplannedRun(ControllerRun):
     def summary(self) -> str:
         return self.log.summary()
 
-    def _leads_there(self, problem: Problem, gain: Array, offset: Array, state: Array) -> bool:
+    def _leads_to_goal(self, problem: Problem, gain: Array, offset: Array, state: Array) -> bool:
         """Whether a law leads from a state (n,) to the goal, clear of obstacles, by the model."""
         states, _ = compiled.rollout(problem, gain, offset, state)
         if not np.isfinite(states).all():
@@ -107,7 +107,7 @@ class ReplannedRun(ControllerRun):
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
         gain = in_c_order(gain[:, :, :n])
-        if not self._always and self._leads_there(problem, gain, offset, here):
+        if not self._always and self._leads_to_goal(problem, gain, offset, here):
             return
         plan = law.plan
         start = InitialGuess(gain, in_c_order(offset), cost_to_go=plan.shifted(done, horizon="shrinking").cost_to_go)

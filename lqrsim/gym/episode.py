@@ -114,11 +114,12 @@ class Task:
             return controls
         return np.clip(2 * (controls - self.low) / (self.high - self.low) - 1, -1.0, 1.0)
 
-    def disturbances_of(self, given: Any, strength: Any) -> tuple[Disturbance, ...]:
+    def disturbances_of(self, choice: Any, strength: Any) -> tuple[Disturbance, ...]:
         """Scaled disturbances, given by name or as objects. Raises InputError for anything else."""
         wanted = "a name, such as 'moderate', or a tuple of names and disturbances"
         strength = check_number("strength", strength, at_least=0.0)
-        items = (given,) if isinstance(given, str) else check_items("disturbances", given, (str, Disturbance), wanted)
+        kinds = str, Disturbance
+        items = (choice,) if isinstance(choice, str) else check_items("disturbances", choice, kinds, wanted)
         disturbances: list[Disturbance] = []
         for item in items:
             disturbances += disturbance_set(item, self.scenario) if isinstance(item, str) else (item,)

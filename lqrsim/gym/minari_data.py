@@ -67,7 +67,7 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
 
     about = {"description": f"{task.scenario.name}: {task.scenario.summary}", "env": unwrapped, **about}
     try:
-        with _whole(get_dataset_path(name)), warnings.catch_warnings():
+        with _removed_on_failure(get_dataset_path(name)), warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"minari\.")  # what is not known, such as an author
             storage = minari.create_dataset_from_buffers(name, cast("list[Any]", buffers()), **about).storage
             storage.update_episode_metadata(episodes)
@@ -78,7 +78,7 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
 
 
 @contextlib.contextmanager
-def _whole(folder: Path) -> Iterator[None]:
+def _removed_on_failure(folder: Path) -> Iterator[None]:
     """Remove a new data set, and namespaces made for it, unless the block succeeds. Raises InputError if it exists."""
     if os.path.lexists(folder):
         raise InputError(f"name: got the name of {folder}, which exists, want another name or version")

@@ -30,7 +30,7 @@ SQUARES = 1e-28
 OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-9, 1e-2
 
 
-def certify(settings, own, plan, policy, to_go, model, row):
+def certify(settings, fresh, plan, policy, to_go, model, row):
     """Write cost, residuals and predicted decrease of a plan and its policy.
 
     The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
@@ -40,7 +40,7 @@ def certify(settings, own, plan, policy, to_go, model, row):
     decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
     Args:
-      own: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
+      fresh: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
         them to `to_go`. The Hessians of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
       row: row of CERTIFICATE, written; before, `typical` may have the least typical cost where nothing is curved.
@@ -75,7 +75,7 @@ def certify(settings, own, plan, policy, to_go, model, row):
     augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)
     copy(stage.gradient, N, costate)
-    if own:
+    if fresh:
         copy_matrix(stage.hessian, N, N, hessians[steps])
     for t in range(steps - 1, -1, -1):
         x, u = states[t], plan.controls[t]
@@ -85,7 +85,7 @@ def certify(settings, own, plan, policy, to_go, model, row):
         augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # for this policy, the gradient of the cost-to-go is the costate
             given = model.noise.risk[2] > 0  # a cost-to-go about the origin
-            there, slope = nowhere if own and not given else arrived, costate if own else to_go.gradient[t + 1]
+            there, slope = nowhere if fresh and not given else arrived, costate if fresh else to_go.gradient[t + 1]
             ahead = NextStep(step.jacobian, there, hessians[t + 1], slope)
             cost += noise_quadratic(x, u, t, model.noise, ahead, False, stage)
         terms = scale_of(x, u, stage)
@@ -104,7 +104,7 @@ def certify(settings, own, plan, policy, to_go, model, row):
         )
         decrease += 0.0 if predicted <= SQUARES * terms else predicted
         uncurved += slopes
-        if own:
+        if fresh:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
         cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)

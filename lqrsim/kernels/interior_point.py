@@ -329,7 +329,7 @@ def iterate(done, tolerance, stages, work, mem):
             renew(stages, work, mem)
             continue
         # Far away, linearised equalities may be absurd; softened equalities demand only a part.
-        if part >= STUCK or asked(stages, work) < ABSURD * mem.scale or mem.soft >= SOFTEST:
+        if part >= STUCK or largest_multiplier_step(stages, work) < ABSURD * mem.scale or mem.soft >= SOFTEST:
             break
         mem.soft *= SOFTER
     if part < 0:
@@ -341,7 +341,7 @@ def iterate(done, tolerance, stages, work, mem):
 
 
 @compact
-def asked(stages, work):
+def largest_multiplier_step(stages, work):
     """The largest change of the multiplier of an equality without a price, times its row's size."""
     rows, largest = stages.rows, 0.0
     for at in range(rows.size * (stages.steps + 1)):

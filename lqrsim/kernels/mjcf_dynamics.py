@@ -336,11 +336,11 @@ def start_from(p, one, guess):
     copy(guess, int(p[NV]), at(one[WARM]))
 
 
-def step_from(z, near, p, one, guess, kept, out):
+def step_from(z, near, p, one, guess, stages, out):
     """Write the state after a physics step, which keeps that number of stages of the MjData if it can."""
     write_to(z, p, one)
     start_from(p, one, guess)
-    call(p[STEP_SKIP], at(one[OWN_MODEL]), at(one[DATA]), int32(kept if p[KEEPS] != 0 else 0), int32(1))
+    call(p[STEP_SKIP], at(one[OWN_MODEL]), at(one[DATA]), int32(stages if p[KEEPS] != 0 else 0), int32(1))
     read_from(near, p, one, out)
 
 

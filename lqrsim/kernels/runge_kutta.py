@@ -132,7 +132,7 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
     back(fx4, w4, h, h / 3, weights, w3)
     back(fx3, w3, 0.5 * h, h / 3, weights, w2)
     back(fx2, w2, 0.5 * h, h / 6, weights, w1)
-    whole_curvature(x, u, p, w1, curve)
+    full_curvature(x, u, p, w1, curve)
     for a in range(K):
         for b in range(K):
             hessian[SUPPORT[a], SUPPORT[b]] += curve[a, b]
@@ -150,7 +150,7 @@ def back(fx, after, ahead, share, weights, before):
         before[j] = share * weights[j] + ahead * total
 
 
-def whole_curvature(x, u, p, w, curve):
+def full_curvature(x, u, p, w, curve):
     """Write the second derivatives of the weighted rates, (K, K), on both sides of the diagonal."""
     rate_curvature(x, u, p, w, curve)
     for a in range(K):
@@ -162,7 +162,7 @@ def add_curvature(z, u, p, weights, ahead, slope, total):
     """Add the Hessian (W, W) of the weighted rates at a stage with state `x + ahead k`; `slope` (N, W) is k's."""
     curve, rows, product = zeros(K, K), stack(STATES + 1, W), stack(K, W)
     line = stack(W)  # a local array, not a row of a matrix, stays in registers
-    whole_curvature(z, u, p, weights, curve)
+    full_curvature(z, u, p, weights, curve)
     for a in range(STATES):
         for j in range(W):
             rows[a, j] = ahead * slope[SUPPORT[a], j]

@@ -68,15 +68,15 @@ def begin(slopes, first):
             slopes[first + i, j] = 1.0 if i == j else 0.0
 
 
-def follow(own, slopes, first, then):
+def follow(step_jacobian, slopes, first, then):
     """Write the Jacobian after a step [A B], `A slopes + [0 B]`, from row `then` on; that before is from `first` on."""
     after = stack(N, W)
     for i in range(N):
         for j in range(W):
-            after[i, j] = own[i, j] if j >= N else 0.0
+            after[i, j] = step_jacobian[i, j] if j >= N else 0.0
         for k in range(N):
             for j in range(W):
-                after[i, j] += own[i, k] * slopes[first + k, j]
+                after[i, j] += step_jacobian[i, k] * slopes[first + k, j]
     for i in range(N):
         for j in range(W):
             slopes[then + i, j] = after[i, j]

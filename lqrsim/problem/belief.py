@@ -452,15 +452,15 @@ def _together(*given: Mapping[str, float]) -> dict[str, float]:
     return parameters
 
 
-def _written(name: str, arguments: str, values: dict[str, Any], made: _Step, of: str, data: str = "p") -> str:
+def _written(name: str, arguments: str, values: dict[str, Any], step: _Step, of: str, data: str = "p") -> str:
     """Source of a function of the operations that these values need."""
-    return symbolic.write_function(name, arguments, data, values, of=of, steps=_needed(made, values.values()))
+    return symbolic.write_function(name, arguments, data, values, of=of, steps=_needed(step, values.values()))
 
 
-def _needed(made: _Step, values: Iterable[Any]) -> list[tuple[Any, Any]]:
+def _needed(step: _Step, values: Iterable[Any]) -> list[tuple[Any, Any]]:
     """The operations that these values need, in order."""
     needed, steps = {symbol for value in values for symbol in value.free_symbols}, []
-    for symbol, operation in reversed(made.operations.steps):
+    for symbol, operation in reversed(step.operations.steps):
         if symbol in needed:
             needed |= operation.free_symbols
             steps.append((symbol, operation))

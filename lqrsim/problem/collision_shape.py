@@ -115,15 +115,15 @@ class ShapeInWorld:
         """The distances of geoms up to `reach` in m; None for balls, whose distances have second derivatives."""
         return None
 
-    def placed(self, module: str, own: Array) -> tuple[Source, Array, tuple[UserFunction, ...]]:
+    def placed(self, module: str, numbers: Array) -> tuple[Source, Array, tuple[UserFunction, ...]]:
         """The kernel of a module for these balls, with AT, BALLS and AXES; its data with its own; and its functions."""
         centers, axes = self.centers, self.depends_on
         if centers is None:
-            return source_of(module, AXES=axes), own, ()
+            return source_of(module, AXES=axes), numbers, ()
         kernel = source_of(
             module, AT=centers.numbers, BALLS=self.balls, PARTS=len(self.radii), AXES=axes, HULLS=int(bool(self.hulls))
         )
-        return centers.filling(kernel), np.concatenate([centers.data, own]), centers.functions
+        return centers.filling(kernel), np.concatenate([centers.data, numbers]), centers.functions
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -340,10 +340,10 @@ class KeepsClear:
         return shape_in(dynamics, self.world.moved(time) if time else self.world, **self.shape)
 
 
-def each_once(kept: Sequence[KeepsClear]) -> list[KeepsClear]:
+def each_once(terms: Sequence[KeepsClear]) -> list[KeepsClear]:
     """The first of each kind: those with other obstacles, or another shape, than all before."""
     distinct: list[KeepsClear] = []
-    for term in kept:
+    for term in terms:
         if not any(term.shape == other.shape and _same(term.world, other.world) for other in distinct):
             distinct.append(term)
     return distinct

@@ -203,12 +203,12 @@ def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = 
 
 
 def by_name(
-    who: str, given: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
+    who: str, values: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
 ) -> dict[str, _Value]:
     """The values given for states by name, in a dictionary or by keyword."""
     want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
-    check_kind(who, given, (Mapping, type(None)), want)
-    stated = dict(given or {})  # pyright: ignore[reportCallIssue, reportArgumentType]
+    check_kind(who, values, (Mapping, type(None)), want)
+    stated = dict(values or {})  # pyright: ignore[reportCallIssue, reportArgumentType]
     check_items(who, tuple(stated), str, want)
     for name in stated.keys() & named.keys():
         raise InputError(f"{who}: got {excerpt(name)} twice, want each state once")

@@ -89,22 +89,22 @@ class ControlRate:
         return np.concatenate([[float(known), dt], previous])
 
 
-def _sized(field: str, given: object, want: str, *, infinite: bool = False) -> Array:
+def _sized(field: str, value: object, want: str, *, infinite: bool = False) -> Array:
     """A number, (), or numbers (m,)."""
-    numbers = numbers_of(field, given, want)
+    numbers = numbers_of(field, value, want)
     return check_array(field, numbers, (None,) * min(numbers.ndim, 1), infinite=infinite)
 
 
-def _range(field: str, given: Any, *, single: bool = False) -> tuple[Array, Array]:
+def _range(field: str, value: Any, *, single: bool = False) -> tuple[Array, Array]:
     """(low, high), each () or (m,), of r or (low, high); of a single control, ()."""
     want = "a number, or (low, high), each a number or one for each control"
-    if isinstance(given, (tuple, list)):
-        sides = check_items(field, given, object, want)
+    if isinstance(value, (tuple, list)):
+        sides = check_items(field, value, object, want)
         if len(sides) != 2:
             raise InputError(f"{field}: got {len(sides)} items, want {want}")
         low, high = (_sized(field, side, want, infinite=True) for side in sides)
     else:
-        high = check_array(field, numbers_of(field, given, want), (), infinite=True)
+        high = check_array(field, numbers_of(field, value, want), (), infinite=True)
         low = -high
     if not ((low < 0).all() and (high > 0).all()):
         raise InputError(f"{field}: got {brief(low)} to {brief(high)}, want a range with 0 inside")

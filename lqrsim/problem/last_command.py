@@ -182,16 +182,16 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
             hessian[row, column] += curve[i, j]
 
 
-def write_jacobian(u, own, out, jacobian):
+def write_jacobian(u, inner, out, jacobian):
     """Write the last M states, and the Jacobian of all, given that of the others, (N - M, N)."""
     for i in range(N):
         for j in range(W):
             jacobian[i, j] = 0.0
     for i in range(N - M):
         for j in range(N - M):
-            jacobian[i, j] = own[i, j]
+            jacobian[i, j] = inner[i, j]
         for j in range(M):
-            jacobian[i, N + j] = own[i, N - M + j]
+            jacobian[i, N + j] = inner[i, N - M + j]
     for i in range(M):
         out[N - M + i] = u[i]
         jacobian[N - M + i, N + i] = 1.0

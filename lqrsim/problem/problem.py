@@ -606,7 +606,7 @@ class Problem(OneVersion):
         collision = None if goal is None else self._inside(self.kept_clear, goal, end)
         return "" if collision is None else collision[0]
 
-    def _inside(self, kept: Sequence[KeepsClear], state: Array, time: float) -> tuple[str, str] | None:
+    def _inside(self, terms: Sequence[KeepsClear], state: Array, time: float) -> tuple[str, str] | None:
         """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
-        collisions = (term.in_world(self.dynamics, time).inside(state) for term in kept)
+        collisions = (term.in_world(self.dynamics, time).inside(state) for term in terms)
         return next((collision for collision in collisions if collision is not None), None)

@@ -210,16 +210,16 @@ class ControlCost(_SquareCost):
         return self
 
 
-def _number_or_column(field: str, given: object) -> float | Array:
+def _number_or_column(field: str, value: object) -> float | Array:
     """A number; or numbers (K,), one for each knot. Raises InputError for anything else."""
-    if isinstance(given, (list, tuple)) or (isinstance(given, np.ndarray) and given.ndim):
-        return check_array(field, given, (None,))
-    return check_number(field, given)
+    if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim):
+        return check_array(field, value, (None,))
+    return check_number(field, value)
 
 
-def _by_name(space: Coordinates, field: str, given: Mapping[str, object]) -> Array:
+def _by_name(space: Coordinates, field: str, numbers: Mapping[str, object]) -> Array:
     """Numbers by name or unit as an array (n,), with 0 for the rest; (K, n) if some have one number for each knot."""
-    entries = space._by_name(field, given, _number_or_column)
+    entries = space._by_name(field, numbers, _number_or_column)
     counts = {len(entry) for entry in entries.values() if isinstance(entry, np.ndarray)}
     if len(counts) > 1 or 0 in counts:
         got = " and ".join(map(str, sorted(counts)))

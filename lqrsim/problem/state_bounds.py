@@ -169,10 +169,10 @@ class LimitCost(Cost):
         return CostTerm(soft, numbers, exact_hessian=False)
 
 
-def _bound(field: str, given: object) -> tuple[Side, Side]:
+def _bound(field: str, bound: object) -> tuple[Side, Side]:
     """(low, high), each a number or numbers (K,), at least one of them finite."""
     want = "(low, high), each a number or one for each knot; infinite for no bound"
-    sides = check_items(field, given, object, want)
+    sides = check_items(field, bound, object, want)
     if len(sides) != 2:
         raise InputError(f"{field}: got {len(sides)} items, want {want}")
     low, high = (_side(f"{field}: {name}", side) for name, side in zip(("low", "high"), sides, strict=True))
@@ -189,9 +189,9 @@ def _bound(field: str, given: object) -> tuple[Side, Side]:
     return low, high
 
 
-def _side(field: str, given: object) -> Side:
+def _side(field: str, bound: object) -> Side:
     """A bound, or one for each knot. Raises InputError for anything else."""
-    numbers = numbers_of(field, given, "a number, or one for each knot")
+    numbers = numbers_of(field, bound, "a number, or one for each knot")
     numbers = check_array(field, numbers, (None,) if numbers.ndim else (), infinite=True)
     if not numbers.size:
         raise InputError(f"{field}: got no numbers, want one, or one for each knot")

@@ -98,7 +98,7 @@ def value(x, u, t, row, data):
     z, p = stack(N), stack(PARAMETERS + 1)
     read_parameters(data, p)
     advance(x, u, p, (row // rows + 1) * data[AT + LENGTH] / TIMES, z)
-    return value_there(z, u, holding(z, u, t, own, data), own, data) - data[AT + OTHERS + PARAMETERS + own]
+    return value_at_state(z, u, holding(z, u, t, own, data), own, data) - data[AT + OTHERS + PARAMETERS + own]
 
 
 def slope(x, u, t, row, data, gradient):
@@ -109,7 +109,7 @@ def slope(x, u, t, row, data, gradient):
         z, p, jacobian, there = stack(N), stack(PARAMETERS + 1), zeros(N, W), zeros(W)
         read_parameters(data, p)
         step_jacobian(x, u, p, (row // rows + 1) * data[AT + LENGTH] / TIMES, z, jacobian)
-        slope_there(z, u, holding(z, u, t, own, data), own, data, there)
+        slope_at_state(z, u, holding(z, u, t, own, data), own, data, there)
         for i in range(N):
             for j in range(W):
                 gradient[j] += there[i] * jacobian[i, j]
@@ -128,10 +128,10 @@ def holding(z, u, t, row, data):
     """The end of a period at which a constraint asks for less."""
     if not BOTH:
         return t
-    return t + 1 if value_there(z, u, t + 1, row, data) > value_there(z, u, t, row, data) else t
+    return t + 1 if value_at_state(z, u, t + 1, row, data) > value_at_state(z, u, t, row, data) else t
 
 
-def value_there(z, u, t, row, data):
+def value_at_state(z, u, t, row, data):
     """The constraint at a state."""
     if not SHARED:
         return constraint_value(z, u, t, row, data)
@@ -140,7 +140,7 @@ def value_there(z, u, t, row, data):
     return constraint_value(shared, u, t, row, data)
 
 
-def slope_there(z, u, t, row, data, gradient):
+def slope_at_state(z, u, t, row, data, gradient):
     """Add its gradient (W,) at a state."""
     if SHARED:
         shared, moves = stack(SHARED), zeros(SHARED, N)

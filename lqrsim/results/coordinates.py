@@ -215,21 +215,21 @@ class Coordinates:
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
     def _by_name(
-        self, field: str, given: Mapping[str, object], check: Callable[[str, object], _Value]
+        self, field: str, entries: Mapping[str, object], check: Callable[[str, object], _Value]
     ) -> dict[int, _Value]:
         """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit."""
         units, values = set(self.units) - {""} - set(self.names), {}
-        for key in sorted(given, key=lambda key: key not in units):  # units first, so that names take precedence
+        for key in sorted(entries, key=lambda key: key not in units):  # units first, so that names take precedence
             check_name(field, key, [*self.names, *sorted(units)])
-            value = check(f"{field}: {excerpt(key)}", given[key])
+            value = check(f"{field}: {excerpt(key)}", entries[key])
             labels = self.units if key in units else self.names
             values |= {i: value for i, label in enumerate(labels) if label == key}
         return values
 
-    def _numbers(self, field: str, given: Mapping[str, float]) -> Array:
+    def _numbers(self, field: str, entries: Mapping[str, float]) -> Array:
         """Numbers by name or by unit as an array (n,), with 0 for entries without a number."""
         out = np.zeros(len(self))
-        for i, number in self._by_name(field, given, check_number).items():
+        for i, number in self._by_name(field, entries, check_number).items():
             out[i] = number
         return out
 

@@ -205,7 +205,7 @@ class Solution(Plan):
         """What is wrong between the knots, with the remedy; nothing for a plan that failed, or from a file."""
         if not self.success or "_look" not in vars(self):
             return []
-        faults = self.between_knots()._told(1e-6)  # the default tolerance
+        faults = self.between_knots()._faults(1e-6)  # the default tolerance
         remedies = {"accuracy": "accuracy=1e-6", "between_knots": "between_knots=True"}
         use = ", ".join(remedies[name] for name in faults)
         return [f"{'; '.join(faults.values())}; use Problem({use})"] if faults else []

@@ -323,7 +323,7 @@ class BetweenKnots:
 
     __repr__ = repr_of
 
-    def _told(self, tolerance: float, accuracy: float = COARSE) -> dict[str, str]:
+    def _faults(self, tolerance: float, accuracy: float = COARSE) -> dict[str, str]:
         """What exceeds a tolerance of constraints or an accuracy of steps, in words, by the argument that helps."""
         faults = {}
         if self.step_error > accuracy:

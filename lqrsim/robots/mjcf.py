@@ -603,6 +603,6 @@ def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) 
     return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _WILD
 
 
-def _weights(field: str, given: PerEntry, size: int) -> PerEntry:
+def _weights(field: str, weights: PerEntry, size: int) -> PerEntry:
     """Weights by name unchanged; other weights as one number for each of `size` entries."""
-    return given if isinstance(given, Mapping) else check_weights(field, given, size)
+    return weights if isinstance(weights, Mapping) else check_weights(field, weights, size)

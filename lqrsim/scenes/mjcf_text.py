@@ -90,20 +90,20 @@ def _flatten(path: Path) -> str:
         expand(root, file.parent)
         return root
 
-    def expand(element: ElementTree.Element, own: Path) -> None:
+    def expand(element: ElementTree.Element, including: Path) -> None:
         children = list(element)
         element[:] = []
         for child in children:
             if child.tag == "include":
-                element.extend(read(find(child.get("file", ""), own)))
+                element.extend(read(find(child.get("file", ""), including)))
             else:
-                expand(child, own)
+                expand(child, including)
                 element.append(child)
-                folder_of.setdefault(child, own)
+                folder_of.setdefault(child, including)
 
-    def find(name: str, own: Path) -> Path:
+    def find(name: str, including: Path) -> Path:
         # MuJoCo's rule, relative to the main file, then to the file that includes; and then the packaged models.
-        file = next((file for file in (folder / name, own / name, MODELS / name) if os.path.isfile(file)), None)
+        file = next((file for file in (folder / name, including / name, MODELS / name) if os.path.isfile(file)), None)
         if file is None:
             packaged = ", ".join(sorted(file.name for file in MODELS.glob("*.xml")))
             raise InputError(f"scene: got an include of {name!r}, want a file beside {path.name} or one of: {packaged}")

@@ -400,8 +400,8 @@ def _is_limited(joint: mujoco.MjsJoint) -> bool:
 
 
 def _add(
-    parent: ElementTree.Element, tag: str, own: Mapping[str, str] | None = None, **numbers: npt.ArrayLike
+    parent: ElementTree.Element, tag: str, attributes: Mapping[str, str] | None = None, **numbers: npt.ArrayLike
 ) -> ElementTree.Element:
     """A new element, whose numbers read back exactly."""
     texts = {key: " ".join(repr(float(number)) for number in np.ravel(values)) for key, values in numbers.items()}
-    return ElementTree.SubElement(parent, tag, {**(own or {}), **texts})
+    return ElementTree.SubElement(parent, tag, {**(attributes or {}), **texts})

@@ -450,12 +450,12 @@ def _record_of(moving: World | None, begun: float) -> MovingObstacles | None:
     )  # fmt: skip
 
 
-def _checked_commands(given: Any, shape: tuple[int, int]) -> Array:
+def _checked_commands(commands: Any, shape: tuple[int, int]) -> Array:
     """The commands that a controller returned. Raises InputError unless they are (K, m) numbers."""
     try:
-        command = np.asarray(given, dtype=np.float64)
+        command = np.asarray(commands, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(f"got {excerpt(given)}, want controls of shape {shape}") from None
+        raise InputError(f"got {excerpt(commands)}, want controls of shape {shape}") from None
     if command.shape != shape:
         raise InputError(f"got controls of shape {command.shape}, want {shape}")
     return command
@@ -503,15 +503,15 @@ def _coordinates_of(controller: Controller, plant: Plant) -> tuple[Coordinates, 
     return spaces[0], spaces[1].limited((low, high))
 
 
-def _check_plan(given: Plan, plant: Plant) -> None:
+def _check_plan(followed: Plan, plant: Plant) -> None:
     """Raise InputError unless the plan is finite, and has the plant's states and controls."""
-    plan, dynamics = given.trajectory, plant.robot.dynamics
+    plan, dynamics = followed.trajectory, plant.robot.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
         raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
     if not plan.finite:
-        raise InputError(f"plan: got a plan that is not finite ({given.status.name}), want one that can be run")
+        raise InputError(f"plan: got a plan that is not finite ({followed.status.name}), want one that can be run")
 
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:

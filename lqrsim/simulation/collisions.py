@@ -71,12 +71,12 @@ class Collisions:
         self._last = self.shape.places(states)
         self.clearance = self._clear(self._last, self._time)
 
-    def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
+    def _search_line(self, step: int, part: int, parts: int, arrived: Array, open_: npt.NDArray[np.bool_]) -> None:
         """Check the lines from the robot's last positions to the new ones, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._time = (step + (part + 1) / parts) * self.dt
-        self._last, self.clearance = there, self._clear(there, self._time)
-        length = self.shape.travel(last, there) + self._fastest * self.dt / parts  # moves of robot and obstacles
+        self._last, self.clearance = arrived, self._clear(arrived, self._time)
+        length = self.shape.travel(last, arrived) + self._fastest * self.dt / parts  # moves of robot and obstacles
         # If the clearances at both ends add up to more than the length, no point of the line touches an obstacle.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
@@ -89,7 +89,7 @@ class Collisions:
             gone = np.where(looking, np.minimum(gone + np.maximum(clear, finest), length[rows]), gone)
             share = (gone / np.where(length[rows] > 0, length[rows], 1.0))[:, None, None]
             at_end = gone >= length[rows]
-            places = np.where(at_end[:, None, None], there[rows], last[rows] + share * (there[rows] - last[rows]))
+            places = np.where(at_end[:, None, None], arrived[rows], last[rows] + share * (arrived[rows] - last[rows]))
             times = (step + (part + share[:, 0, 0]) / parts) * self.dt
             clear = self._clear(places, times, rows)
             for k in np.flatnonzero(looking & (clear < 0)):

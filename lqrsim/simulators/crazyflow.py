@@ -152,15 +152,15 @@ def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
         advance, template = simulation.build_step_fn(), simulation.data
 
         @jax.jit
-        def compiled(given: Any) -> Any:
+        def compiled(numbers: Any) -> Any:
             def at(first: int, size: int) -> Any:
-                return given[first : first + size].reshape(1, 1, size)
+                return numbers[first : first + size].reshape(1, 1, size)
 
             moved = template.states.replace(
                 pos=at(0, 3), quat=at(3, 4), vel=at(7, 3), ang_vel=at(10, 3), rotor_vel=at(13, 4), force=at(21, 3),
                 torque=at(24, 3),
             )  # fmt: skip
-            parameters, (mass, inertia), thrust = template.params, given[27:29], given[29:33]
+            parameters, (mass, inertia), thrust = template.params, numbers[27:29], numbers[29:33]
             changed = parameters.replace(
                 mass=parameters.mass * mass, J=parameters.J * inertia, J_inv=parameters.J_inv / inertia,
                 rpm2thrust=parameters.rpm2thrust * thrust[:, None], rpm2torque=parameters.rpm2torque * thrust[:, None],
@@ -173,8 +173,8 @@ def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
                 [part.ravel() for part in (states.pos, states.quat, states.vel, states.ang_vel, states.rotor_vel)]
             )
 
-    def run(given: Array) -> Array:
+    def run(numbers: Array) -> Array:
         with jax.enable_x64(True):
-            return np.asarray(compiled(given))
+            return np.asarray(compiled(numbers))
 
     return run

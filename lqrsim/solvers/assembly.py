@@ -26,10 +26,10 @@ from lqrsim.versions import versions
 BESIDE, LITTLE = 8, 1e-9
 # Distance of a rotation vector from a whole turn, in rad, below which the solution says so. With 0.01 rad of noise, a
 # quadrotor that hovers 0.35 rad from there stays level, and one at 0.17 rad tumbles.
-WHOLE = 0.3
-# That of a tilt from half a turn. An error of the attitude is 2 / HALF times as large in the turn, which is as much as
-# 2 pi / WHOLE times in a rotation vector.
-HALF = 0.1
+NEAR_TURN = 0.3
+# That of a tilt from half a turn. An error of the attitude is 2 / NEAR_TILT times as large in the turn, as much as
+# 2 pi / NEAR_TURN times in a rotation vector.
+NEAR_TILT = 0.1
 UNBOUNDED = 1e10  # a cost so many times below that of the first iteration, or below -1, falls for ever
 FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
@@ -123,9 +123,9 @@ def _near_singular(problem: Problem, result: RunResult) -> str:
     space, states = problem.dynamics.state_coordinates, result.states
     for first, turn in zip(space.rotation_vectors, space.turns, strict=True):
         entries = [first + i for i in range(3) if i != turn]
-        period, close, multiple, where = 2 * np.pi, WHOLE, "a whole turn", "rotation vectors"
+        period, close, multiple, where = 2 * np.pi, NEAR_TURN, "a whole turn", "rotation vectors"
         if turn >= 0:
-            period, close, multiple, where = np.pi, HALF, "half or whole turns", "tilts"
+            period, close, multiple, where = np.pi, NEAR_TILT, "half or whole turns", "tilts"
         angles = np.linalg.norm(states[:, entries], axis=1)
         turns = np.round(angles / period)
         apart = np.where(turns > 0, np.abs(angles - period * turns), np.inf)
@@ -146,7 +146,7 @@ def _regular_axis(vectors: Array) -> str | None:
         turned = rotation_vector(quaternion(vectors), turns_about=axis)
         tilts[axis] = float(np.linalg.norm(np.delete(turned, i, axis=1), axis=1).max())
     axis = min(AXES, key=lambda axis: tilts[axis])
-    return axis if tilts[axis] < np.pi - HALF else None
+    return axis if tilts[axis] < np.pi - NEAR_TILT else None
 
 
 def _fragile(problem: Problem, result: RunResult) -> str:

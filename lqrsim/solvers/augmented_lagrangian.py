@@ -239,24 +239,26 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
     return dataclasses.replace(result, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
 
 
-def _forces(own: ConstraintMultipliers, values: Array) -> Array:
+def _forces(multipliers: ConstraintMultipliers, values: Array) -> Array:
     """The new multipliers: lambda - mu d, at least 0 for inequalities; 0 if the row is inactive."""
     acting = np.where(np.isinf(values), 0.0, values)
-    forces = np.clip(own.values - own.penalty * acting, -own.price if own.term.equality else 0.0, own.price)
+    least = -multipliers.price if multipliers.term.equality else 0.0
+    forces = np.clip(multipliers.values - multipliers.penalty * acting, least, multipliers.price)
     return np.where(np.isinf(values), 0.0, forces)
 
 
-def _added(own: ConstraintMultipliers, values: Array) -> float:
+def _added(multipliers: ConstraintMultipliers, values: Array) -> float:
     """The augmented Lagrangian's terms in the cost."""
-    known, acting, forces = own.values, np.where(np.isinf(values), 0.0, values), _forces(own, values)
-    return float((forces @ (2 * (known - own.penalty * acting) - forces) - known @ known) / (2 * own.penalty))
+    known, penalty, forces = multipliers.values, multipliers.penalty, _forces(multipliers, values)
+    acting = np.where(np.isinf(values), 0.0, values)
+    return float((forces @ (2 * (known - penalty * acting) - forces) - known @ known) / (2 * penalty))
 
 
-def _missed(own: ConstraintMultipliers, values: Array) -> float:
+def _missed(multipliers: ConstraintMultipliers, values: Array) -> float:
     """The largest violation of a constraint, or error of an inequality's multipliers."""
-    if own.term.equality:
+    if multipliers.term.equality:
         return float(np.abs(values).max(initial=0.0))
-    forces = own.values / own.penalty if own.penalty > 0 else 0.0
+    forces = multipliers.values / multipliers.penalty if multipliers.penalty > 0 else 0.0
     return float(np.abs(np.minimum(values, forces)).max(initial=0.0))
 
 

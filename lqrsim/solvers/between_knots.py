@@ -207,7 +207,7 @@ def solve_between_knots(
             status, remedy = Status.STALLED, "use more steps"
             if stop.due:
                 status, remedy = Status.TIME_LIMIT, "raise time_limit"
-            wrong = errors.record(at_knots)._told(tolerance, problem.accuracy or np.inf)
+            wrong = errors.record(at_knots)._faults(tolerance, problem.accuracy or np.inf)
             said = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
             ended = {"status": status, "remedy": remedy, "detail": said}
             break
@@ -231,15 +231,15 @@ def solve_between_knots(
     )  # fmt: skip
 
 
-def _with_rows(asked: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
+def _with_rows(problem: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
     """The problem with rows within its periods beside the constraints that are asked."""
-    pairs = zip(asked.constraints, rows, strict=True)
+    pairs = zip(problem.constraints, rows, strict=True)
     within = [
         WithinPeriods(constraint, *constraint_rows)
         for constraint, constraint_rows in pairs
         if constraint_rows.acts.any()
     ]
-    return at_knots.with_constraints([*asked.constraints, *within])
+    return at_knots.with_constraints([*problem.constraints, *within])
 
 
 class Rows(NamedTuple):

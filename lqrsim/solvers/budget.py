@@ -123,7 +123,7 @@ class Budget:
     def __init__(
         self, most: int, stop: Stop | None = None, *, callback: Callback | None = None, attentive: bool = False
     ) -> None:
-        self._most, self._callback, self._told = most, callback, 0
+        self._most, self._callback, self._reported = most, callback, 0
         self.stop, self.attentive = Stop() if stop is None else stop, attentive
         self.log: list[Iteration] = []
 
@@ -160,12 +160,12 @@ class Budget:
     def report_to(self, callback: Callback | None) -> None:
         """Set a callback; it is called at once with the iterations so far that none was called with."""
         self._callback = callback
-        self._tell(self.log[self._told :])
+        self._tell(self.log[self._reported :])
 
     def _tell(self, iterations: Iterable[Iteration]) -> None:
         if self._callback is None:
             return
-        self._told = len(self.log)
+        self._reported = len(self.log)
         self.stop.told = time.perf_counter()
         with self.stop.heeding():
             for iteration in iterations:

@@ -310,22 +310,22 @@ class Descent:
                 return trial
         return None
 
-    def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
+    def _pushed_back(self, trial: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
         """The plan after a change of the offsets, corrected until it crosses no switch; or else the last trial."""
         wanted, factor = self.model.values + self.model.slopes @ change, None
         for _ in range(PUSHES):
-            if not np.isfinite(there.cost):
+            if not np.isfinite(trial.cost):
                 break
-            rows, missing, crossed = self._missing(there, wanted, multipliers)
+            rows, missing, crossed = self._missing(trial, wanted, multipliers)
             if not crossed:
                 break
             factor = scipy.linalg.cho_factor(self.model.hessian) if factor is None else factor
             change = change + self._push(factor, rows, missing)
-            there = changed(self._problem, self.plan, self.model, change)
-        return there
+            trial = changed(self._problem, self.plan, self.model, change)
+        return trial
 
     def _missing(
-        self, there: CostedPlan, wanted: Array, multipliers: Array
+        self, trial: CostedPlan, wanted: Array, multipliers: Array
     ) -> tuple[npt.NDArray[np.intp], Array, bool]:
         """The switches that a trial must keep to, what each misses, and whether the trial crosses any."""
         model, rows, missing, crossed, jumped = self.model, list[int](), list[float](), False, False
@@ -334,7 +334,7 @@ class Descent:
             sides, held = model.sides[here], multipliers[here] > 0
             short = np.zeros(len(held))
             if len(held) and not jumped:
-                values = self._modes.step(there.states[t], there.controls[t])[1].at(period.switches.names)
+                values = self._modes.step(trial.states[t], trial.controls[t])[1].at(period.switches.names)
                 across = (sides * values < 0) & model.known[here]
                 seen = period.switches.before_jump(across)
                 aim = np.where(held, np.maximum(MARGIN, sides * wanted[here]), MARGIN)

@@ -96,7 +96,7 @@ def gradients(
     if not (sizes > 0).all():
         raise InputError(f"scale: got {sizes.min():g}, want numbers above 0")
     _check_solution(solution, plan)
-    problem = _made(make, point)
+    problem = _problem_at(make, point)
     if problem.accuracy is not None or problem.between_knots:
         raise InputError("make: got a problem with accuracy= or between_knots=True, want one with neither")
     if problem.digest != solution.problem_digest:
@@ -109,7 +109,7 @@ def gradients(
         ahead, behind = point.copy(), point.copy()
         ahead[k] += step
         behind[k] -= step
-        above, below = (optimum.values(_made(make, parameters), plan) for parameters in (ahead, behind))
+        above, below = (optimum.values(_problem_at(make, parameters), plan) for parameters in (ahead, behind))
         return [(upper - lower) / (ahead[k] - behind[k]) for upper, lower in zip(above, below, strict=True)]
 
     columns, errors = [], []
@@ -135,7 +135,7 @@ def _check_solution(solution: Solution, plan: bool) -> None:
         )
 
 
-def _made(make: Callable[[Array], Problem], point: Array) -> Problem:
+def _problem_at(make: Callable[[Array], Problem], point: Array) -> Problem:
     """The problem for parameters (P,). Raises InputError for one whose optimal cost depends on more than the plan."""
     problem = check_kind("make", make(point.copy()), Problem, "a function that returns a Problem")
     if problem.noise is not None:
@@ -173,8 +173,8 @@ class _Optimum:
         """The problem with the start that the solver had: iLQR begins where the initial cost is least."""
         return problem.from_state(problem.start) if self._ilqr and problem.start is not None else problem
 
-    def values(self, problem: Problem, whole: bool) -> list[Array]:
-        """For another problem, the Lagrangian; and if `whole`, the start (n,), the ends of the steps (T, n), the rows
+    def values(self, problem: Problem, full: bool) -> list[Array]:
+        """For another problem, the Lagrangian; and if `full`, the start (n,), the ends of the steps (T, n), the rows
         that act (T+1, R), and the slopes of the Lagrangian (T+1, n+m). Raises InputError for one of other sizes.
         """
         problem = self._begun(problem)
@@ -185,11 +185,11 @@ class _Optimum:
         with problem.dynamics.quiet():
             cost, arrived = stages.trial(self._plan)
             rows = np.where(self._held | (self._forces != 0), stages.values(self._plan), 0.0)
-            if whole:
+            if full:
                 stages.linearize(self._plan, self._costates, self._forces, np.inf)
         cost += (self._costates[0] @ (start - states[0])) - (self._forces * rows).sum()
         parts = [np.array(cost + (self._costates[1:] * (arrived - states[1:])).sum())]
-        if whole:
+        if full:
             slopes = stages.models.gradient - np.einsum("tr,trw->tw", self._forces, stages.slopes)
             slopes[:-1] += np.einsum("tn,tnw->tw", self._costates[1:], stages.models.jacobian)
             parts += [np.array(start), arrived, rows, slopes]

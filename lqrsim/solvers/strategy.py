@@ -86,7 +86,7 @@ APPROACH = 15  # iterations along an approach; without contacts most converge in
 # this number of iterations without them; then along a plan of this tolerance; and then along plans that have converged.
 REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-3
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
-GIVEN = "the given start"  # name of the start that the caller gives
+CALLERS_START = "the given start"  # name of the start that the caller gives
 
 Finish = Callable[[SolveRun, Known], RunResult]
 
@@ -132,7 +132,7 @@ def solve(
     if refinements == REFINEMENTS and any(constraint._rough for constraint in problem.constraints):
         problem, settings, before = outlined(problem, settings, attentive, threads, callback, stop)
     with stop.not_counting():  # compiling
-        starts = [(GIVEN, settings.start)] if settings.start is not None else guides(problem, settings.starts)
+        starts = [(CALLERS_START, settings.start)] if settings.start is not None else guides(problem, settings.starts)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
         first = resolve(starts[0][1], problem).penalised(problem, settings.penalty)
         check_functions(problem, start, first.offset[0].copy())
@@ -838,7 +838,7 @@ class Search:
             untried = "no time was left for further attempts, which may find a better plan"
             result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}".removeprefix("; "))
         elif not stop.due or (self._still is not None and not self._comes_nearer(result)):
-            result = self._told_of_unmoved(result)
+            result = self._with_unmoved_states(result)
         detail = name_risk(chosen, result) if result.status is Status.RISK_TOO_HIGH else result.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
         begun = self._named[0][1] if settings.start is not None else chosen
@@ -847,7 +847,7 @@ class Search:
             options=settings.options(begun.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
 
-    def _told_of_unmoved(self, result: RunResult) -> RunResult:
+    def _with_unmoved_states(self, result: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
         problem, places = self._problem, self._unmoved()
         if not places:

@@ -38,7 +38,7 @@ from lqrsim.versions import changed, other_lqrsim, versions
 _log = logging.getLogger("lqrsim")
 
 MOST_WORKERS, LARGEST_BATCH = 1024, 100_000
-_CAMPAIGN_FILES = {files.NAME, files.GIVEN, "campaign.lock", "policies", "shards", "damaged"}
+_CAMPAIGN_FILES = {files.NAME, files.SOLUTION_FILE, "campaign.lock", "policies", "shards", "damaged"}
 
 
 @checked
@@ -143,7 +143,7 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):
             generator = np.random.default_rng(campaign.seed)
-            untouched, known = generator.bit_generator.state, _is_own(type(disturbance))
+            untouched, known = generator.bit_generator.state, _is_packaged(type(disturbance))
             try:
                 disturbance.check(plant)
                 disturbance.start(plant, standing, [generator])
@@ -166,7 +166,7 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     return [pair for pair, drew_nothing in fixed.items() if drew_nothing]
 
 
-def _is_own(kind: type[Disturbance]) -> bool:
+def _is_packaged(kind: type[Disturbance]) -> bool:
     return kind.__module__.partition(".")[0] == "lqrsim"
 
 
@@ -192,7 +192,7 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         hashes[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
-        save_load.save(given, folder / files.GIVEN)
+        save_load.save(given, folder / files.SOLUTION_FILE)
     remarks = [
         f"{policy} {remark}" for policy, solution in solutions.items() for remark in solving.remarks(scenario, solution)
     ]
@@ -229,7 +229,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(f"scenario: got a {parts} other than the one {folder} was begun with{older}, want another")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
-        want = "none" if manifest["solution"] is None else folder / files.GIVEN
+        want = "none" if manifest["solution"] is None else folder / files.SOLUTION_FILE
         raise InputError(f"solution: got {got}, want {want}, as {folder} was begun with, or another folder")
     for kind, digest in specification["code"].items():
         if digest != manifest["code"].get(kind):
@@ -263,7 +263,7 @@ def _code(campaign: Campaign) -> dict[str, str | None]:
     for kind in sorted(
         {type(disturbance) for disturbance in itertools.chain(*used)}, key=lambda kind: kind.__qualname__
     ):
-        if not _is_own(kind):
+        if not _is_packaged(kind):
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
             hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())
     return hashes

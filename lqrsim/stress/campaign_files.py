@@ -252,7 +252,7 @@ def _unsigned(data: io.BytesIO) -> int:
 
 
 FORMAT, VERSION, NAME = "lqrsim campaign", 8, "manifest.json"
-GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
+SOLUTION_FILE = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
 _LARGEST, _LARGEST_TABLE = 1 << 26, 1 << 29  # bytes, largest manifest and table
 
 

@@ -21,7 +21,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
-from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, digest_of_solution, read, read_manifest
+from lqrsim.stress.campaign_files import SOLUTION_FILE, Damaged, Table, digest_of_solution, read, read_manifest
 from lqrsim.stress.data_table import DataTable, Entry, fraction_format
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
@@ -63,7 +63,7 @@ class Results:
         """The campaign. Raises InputError if its scenario is your own function, and no scenario was given."""
         stated = self.manifest["campaign"]
         scenario = resolve(stated["scenario"], registered_only=self._scenario is None)
-        given = None if self.manifest["solution"] is None else self.folder / GIVEN
+        given = None if self.manifest["solution"] is None else self.folder / SOLUTION_FILE
         return Campaign.from_json(stated, scenario, given)
 
     @property

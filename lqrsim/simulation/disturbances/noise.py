@@ -200,10 +200,10 @@ class StateNoise(Disturbance):
         return self._left_out(plant, "filters and tubes have no noise that acts on the states directly")
 
 
-def as_disturbances(given: object) -> tuple[Disturbance, ...]:
+def as_disturbances(disturbances: object) -> tuple[Disturbance, ...]:
     """The disturbances, with each `Noise` converted to StateNoise. Raises InputError for anything else."""
     wanted = "disturbances, such as ControlNoise(0.05)"
-    items = check_items("disturbances", given, (Disturbance, Noise), wanted)
+    items = check_items("disturbances", disturbances, (Disturbance, Noise), wanted)
     return tuple(StateNoise(item) if isinstance(item, Noise) else item for item in items)
 
 
