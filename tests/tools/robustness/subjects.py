@@ -30,6 +30,7 @@ HOOKS |= {
     "solving",
     "softened",
     "touches",
+    "grazed",
     "untouched_body",
     "approaches",
     "contact_modes",
