@@ -285,7 +285,7 @@ class Dynamics:
     def grazed(self, states: Array) -> tuple[int, list[str]]:
         """The first step at which a plan (T+1, n) grazes geoms that are fixed to the world, and the names of these.
 
-        Those that it touches at its start or at its end do not count.
+        Ground does not count, nor what it touches at its start or at its end.
         """
         return 0, []
 

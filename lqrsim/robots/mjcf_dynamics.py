@@ -346,9 +346,10 @@ class MjcfDynamics(Dynamics):
     def grazed(self, states: Array) -> tuple[int, list[str]]:
         model, touched = copy.copy(self.physics.model), list[set[int]]()
         model.geom_margin[:] += _GRAZED
+        ground = np.isin(model.geom_type, [int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)])
+        passed = np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & ~ground)
         for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
-            geoms = np.unique(data.contact.geom)
-            touched.append(set(geoms[model.body_weldid[model.geom_bodyid[geoms]] == 0].tolist()))
+            touched.append(set(passed[np.isin(passed, data.contact.geom)].tolist()))
         met = set[int]().union(*touched) - touched[0] - touched[-1]
         if not met:
             return 0, []
