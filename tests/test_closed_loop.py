@@ -476,8 +476,12 @@ def test_a_plan_of_another_model_is_left_gradually() -> None:
     robot = MjcfRobot(scene_from_xml(BILLIARD, "billiard"))
     solution = track(robot, [0.0, 1.0, 0.0, 0.0], np.full((30, 1), 1.0), 0.01, feedback=False)
     other = replace(solution.trajectory, states=0.8 * solution.trajectory.states + np.array([0.0, 0.2, 0.0, 0.0]))
-    said = simulate(Plant(robot, robot.scene), replace(solution, trajectory=other)).departure()
+    run = simulate(Plant(robot, robot.scene), replace(solution, trajectory=other))
+    said = run.departure()
     assert re.fullmatch(r"LEAVES the plan at 0\.\d+ s: x\S* \+\S+ \S+, allowed \S+ \S+", said)
+    assert f"policy {said}\n" in run.summary()
+    formulas = replace(run, scene="a scene for a robot of formulas")
+    assert f"policy {said}; ls.check_plant compares the plan's dynamics" in formulas.summary()
 
 
 JOINTS = {

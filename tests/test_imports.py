@@ -35,6 +35,7 @@ FLOORS = (
     ("reports",),
     ("commands",),
     ("cli",),
+    ("__main__",),
     ("belief", "disturbances", "lq", "types"),
 )
 

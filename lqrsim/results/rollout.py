@@ -360,7 +360,10 @@ class Rollout:
         else:
             lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]
         if self.undisturbed is not None and (left := self.departure()):
-            lines.append(f"  undisturbed, the plan's policy {left}")
+            # One that is left little by little is of other dynamics; by an MJCF, which is robot and scene, of the same.
+            by_formula = self.robot != self.scene and "that step jumps" not in left
+            hint = "; ls.check_plant compares the plan's dynamics with the simulator's" if by_formula else ""
+            lines.append(f"  undisturbed, the plan's policy {left}{hint}")
         if warned := self.warned():
             lines.append(f"  MuJoCo warned {warned}")
         if self.trials > 1:
