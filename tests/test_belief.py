@@ -378,6 +378,35 @@ def test_the_filter_in_the_loop_is_as_good_as_it_says() -> None:
     np.testing.assert_allclose(exact.states[0], plan.trajectory.states[:, :3], atol=0.02)
 
 
+class Reading(ls.belief.BeliefFeedback):
+    """Notes what it reads."""
+
+    def start(self, trials: int) -> Any:
+        run, self.read = super().start(trials), list[Array]()
+        decide = run.control
+
+        def control(step: int, measured: Array) -> Array:
+            self.read.append(measured.copy())
+            return decide(step, measured)
+
+        run.control = control  # pyright: ignore[reportAttributeAccessIssue]
+        return run
+
+
+def test_a_run_reads_its_true_states_as_late_as_is_stated() -> None:
+    """The formulas of the beacons in NumPy, to rounding; nothing before the first reading arrives."""
+    scenario, trials = ls.scenarios.differential_drive(), 3
+    problem = drive(scenario)
+    law, delay = Reading(problem, ls.smooth(problem)), 1
+    off = ls.disturbances.InitialStateError(0.05)
+    run = ls.simulate(scenario.plant(), controller=law, disturbances=[off], trials=trials, frames=False)
+    x, y, heading = np.moveaxis(run.states, 2, 0)
+    exact = [*(np.sqrt((x - place) ** 2 + y**2 + 0.01) for place in (-2.0, 2.0)), np.sin(heading)]
+    read, wanted = np.moveaxis(law.read, 0, 1), np.stack(exact, axis=2)
+    assert np.isnan(read[:, :delay]).all()
+    np.testing.assert_allclose(read[:, delay:], wanted[:, : read.shape[1] - delay], atol=1e-12)
+
+
 def belief_scenario() -> ls.Scenario:
     """The packaged drive along a wall, with what a run meets."""
     scenario = ls.scenarios.differential_drive()
