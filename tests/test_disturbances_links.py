@@ -140,7 +140,8 @@ def test_saturation_narrows_the_limits(arena, cage):
     np.testing.assert_allclose(Saturation(highest=(0.2, 0.3)).limits(arena), [[-0.5] * 2, [0.2, 0.3]])
     np.testing.assert_allclose(Saturation(lowest=1.0).scaled(0.5).limits(cage), [[0.5] * 4, [3.71] * 4])
     np.testing.assert_allclose(Saturation(share=0.5).scaled(0.0).limits(cage), [space.low, space.high])
-    np.testing.assert_allclose(Saturation(lowest=-0.1, highest=0.1).scaled(2.0).limits(arena), np.zeros((2, 2)))
+    crossed = Saturation(lowest=-0.1, highest=0.2).scaled(2.0)  # to 0.3 and -0.1: the middle of both
+    np.testing.assert_allclose(crossed.limits(arena), np.full((2, 2), 0.1))
     rollout = simulate(cage, hover(), disturbances=[ControlNoise(0.5), Saturation(lowest=1.0, highest=1.4)], trials=3)
     assert rollout.applied.min() == 1.0
     assert rollout.applied.max() == 1.4
