@@ -181,7 +181,7 @@ def remedy_of(
     if inside := problem.goal_inside:
         geoms = any("geoms" in term.shape for term in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
-    step, met = problem.dynamics.grazed(found.states) if np.isfinite(found.states).all() else (0, [])
+    step, met = problem.dynamics.grazed(result.states) if np.isfinite(result.states).all() else (0, [])
     if met:
         grazed = (
             f"the plan grazes {' and '.join(met)} at {step * problem.dt:.4g} s: if that is only to be passed, let it"
