@@ -1370,7 +1370,7 @@ class TestPlanMethods:
         replay(kernel, SIZES, "renew", *state)
         assert memory["age"][0] == stages.about.keeps[0] == 0
         replay(kernel, SIZES, "asked", *state[:2])
-        run(interior_point.SETTLE, 0, 0)
+        run(interior_point.POLISH, 0, 0)
         memory["solved"] = 1.0
         replay(kernel, SIZES, "central", 1e6, state[2])
         replay(kernel, SIZES, "cross", 1e6, 1e6, *state)

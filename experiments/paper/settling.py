@@ -14,7 +14,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.solvers.active_set import ActiveSet
-from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
+from lqrsim.solvers.interior_point import InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.stages import Stages
 from paper.common import numbers
 
@@ -47,7 +47,7 @@ def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
     return np.array([])
 
 
-def settle(stages: Stages, plan: Motion, found: Found) -> list[Motion]:
+def settle(stages: Stages, plan: Motion, found: InteriorResult) -> list[Motion]:
     """The plan, and those after each step from there with the multipliers of the optimum; nothing is good enough."""
     plans = [plan]
     with np.errstate(all="ignore"):

@@ -102,7 +102,7 @@ NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its r
 
 # Tasks of `interior_point`: to find typical sizes at a plan; to choose slacks and multipliers there; to take steps
 # without a barrier from there; to iterate; and to cross over, because no iteration follows.
-SURVEY, BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3, 4
+SURVEY, BEGIN, POLISH, ITERATE, CLOSE = 0, 1, 2, 3, 4
 
 
 @compact
@@ -112,7 +112,7 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     All code that a solve can need is compiled together, before it begins.
 
     Args:
-      task: one of SURVEY, BEGIN, SETTLE, ITERATE and CLOSE.
+      task: one of SURVEY, BEGIN, POLISH, ITERATE and CLOSE.
       tolerance: tolerance of stationarity, gaps and complementarity. violation: of constraints, in their units.
       begun: PlanBeginning. stages: PlanStages. work: InteriorArrays. memory: (1,) row of INTERIOR.
       log: rows of MEASURES, written.
@@ -127,7 +127,7 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     if task == BEGIN:
         begin(begun, stages, work, memory[0])
         return 0, RUNNING
-    if task == SETTLE:
+    if task == POLISH:
         return first, CONVERGED if polish(tolerance, violation, begun, stages, work, memory[0]) else RUNNING
     return iterations(first, last, task == CLOSE, tolerance, violation, stages, work, memory[0], log)
 

@@ -99,8 +99,8 @@ class Ladder:
         return self._answer()
 
     def finish_interior(self) -> RunResult | None:
-        assert self.guess.found is not None
-        return self._remember(self._point.finish(self.guess.found))
+        assert self.guess.interior is not None
+        return self._remember(self._point.finish(self.guess.interior))
 
     def from_neighbour(self) -> RunResult | None:
         known = tuple(multipliers.values for multipliers in self.guess.multipliers)
@@ -313,7 +313,7 @@ class Attempt(NamedTuple):
 ATTEMPTS = (
     Attempt(
         "the optimum of the search for a free duration, which is only finished",
-        lambda tried: tried.guess.found is not None,
+        lambda tried: tried.guess.interior is not None,
         Ladder.finish_interior,
     ),
     Attempt(

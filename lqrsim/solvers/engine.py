@@ -502,7 +502,7 @@ class SolveRun:
             result.states, value, violation=violation, kept=self.work.keeps(values),
             claimed=self.budget.log[-1].cost if result.success else None,
             tolerance=self.final if result.status is Status.CONVERGED else None,
-            least=0.0 if self.initial_guess.found is None else self.initial_guess.found.scale,
+            least=0.0 if self.initial_guess.interior is None else self.initial_guess.interior.scale,
         )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
             # The expected cost without penalties of constraints, which the cost-to-go of the solver has.

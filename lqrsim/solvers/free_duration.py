@@ -26,7 +26,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Callback, Laps, Stop
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resampled, resolve
-from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
+from lqrsim.solvers.interior_point import InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.interior_run import LITTLE, MUCH, Barrier
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
@@ -97,7 +97,7 @@ class DurationSearch:
         self._problem, self._settings, self._solve = problem, settings, solve
         self._range, self._stop, self._attentive = problem.duration, stop, attentive
         self._budget = Budget(settings.max_iterations, stop, callback=callback)
-        self.best: tuple[Problem, Found] | None = None
+        self.best: tuple[Problem, InteriorResult] | None = None
         self.candidates = list[Candidate]()
         self._log = list[Iteration]()  # of the search that led to the best plan
         self._fixed, self._total = list[Solution](), 0
@@ -238,7 +238,7 @@ class DurationSearch:
                 return
             begin = again.trajectory
 
-    def _find(self, begin: Trajectory, budget: Budget, share: float = 1.0) -> tuple[bool, Problem, Found]:
+    def _find(self, begin: Trajectory, budget: Budget, share: float = 1.0) -> tuple[bool, Problem, InteriorResult]:
         """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan.
 
         `share` is of the tolerance.
@@ -298,12 +298,12 @@ class DurationSearch:
             remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
         ))  # fmt: skip
 
-    def _finished(self, ordinary: Problem, result: Found) -> Solution:
+    def _finished(self, ordinary: Problem, result: InteriorResult) -> Solution:
         """What becomes of a plan with its duration held. The log begins with that of the search for it."""
         m, n = result.plan.controls.shape[1], result.plan.states.shape[1]
         summary = f"a plan of {ordinary.steps * ordinary.dt:.6g} s"
         gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
-        guess = InitialGuess(gain, result.plan.controls, summary, found=result, log=log)
+        guess = InitialGuess(gain, result.plan.controls, summary, interior=result, log=log)
         return self._solved(ordinary, replace(self._settings, starts=None, start=guess))
 
     def _described(self, solution: Solution) -> Solution:
@@ -373,7 +373,7 @@ def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
 
 def find_duration(
     problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, budget: Budget, price: float
-) -> tuple[Problem, Found]:
+) -> tuple[Problem, InteriorResult]:
     """Find the best duration near a plan's duration. Return the problem with it, and the optimum or the last plan.
 
     `violation` is the tolerance of the constraints. The iterations join the log of the budget, which may end the
@@ -404,7 +404,7 @@ def find_duration(
 def _searched(
     problem: Problem, begin: Trajectory, segments: Sequence[int], tolerance: float, violation: float, budget: Budget,
     price: float, *, hold: bool = False,
-) -> tuple[Stages, Array, Found]:  # fmt: skip
+) -> tuple[Stages, Array, InteriorResult]:  # fmt: skip
     """The optimum near a plan with its duration as a state, which jumps where segments end; and the price of rows.
 
     With `hold`, the gaps of the plan are first closed with its duration, which must be that of the problem.
@@ -424,7 +424,7 @@ def _searched(
     # The bounds of the duration hold at any price.
     prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, price)
 
-    def run(plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()) -> Found:
+    def run(plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()) -> InteriorResult:
         point = InteriorPoint(
             stages, plan, barrier=barrier.parameter, room=barrier.room, price=prices, multipliers=multipliers
         )

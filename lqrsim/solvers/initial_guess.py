@@ -18,7 +18,7 @@ from lqrsim.results.solution_parts import Iteration, Multipliers, Trajectory
 from lqrsim.results.value_functions import Quadratic
 
 if TYPE_CHECKING:
-    from lqrsim.solvers.interior_point import Found
+    from lqrsim.solvers.interior_point import InteriorResult
 
 
 class InitialPrior:
@@ -100,7 +100,8 @@ class InitialGuess:
     trajectory: Trajectory | None = None  # that the first pass linearises about, feasible or not; None for the policy's
     prior: InitialPrior | None = None
     multipliers: tuple[Multipliers, ...] = ()  # of the constraints; empty if unknown
-    found: "Found | None" = None  # a result of the interior point, with the iterations in `log`: only finishing remains
+    # A result of the interior point, with the iterations in `log`: only finishing remains.
+    interior: "InteriorResult | None" = None
     log: tuple[Iteration, ...] = ()
 
     @property

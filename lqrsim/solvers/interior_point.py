@@ -11,7 +11,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
-from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, SETTLE, SURVEY
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SURVEY
 from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
@@ -39,7 +39,7 @@ class Measures(NamedTuple):
 
 
 @dataclass(kw_only=True, eq=False)
-class Found:
+class InteriorResult:
     """Result of a run."""
 
     plan: Motion  # feasible except for gaps
@@ -116,7 +116,7 @@ class InteriorPoint:
         near: bool = False,
         watch: Callable[[Measures, float], bool] = lambda measures, seconds: False,
         hurried: bool = True,
-    ) -> Found:
+    ) -> InteriorResult:
         """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
 
         Args:
@@ -127,14 +127,17 @@ class InteriorPoint:
           hurried: whether it is to be called after each iteration, rather than after `ATTENTION` seconds.
         """
         functions = functions_of(self.stages.problem)
-        self._make_room(most)
+        self._log = np.zeros(most, MEASURES)
+        if len(self._arrays.filter) < most:  # like the log, the filter gets a row at each iteration
+            self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
+            self.stages.interior = self._arrays, self._memory
         self._tolerances = float(tolerance), float(violation)
         self.stages.state(margin=INSIDE * violation)
         clock = time.perf_counter()
-        if near and self._call(SETTLE, 1)[1] == CONVERGED:
+        if near and self._call(POLISH, 1)[1] == CONVERGED:
             self.iterations = 1
             watch(self.measures, time.perf_counter() - clock)
-            return self._found(True)
+            return self._result(True)
         outcome, ended, bite = RUNNING, False, 1
         while outcome == RUNNING and not ended and self.iterations < most:
             first, clock = self.iterations, time.perf_counter()
@@ -149,7 +152,7 @@ class InteriorPoint:
                 bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
         if outcome == RUNNING:
             self._call(CLOSE, self.iterations)
-        return self._found(bool(self._memory["solved"][0]))
+        return self._result(bool(self._memory["solved"][0]))
 
     def _call(self, task: int, last: int) -> tuple[int, int]:
         return self.stages.call(
@@ -157,20 +160,13 @@ class InteriorPoint:
             self._arrays, self._memory, self._log,
         )  # fmt: skip
 
-    def _make_room(self, most: int) -> None:
-        """Enlarge the filter and the log, which get a row at each iteration."""
-        self._log = np.zeros(most, MEASURES)
-        if len(self._arrays.filter) < most:
-            self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
-            self.stages.interior = self._arrays, self._memory
-
-    def _found(self, solved: bool) -> Found:
+    def _result(self, solved: bool) -> InteriorResult:
         stages = self.stages
         known = tuple(stages.force[:, stages.owners == k].copy() for k in range(len(stages.problem.constraint_terms)))
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
-        return Found(
+        return InteriorResult(
             plan=Motion(*map(np.copy, self.plan)), gain=stages.about.policy.gain, measures=self.measures,
             multipliers=known, pressing=pressing, solved=solved,
             flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self.sizes, scale=float(self._memory["scale"][0]),

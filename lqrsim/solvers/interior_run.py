@@ -19,7 +19,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import NAME, Found, InteriorPoint, Measures
+from lqrsim.solvers.interior_point import NAME, InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.settings import has_curvature
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
@@ -93,7 +93,7 @@ class InteriorRun:
             )  # fmt: skip
         return None if result is None else self.finish(result)
 
-    def finish(self, interior: Found) -> RunResult | None:
+    def finish(self, interior: InteriorResult) -> RunResult | None:
         """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
         if not np.isfinite(interior.plan.states).all():
             return None
@@ -105,7 +105,7 @@ class InteriorRun:
             return replace(result, status=Status.COST_CONVERGED, detail=KINKED)
         return result
 
-    def _jumps(self, interior: Found) -> bool:
+    def _jumps(self, interior: InteriorResult) -> bool:
         """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
         dynamics, dt, draws = self._problem.dynamics, self._problem.dt, np.random.default_rng(0)
 
@@ -148,7 +148,7 @@ class InteriorRun:
             candidates.append(self.result(*self._run.work.roll_out(*law, plan.states[0]), law))
         return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
 
-    def _polished(self, interior: Found) -> RunResult | None:
+    def _polished(self, interior: InteriorResult) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
         work = self._run.work
         law = compiled.law_about(interior.plan.states, *self._at_limits(interior))
@@ -181,7 +181,7 @@ class InteriorRun:
         self.without_multipliers()
         return replace(result, status=Status.MAX_ITERATIONS)
 
-    def _ended_inside(self, lagrangian: AugmentedLagrangian, interior: Found) -> RunResult:
+    def _ended_inside(self, lagrangian: AugmentedLagrangian, interior: InteriorResult) -> RunResult:
         """The plan in memory as it is: without second derivatives, the interior point ends inside the constraints.
 
         Penalties give the policy its gains across rows that press. The certificate is that of the multipliers alone.
@@ -193,7 +193,7 @@ class InteriorRun:
         interior.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
         return result
 
-    def _at_limits(self, interior: Found) -> tuple[Array, Array]:
+    def _at_limits(self, interior: InteriorResult) -> tuple[Array, Array]:
         """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""
         controls, gain = interior.plan.controls.copy(), interior.gain.copy()
         for side, sign in ((self._run.stages.low, -1.0), (self._run.stages.high, 1.0)):
@@ -204,7 +204,7 @@ class InteriorRun:
             gain[pressed] = 0.0
         return controls, gain
 
-    def _set_multipliers(self, interior: Found, values: list[Array], firmness: float) -> None:
+    def _set_multipliers(self, interior: InteriorResult, values: list[Array], firmness: float) -> None:
         """Choose multipliers with which the augmented Lagrangian has the interior point's forces at these values."""
         triples = zip(self._run.work.multipliers, interior.multipliers, values, strict=True)
         for k, (own, known, numbers) in enumerate(triples):
@@ -221,7 +221,9 @@ class InteriorRun:
         lagrangian.evaluate(*result.plan)
         return result
 
-    def _pressing(self, lagrangian: AugmentedLagrangian, interior: Found, result: RunResult) -> tuple[Multipliers, ...]:
+    def _pressing(
+        self, lagrangian: AugmentedLagrangian, interior: InteriorResult, result: RunResult
+    ) -> tuple[Multipliers, ...]:
         """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
         values = self._run.work.constraint_values(*result.plan)
         multipliers = []

@@ -140,7 +140,7 @@ def solve(
             SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
             for guess in (first, *(resolve(choice, problem) for _, choice in starts[1:]))
         ]
-    is_plan = settings.start is not None and first.prior is None and first.found is None
+    is_plan = settings.start is not None and first.prior is None and first.interior is None
     given_plan = runs[0].given() if is_plan else None
     search = Search([name for name, _ in starts], runs, callback, threads, given_plan, trees=trees)
     with stop.reporting("smooth", attentive):
@@ -196,7 +196,7 @@ def outlined(
 
 def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
-    if run.initial_guess.found is not None or (run.problem.constraints and run.second_order):
+    if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
         return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
