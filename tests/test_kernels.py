@@ -1369,7 +1369,7 @@ class TestPlanMethods:
         memory["age"], stages.about.keeps[0] = 1.0, 1.0
         replay(kernel, SIZES, "renew", *state)
         assert memory["age"][0] == stages.about.keeps[0] == 0
-        replay(kernel, SIZES, "asked", *state[:2])
+        replay(kernel, SIZES, "largest_multiplier_step", *state[:2])
         run(interior_point.POLISH, 0, 0)
         memory["solved"] = 1.0
         replay(kernel, SIZES, "central", 1e6, state[2])
