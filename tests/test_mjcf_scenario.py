@@ -44,7 +44,7 @@ def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> Non
     assert scenario.name == "cart"
 
 
-def test_start_and_goal_are_settled_where_contacts_carry_the_robot(tmp_path: Path) -> None:
+def test_start_and_goal_are_at_rest_where_contacts_carry_the_robot(tmp_path: Path) -> None:
     """A box on a slide, above its floor: MuJoCo's contact is a spring, which its weight pushes in."""
     file = tmp_path / "box.xml"
     file.write_text(
@@ -56,7 +56,7 @@ def test_start_and_goal_are_settled_where_contacts_carry_the_robot(tmp_path: Pat
     problem = resolve(f"{file},goal={{'arm': 0.5}},at_rest=True").problem
     for state, arm in ((problem.start, 0.0), (problem.goal, 0.5)):
         np.testing.assert_allclose(state[:2], [-0.2, arm], rtol=0, atol=1e-3)
-    with pytest.raises(InputError, match="settled: got 1, want True or False"):
+    with pytest.raises(InputError, match="at_rest: got 1, want True or False"):
         resolve(f"{file},at_rest=1")
 
 

@@ -305,7 +305,7 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ({"tolerate": {"feet": 0.05}}, "tolerate: got 'feet', want one of: x, y"),
         ({"effort": [1.0, 2.0]}, "effort: got 2 numbers, want 4: rotor_1"),
         ({"at_end": -1.0}, "at_end: got -1"),
-        ({"memory": 0.0}, "OffsetFree: memory: got 0.0, want a finite number > 0$"),
+        ({"memory": 0.0}, "OffsetFree: memory: got 0.0, want a finite number > 0"),
         ({"record": "yes"}, "OffsetFree: record: got 'yes', want"),
         ({"uncertainty": {"start": 0.1}}, "OffsetFree: uncertainty: got {'start': 0.1}, want an Uncertainty"),
         (
