@@ -15,6 +15,7 @@ from sympy import cos, sin, sqrt
 import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
+from lqrsim.problem.plain_term import PlainTerm
 from lqrsim.results.solution_parts import Status
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.view.figure_parts import accuracy
@@ -335,6 +336,25 @@ def drive(scenario: ls.Scenario, **changed: Any) -> ls.Problem:
     return ls.Problem(dynamics=of, **given | changed)
 
 
+@pytest.mark.parametrize("chance", [0.2, 0.02])
+def test_a_chance_constraint_is_a_quantile_away(chance: float) -> None:
+    """At drawn beliefs: SciPy's quantile, of the distance's gradient times the covariance, times four."""
+    of = drive(ls.scenarios.differential_drive()).dynamics
+    assert isinstance(of, ls.belief.Belief)
+    side = of.chance_constraint(lambda x, u, p: p.wall - x.x * x.y, chance=chance, parameters={"wall": 1.0})
+    value = PlainTerm(side.bind(of), len(of.state_coordinates), 2).value
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        roots = np.tril(rng.normal(size=(3, 3)))
+        mean, covariance = rng.normal(size=3), roots @ roots.T
+        slope = np.array([-mean[1], -mean[0], 0.0])
+        expected = 1.0 - mean[0] * mean[1] - norm.isf(chance) * np.sqrt(slope @ covariance @ slope)
+        assert value(np.concatenate([of.state(mean, covariance), np.zeros(2)]), 0, 0) == pytest.approx(
+            expected, rel=1e-9
+        )
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("chance", [0.2, 0.02])
 def test_a_chance_constraint_keeps_standard_deviations_away(chance: float) -> None:
     """From a wall that the plan would pass nearer: by the quantile of SciPy, along the gradient of the distance."""

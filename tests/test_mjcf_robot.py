@@ -509,7 +509,7 @@ def test_a_free_body_passes_pillars(clearance: float | None) -> None:
         assert min(apart) == pytest.approx(clearance, abs=1e-5)
 
 
-@pytest.mark.parametrize("turn", [5.0, 6.1, 2 * np.pi, 6.5, 8.0])
+@pytest.mark.parametrize("turn", [6.1, *rarely(5.0, 2 * np.pi, 6.5, 8.0)])
 def test_a_plan_that_comes_near_a_whole_turn_says_so(turn: float) -> None:
     """There a tilt of 0.02 rad is at least 0.3 rad of the rotation vector: |r| / (2 sin(|r| / 2)) times as much."""
     motors = "".join(f'<motor joint="b" gear="{gear}"/>' for gear in ("1 0 0", "0 1 0", "0 0 1"))

@@ -19,6 +19,7 @@ SAMPLE = (34, 94, 119, 201, 222, 554, 38, 42, 61, 69, 95, 133)
 SOLVED = (34, 42)  # of these: with a plan and without, each of another structure
 
 
+@pytest.mark.long
 def test_nothing_false_is_said() -> None:
     """However few are solved within so many iterations."""
     found = [outcomes.look(one, improve=True, time_limit=None, max_iterations=80) for one in SOLVED]
@@ -36,7 +37,7 @@ def test_a_goal_that_is_reached_exactly_may_have_any_weight(number: int) -> None
     np.testing.assert_allclose([plan.cost for plan in plans], plans[0].cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize("number", [49, 94, *rarely(68, 178)])
+@pytest.mark.parametrize("number", [94, *rarely(49, 68, 178)])
 def test_a_plan_that_is_hard_to_find_is_found(number: int) -> None:
     """What is missed can be stationary, or a descent at a price end at the first plan, which costs a thousand times as
     much.

@@ -131,8 +131,8 @@ def drawn(count: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_samples_are_about_the_line_from_start_to_goal() -> None:
-    """Of 300, the moments within 4.5 standard errors."""
-    count, end = 300, 1e-3
+    """Of 100, the moments within 4.5 standard errors."""
+    count, end = 100, 1e-3
     problem = swung(final_cost=ls.QuadraticCost(np.ones(2), about=(0.3 + end, 0.0)), steps=50)
     states, controls = drawn(count, problem=problem)
     angle, speed = states.T

@@ -87,9 +87,14 @@ web_server.serve = lambda handler, **options: serve(handler, **{{**options, {}}}
     ("before", "reason"),
     [
         (BIND.format("'0.0.0.0'"), r"others can reach the server at \S+, port \d+"),
-        *rarely((BIND.format("'::'"), r"others can reach the server at \S+, port \d+")),
-        (SERVE.format("'process_request': None"), r"admits http://127\.0\.0\.1:\d+ to /drop, port \d+"),
-        (SERVE.format("'process_response': shared(options['process_response'])"), r"lets any page read /, port \d+"),
+        *rarely(
+            (BIND.format("'::'"), r"others can reach the server at \S+, port \d+"),
+            (SERVE.format("'process_request': None"), r"admits http://127\.0\.0\.1:\d+ to /drop, port \d+"),
+            (
+                SERVE.format("'process_response': shared(options['process_response'])"),
+                r"lets any page read /, port \d+",
+            ),
+        ),
     ],
 )
 def test_a_server_that_is_not_private_is_refused(rollout: ls.Rollout, before: str, reason: str, tmp_path: Path) -> None:
