@@ -97,8 +97,8 @@ class DerivativeCheck:
     Attributes:
       what: name of the derivative, such as `df/dx of ...`.
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
-      row, column: names of the output and the input at that entry; the other fields are there, too.
-      difference: the difference quotient.
+      row, column: names of the output and the input at that entry.
+      stated: the derivative there. difference: its difference quotient. state, control: the sample.
       tolerance: the largest acceptable error.
     """
 

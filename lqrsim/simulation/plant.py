@@ -45,9 +45,9 @@ class Plant(OneVersion):
         balls in space, all that the MJCF lets it touch, except what a free joint, or a slide that is not level, lets it
         stand on: level planes that face up, and height fields.
       model: the compiled scene, with a contact sensor for each obstacle.
-      bodies: ids of all its bodies: that one, those that its joints move, and those attached to them.
-      qpos, qvel, ctrl: indices of its joints and controls in MuJoCo's arrays.
-      actuators: ids of its actuators, of which each has any number of controls.
+      body: id of the robot's body. bodies: ids of it, of those that the robot's joints move, and of what is attached.
+      qpos, qvel, ctrl: indices of the robot's joints and controls in MuJoCo's arrays.
+      actuators: ids of the robot's actuators, of which each has any number of controls.
       contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
     """
 

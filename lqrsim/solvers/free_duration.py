@@ -108,7 +108,7 @@ class DurationSearch:
         stated = at_duration(problem, problem.steps * problem.dt)
         with stop.not_counting():  # compiling
             stages = Stages(stated)
-            free = with_duration(problem)
+            free = with_duration_state(problem)
         routes, sketches = list(ways(stated, stages)), list[Sketch]()
         spent = dict.fromkeys((way.name for way in routes), 0)
         for share, freed in SKETCHED:
@@ -336,7 +336,7 @@ class Sketch(NamedTuple):
 
 
 def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop, free: Problem | None = None) -> Sketch:
-    """Sketch a way in a problem with its duration, or with a free one, `with_duration`."""
+    """Sketch a way in a problem with its duration, or with a free one, `with_duration_state`."""
     n, budget, states = way.states.shape[1], Budget(SKETCH, stop), way.states
     with stop.not_counting():  # compiling
         stages = Stages.lent(free or problem)
@@ -411,7 +411,7 @@ def _searched(
     """
     n = len(problem.dynamics.state_coordinates)
     with budget.stop.not_counting():  # compiling
-        stages = Stages(with_duration(problem, by_segment=bool(segments)))
+        stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
     stages.jump(segments)
     laps = Laps(budget)
 
@@ -473,7 +473,7 @@ def at_duration(problem: Problem, duration: float) -> Problem:
     return problem._of_duration(duration)
 
 
-def with_duration(problem: Problem, *, by_segment: bool = False) -> Problem:
+def with_duration_state(problem: Problem, *, by_segment: bool = False) -> Problem:
     """The problem with its duration as the last state; or with that of a plan of steps as long as the segment's.
 
     Raises:

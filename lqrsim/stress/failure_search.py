@@ -260,12 +260,8 @@ class RareFailures:
     @checked
     def save(self, folder: str | os.PathLike[str], *, shown: Count = 8) -> Rollout:
         """Write rare.json, certificate.npz, and `shown` typical failures as rollout.npz. Returns these."""
-        folder, result, estimate = (
-            check_path("folder", folder, "the path of a folder"),
-            self.splitting,
-            self.probability,
-        )
-        numbers = self.typical(shown)
+        folder = check_path("folder", folder, "the path of a folder")
+        result, estimate, numbers = self.splitting, self.probability, self.typical(shown)
         findings = {
             "probability": estimate.value, "low": estimate.low, "high": estimate.high,
             "confidence": estimate.confidence, "standard_error": result.standard_error,
