@@ -367,6 +367,7 @@ def test_what_is_no_urdf_or_no_robot_is_said_in_a_line(
         ({"efforts": {"twin": 3.0}}, "efforts: got 'twin', want one of: shoulder, elbow, grip"),
         ({"efforts": {"elbow": -1.0}}, "efforts of elbow: got -1.0, want"),
         ({"efforts": 3.0}, "efforts: got 3.0, want numbers by joint"),
+        ({"efforts": np.ones((2, 4))}, "efforts: got array("),
         ({"armature": {"wrist": 0.1}}, "armature: got 'wrist', want one of: shoulder, elbow, grip, twin"),
         ({"armature": -0.1}, "armature of shoulder: got -0.1, want"),
         ({"servos": {"wrist": (1.0, 1.0)}}, "servos: got 'wrist', want one of: shoulder, elbow, grip"),

@@ -66,7 +66,7 @@ class EveryPeriod:
 
 
 def prepared(problem: ls.Problem, solution: ls.Solution) -> Contestant:
-    solver = ls.prepare(problem)
+    solver = ls.prepare(problem, tolerance=1e-4)
 
     def again(state: Array, begin: ls.Solution | ls.types.Replan) -> Made:
         found = solver.solve(state, begin)
@@ -197,7 +197,7 @@ def report(found: dict[str, Any]) -> list[str]:
         f" {found['period']:.0f} ms a plan for the next 5 s from the measured state, begun with the solver's own last"
         " plan, shifted by a step; all begin with one first plan. Its first control is commanded at once, however long"
         " the solve took, so that costs compare plans and not times. A time is of the whole call, shifting included."
-        " Solves end at lqrsim's tolerance of 1e-4, FDDP at as small a change of the cost, Fatrop at as small"
+        " lqrsim's solves end at a tolerance of 1e-4, FDDP at as small a change of the cost, Fatrop at as small"
         " residuals. The cost of the loop is what the true states and the commanded controls cost: controls and"
         " obstacles along the run, and the final cost at its end,"
         f" over {compared} runs of each; obstacles do not stop the robot. All but Fatrop answer with gains, too.",

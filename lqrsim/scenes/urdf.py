@@ -290,7 +290,8 @@ def _add_actuators(
     joints = {
         joint.name: joint for joint in spec.joints if _kind(joint) in ("slide", "hinge") and joint.name not in followers
     }
-    effort_of = check_kind(f"{name}: efforts", efforts or {}, Mapping, "numbers by joint: {'shoulder': 20.0}")
+    stated = {} if efforts is None else efforts
+    effort_of = check_kind(f"{name}: efforts", stated, Mapping, "numbers by joint: {'shoulder': 20.0}")
     for joint, effort in effort_of.items():
         check_name(f"{name}: efforts", joint, joints)
         check_number(f"{name}: efforts of {joint}", effort, at_least=0.0)
