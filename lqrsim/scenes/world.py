@@ -73,6 +73,7 @@ class Obstacle:
     @classmethod
     def of_corners(cls, name: str, corners: npt.ArrayLike, *, velocity: npt.ArrayLike = (0.0, 0.0, 0.0)) -> "Obstacle":
         """The convex hull of points (C, 3) in the world, in m; of points (C, 2), a prism that is infinitely high."""
+        name = check_text("obstacle: name", name, "a name", at_most=1000)
         points = real(f"obstacle {name!r}: corners", corners)
         if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
             raise InputError(
