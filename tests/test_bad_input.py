@@ -262,7 +262,7 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: ls.load_scene("aren"), "^scene: got 'aren', want one of: arena, cage .*or the path of an .xml"),
     (lambda: ls.load_scene("somewhere/nowhere.xml"),
      "^scene: got '.*nowhere.xml', want a file that exists, or one of: arena"),
-    (lambda: ls.Obstacle.of_corners(object(), np.zeros(3)), "^obstacle: name: got <object object.*want a name"),
+    (lambda: ls.Obstacle.of_corners(object(), np.zeros(3)), "^obstacle: name: got an object, want a name"),
     (lambda: ls.World([ls.Obstacle(
         "ramp", "box", np.zeros(3), Rotation.from_euler("x", 30, degrees=True).as_matrix(), np.ones(3)
     )]).seen_by("xy"), "'ramp': got a tilted box, want it upright"),
