@@ -134,7 +134,7 @@ def test_a_tube_ends_where_it_would_hide_the_picture(drive_solution: ls.Solution
     largest = 0.2 * np.hypot(*np.ptp(places, axis=0))
     assert len(tube.centres) == np.count_nonzero(2 * std <= largest)
     assert 2 < len(tube.centres) < 20
-    assert tube.label.endswith(f"drawn up to {largest:.2g} m")
+    assert tube.label.endswith(f"drawn up to half axes of {largest:.2g} m")
     # One that is too wide from the first knot on leaves the plan alone.
     nothing = Ellipsoids.predicted(places, np.tile(1e6 * np.eye(2), (151, 1, 1)))
     assert nothing.outlines().shape == (0, 48, 2)

@@ -20,9 +20,9 @@ class BeliefFeedback(Controller):
     """The policy of a plan in belief space: controls affine in the mean and the root of the covariance.
 
     It reads the belief's sensors in place of measured states, from the end of the first period on, and begins with the
-    plan's first belief. States that the belief takes as known are measured. `ReadingErrors` are the errors of readings
-    in a run, and the belief's `process` is the noise that the filter assumes. A rollout's `controller_run` has
-    `beliefs`, (T, K, N) at the knots at which there is a control.
+    plan's first belief. States that the belief takes as known are measured exactly. `ReadingErrors` are the errors of
+    the readings in a run; the belief's `process` is the noise on the state that the filter assumes. A rollout's
+    `controller_run` has `beliefs`, (T, K, N) at the knots at which there is a control.
 
     Args:
       problem: a problem whose dynamics are a `Belief`.
@@ -48,7 +48,7 @@ class BeliefFeedback(Controller):
 
     @property
     def plan(self) -> Solution:
-        """The plan of the mean. Its policy has the gains on the mean, and the covariance of the plan."""
+        """The plan of the mean. Its policy has the gains on the mean; the covariance is that of the plan."""
         n, solution, policy = self.belief.size, self.solution, self.solution.policy
         known = np.vecdot(policy.gain[:, :, n:], policy.nominal[:, None, n:])
         law = AffinePolicy(
@@ -76,7 +76,7 @@ class BeliefRun(ControllerRun):
     """K trials of a run.
 
     Attributes:
-      beliefs: at each knot so far, with the readings that arrived, (t, K, N).
+      beliefs: the beliefs at each knot so far, after the readings that had arrived by then, (t, K, N).
     """
 
     def __init__(self, law: BeliefFeedback, trials: int) -> None:

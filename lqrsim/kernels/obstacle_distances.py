@@ -6,14 +6,14 @@ from lqrsim.kernels.declarations import ROW, outline, stack
 from lqrsim.kernels.hull_distance import MESH, hull_distance
 from lqrsim.kernels.signed_distance import signed_distance
 
-MOST_CORNERS = 64  # of a hull of a robot; its distances take time in proportion to it
+MOST_CORNERS = 64  # of one hull of a robot; distances take time in proportion to its corners
 
 
 def hull_distances(obstacles, count, each, data, parts, size, corners, displaced, out, slopes):
-    """Write the distances (count parts obstacles,) of robots of convex hulls, and their derivatives in the corners.
+    """Write the distances (count parts obstacles,) of robots made of hulls, and their derivatives in the corners.
 
     Args:
-      each: robots per trial. parts: the first corner of each hull, and the end of the last. size: number of the hulls.
+      each: robots per trial. parts: each hull's first corner, and then the number B of all. size: that of hulls.
       corners: (count, 3 B). displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
       slopes: (count parts obstacles, at least 3 for each corner of a hull).
     """

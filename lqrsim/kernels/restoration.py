@@ -27,7 +27,11 @@ from lqrsim.kernels.stages import (
     write_models,
 )
 
-FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; factor
+FIRST, LEAST, FALL = (
+    1e-1,
+    1e-6,
+    0.2,
+)  # first and least barrier parameter, relative to the price; factor by which it falls
 LEAST_DECREASE = 0.1  # predicted decrease per row, relative to the parameter, below which the parameter falls
 LAST = 1e-6  # predicted decrease over all rows at the end: multipliers are accurate to its square root
 ARMIJO, SHORTEST = 1e-4, 1e-6
@@ -35,7 +39,7 @@ ROUNDING = 1e-13  # relative difference of merits that may be rounding
 INSIDE = 0.01  # fraction of the distance to a limit that a step leaves
 EDGE = 0.01  # distance from the limits at the beginning, relative to the range
 DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # weight at a damping of 1; bounds of the damping
-LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # fractions above or below which the damping falls or grows; factor
+LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # step fractions above or below which the damping falls or grows by a factor
 WIDE = 1e3  # factor by which a multiplier may differ from the multiplier that the barrier implies
 # The descent ends when the violation (relative to the rows' sizes) is below CLOSE and the change of cost below SLOW,
 # PATIENCE times in a row.
@@ -45,15 +49,15 @@ LEVEL, FINER = 1e-4, 0.1  # negligible predicted decrease, relative to the merit
 
 @compact
 def restoration(first, last, price, stages, work, memory, log):
-    """Run the iterations `first` to `last` - 1 from the plan in `work.plan`; with `last` of 0, begin there.
+    """Run the iterations `first` to `last` - 1 from the plan in `work.plan`; `last` = 0 only prepares them.
 
     Args:
       price: the cost of violating a constraint by its typical size. stages: PlanStages.
       work: RestorationArrays. memory: (1,) row of RESTORATION. log: rows of RESTORED, written.
 
     Returns:
-      The number of iterations so far; and RUNNING, STALLED if no step helps or none is needed, NOT_FINITE if there is
-      none; or NO_PROGRESS if the caller is to test whether the violation of the plan is stationary, with the
+      The number of iterations so far; and RUNNING, STALLED if no step helps or none is needed, NOT_FINITE if no step
+      can be computed; or NO_PROGRESS if the caller is to test whether the violation of the plan is stationary, with the
       multipliers relative to the price in `work.shares`. If it is not, the next call continues.
     """
     mem = memory[0]
@@ -218,7 +222,7 @@ def model_penalties(price, stages, work, mem):
 
 
 def slacks_of(at, number, price, parameter, rows):
-    """The two slacks of a row, whose difference is its value, that minimise price and barrier."""
+    """The two slacks of a row whose sum of price and barrier is least; their difference is the value of the row."""
     steep = price / rows.sizes[at]
     if rows.kinds[at] == EQUALITY:
         steep *= 2

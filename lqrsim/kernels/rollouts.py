@@ -21,7 +21,7 @@ from lqrsim.kernels.model_functions import (
 from lqrsim.kernels.passes import end_model
 from lqrsim.kernels.records import Limits, ModelOrder, NextStep, QuadraticStage
 
-# A predicted decrease below this, relative to the squares that cancel in it, consists of squares of rounding errors.
+# A predicted decrease below this fraction of the terms that cancel in it is a rounding error.
 SQUARES = 1e-28
 
 
@@ -67,8 +67,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
       keep: 1 to write all steps; 0 to overwrite a single step, if only the predicted decrease is needed.
       policy: relative to the plan, written. to_go: about the origin, written.
 
-    It also returns the decrease of cost that the model predicts, without what is only rounding: of an optimal cost of
-    zero nothing else is left.
+    The decrease of cost that the model predicts is returned, too: 0 if it is only rounding, as at an optimal cost of 0.
     """
     share, stage, arrived, weights = order.share, QuadraticStage(stack(W, W), stack(W)), stack(N), stack(N)
     jacobian, none, no_change = stack(N, W), zeros(M), zeros(N)
@@ -124,7 +123,7 @@ def ilqr_pass(steps, plan, model, damping, policy, to_go):
 
 
 def initial_step(x0, model, share, to_go, direction):
-    """Write the best move (N,) of a soft start x0, given the cost-to-go at 0; return its predicted decrease, or NaN."""
+    """Write the best change (N,) of a start x0 that has a cost, given the cost-to-go; return its predicted decrease."""
     S, s = to_go.hessian[0], to_go.gradient[0]
     hessian, gradient, none = stack(W, W), stack(W), zeros(M)
     total, slope = stack(N, N), stack(N)
@@ -147,7 +146,7 @@ def initial_step(x0, model, share, to_go, direction):
 
 
 def squares_at(z, size, first, hessian):
-    """The squares of z (size,), weighted with the diagonal of a Hessian from an index on, without cancellation."""
+    """The sum of |H_ii| z_i^2 / 2 for z (size,), from an index of H on: the size of terms that may cancel."""
     total = 0.0
     for i in range(size):
         total += 0.5 * abs(hessian[first + i, first + i]) * z[i] * z[i]
@@ -191,7 +190,7 @@ def larger(a, b):
 def line_search(steps, shift, work, model, bound, slope, smallest, trial):
     """Try fractions 1, 1/2, 1/4, ... of a step until the merit is below `bound` by that fraction of `slope`.
 
-    The merit is the true cost, with noise its expectation, plus the augmented Lagrangian's terms. Returns merit, cost
+    The merit is the true cost (with noise the expected one) plus the augmented Lagrangian's terms. Returns merit, cost
     and fraction; or `bound`, `bound` and 0 if no fraction down to `smallest` is accepted.
 
     Args:

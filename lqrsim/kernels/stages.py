@@ -1,8 +1,8 @@
-"""Models of all stages of a plan, which need not satisfy the dynamics, and the step to their minimum.
+"""Quadratic models of all stages about a plan, and the step to their minimum; the plan need not satisfy the dynamics.
 
 The gap between the end of a step and the next state is closed by the iterations. The rows are those of all constraints,
-then the limits of the controls. What a method does with the rows is a curvature across each, and a force along it: see
-`interior_point.py`, `active_set.py` and `solvers/restoration.py`.
+then the limits of the controls. To a model, a row of value d is `curve d^2 / 2 - force d`; each method has its own
+curves and forces: see `interior_point.py`, `active_set.py` and `solvers/restoration.py`.
 """
 
 from math import inf, sin, sqrt
@@ -39,8 +39,8 @@ from lqrsim.kernels.rollouts import larger
 
 TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
 STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: the cube root of the precision
-ASIDE = 1e-3  # distance from a plan at which slopes are looked at, too: at the plan itself some may vanish
-SMALLEST = 1e-3  # least motion of a state that is its typical size
+ASIDE = 1e-3  # distance from a plan at which gradients are evaluated, too: at the plan itself entries may vanish
+SMALLEST = 1e-3  # a state that moves less has a typical size of 1
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
 # The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of
@@ -72,7 +72,7 @@ def write_models(stages, plan, costates, least):
 
 
 def write_models_and_costates(stages, plan, costates):
-    """As `write_models`, but write the costates: those of this plan and the forces of its rows."""
+    """As `write_models`, and compute the costates from this plan and the multipliers of its rows."""
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
     total, slope, out = 0.0, stack(W), stages.models
@@ -214,7 +214,7 @@ def cut_at_jumps(stages, plan, arrived, jacobian):
 
 
 def cut_at_jump(t, stages, plan, arrived, jacobian):
-    """If the last state jumps after a step, it does not depend on the step, and leaves no gap."""
+    """If the last state jumps after step t: no gap, and no dependence on the step."""
     if stages.jumps[t + 1] != 0:
         arrived[t, N - 1] = plan.states[t + 1, N - 1]
         fill(jacobian[N - 1], W, 0.0)
@@ -418,7 +418,7 @@ def direction(stages, plan, gaps, share, weight, base, curves, forces):
 
 
 def regularised_direction(stages, plan, gaps, weight, scale, curves, forces):
-    """The first step of the ladder of regularisation that exists; return the rung, -1 if none has a minimum.
+    """Raise the regularisation until the models have a minimum; return its level, -1 if none suffices.
 
     The weights on changes of the controls are relative to `scale`, and added to `weight`; the rest as in `direction`.
     """
@@ -447,7 +447,7 @@ def blend(share, one, other, out):
 
 
 def add_rows(t, stages, curves, forces, stage, slope):
-    """Add what `direction` says of the rows at a step to its model."""
+    """Add `curve d^2 / 2 - force d` of each row of a step to its model."""
     slopes = stages.models.slopes
     for row in range(stages.rows.size):
         at = stages.rows.size * t + row
@@ -476,8 +476,7 @@ def row_change(t, row, stages):
 def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
     """Write gains and cost-to-go at t so that the gap closes; return whether the control block is definite.
 
-    The stage, which is overwritten, and the cost-to-go are of changes of the plan; so are the policy's offsets, for an
-    unchanged state.
+    The stage, which is overwritten, the cost-to-go and the policy's offsets are in deviations from the plan.
     """
     least, block = stack(M), stack(M, M)
     for i in range(M):
@@ -522,9 +521,9 @@ def forward_sweep(stages, gaps):
 
 
 def jump_law(hessian, gradient, law):
-    """Write the best change of the last state, (N+1,) of the others and 1; reduce the cost-to-go to that of these.
+    """Eliminate the last state: write its best change as an affine function (N+1,) of the others.
 
-    Returns whether there is a best one.
+    The cost-to-go becomes that of the others. Returns whether there is a best change.
     """
     last = N - 1
     curve = hessian[last, last]
@@ -575,7 +574,7 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
 
 
 def least_curvatures(stages, curves, held, least):
-    """Write the least curvatures (M,) of the controls along a plan, while later controls respond at their best.
+    """Write the least curvatures (M,) of the controls along a plan, with later controls optimised out.
 
     Returns whether the reduced Hessian is positive definite.
 

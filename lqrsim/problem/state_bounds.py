@@ -26,8 +26,9 @@ class GoalState(Constraint):
     Args:
       goal: (n,) the state, in the states' units; or a dictionary of name or unit: number, for some of the states, such
         as {"m/s": 0} for all velocities.
-      count_turns: whether a goal of 2 pi is another than 0. By default, the states that the dynamics declare as angles
-        reach their goals up to whole turns, and a search may take any. A QuadraticCost about a goal counts them.
+      count_turns: whether 2 pi and 0 are different goals. By default, the states that the dynamics declare as angles
+        reach their goals up to whole turns, and a search over starts may choose any of them. A QuadraticCost about a
+        goal counts them.
     """
 
     @checked
@@ -210,15 +211,15 @@ def _quantity(number: float, unit: str) -> str:
 
 
 def _quantities(numbers: Array, unit: str) -> str:
-    """The least and the greatest number, or the one that all are."""
+    """The least and the greatest number, or the common value."""
     low, high = numbers.min(), numbers.max()
     return _quantity(low, unit) if low == high else f"{low:g} to {_quantity(high, unit)}"
 
 
-# The kernel of the others: the distance of a state to a bound, positive on the feasible side. `data` has the number of
-# knots K with a bound of their own, and then for each row the index of the state, 1 for a lower or -1 for an upper
-# bound, the last step at which it holds, the period in which the distance is taken, 0 for none, and K bounds, infinite
-# at knots without one. The last bound holds from its knot on.
+# The kernel of GoalState and StateBounds: the distance of a state to a bound, positive on the feasible side. `data` has
+# the number of knots K with a bound of their own, and then for each row the index of the state, 1 for a lower or -1 for
+# an upper bound, the last step at which it holds, the period by which the distance is wrapped, 0 for none, and K
+# bounds, infinite at knots without one. The last bound holds from its knot on.
 INDEX, SIGN, LAST, PERIOD, BOUNDS = 0, 1, 2, 3, 4
 
 

@@ -1,1 +1,1 @@
-"""From MJCF to the obstacles that the planner sees."""
+"""Scenes: files in MJCF and URDF, their kinematics and contacts, and the obstacles in them."""

@@ -32,12 +32,12 @@ UNSTABLE = [
 class Period:
     """The result of a control period, in S parts of equal length."""
 
-    states: list[Array]  # S arrays (K, n), at the end of each part; angles in any representative
+    states: list[Array]  # S arrays (K, n), at the end of each part; angles are not unwrapped
     frames: list[Array]  # S arrays (K, nq), MuJoCo's qpos at these times
     # S arrays (K, obstacles), whether MuJoCo detected a contact at the beginning of the last physics step of the part;
     # empty arrays if contacts are not sensed.
     touching: list[npt.NDArray[np.bool_]]
-    stable: npt.NDArray[np.int64]  # (K,) number of parts, from the first on, in which the simulation was stable
+    stable: npt.NDArray[np.int64]  # (K,) number of leading parts in which the simulation was stable
 
 
 class Physics:
@@ -153,7 +153,7 @@ class MujocoPhysics(Physics):
         return self._qpos.copy()
 
     def state(self) -> Array:
-        """The current analytic states (K, n), angles in any representative."""
+        """The current analytic states (K, n); angles are not unwrapped."""
         return self.plant.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel], self._act)
 
     def touching_now(self) -> npt.NDArray[np.bool_]:
@@ -163,9 +163,9 @@ class MujocoPhysics(Physics):
         return self._sensors[:, self.plant.contact] > 0
 
     def sense(self, held: Array | None = None) -> Array:
-        """MuJoCo's `sensordata` (K, any) of the present, under the last forces and the last controls, or `held` (K, m).
+        """MuJoCo's current `sensordata` (K, any), under the last forces and the last controls, or `held` (K, m).
 
-        The simulations continue as if it had not been asked for.
+        The state of the simulations is restored afterwards.
         """
         if held is not None:
             self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(held)
@@ -262,13 +262,13 @@ class SimulatorPhysics(Physics):
 
     def multiply(self, parameter: str, factors: Array) -> None:
         if parameter not in self._simulator.parameters:
-            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, want one that can")
+            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, want one that has this")
         self._factors[parameter] = self._factors.get(parameter, 1.0) * factors
 
     def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
         raise InputError(
-            f"{name}: got a plant simulated by {self._simulator.name}, want one without a simulator: it changes"
-            " MuJoCo's models"
+            f"{name}: got a plant simulated by {self._simulator.name}, want one that MuJoCo simulates: it"
+            " changes MuJoCo's models"
         )
 
     def displace(self, displaced: Array) -> None:

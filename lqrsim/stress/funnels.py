@@ -56,8 +56,8 @@ class LevelTest:
     """The test that a level has to pass."""
 
     trials: int
-    failures: int  # that there may be
-    aim: int  # failures in the pilot; fewer, because a level that just passes there would fail every second test
+    failures: int  # allowed failures
+    aim: int  # allowed failures in the pilot: fewer, for a level that just passes it fails half of its tests
 
 
 @checked
@@ -77,7 +77,7 @@ def smallest_test(
                 f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
                 f" {MOST_TRIALS:,} trials, want a smaller one of the three"
             )
-    low = failures  # trials that all fail
+    low = failures  # with as many trials nothing is proved
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if proves(middle) else (middle, high)
@@ -118,8 +118,8 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
         failed = pilot.failures(0.0, test.trials)
         if failed > test.aim:
             reason = (
-                f"begun on the plan itself, {failed} of {test.trials} trials fail; to prove a rate of {rate:g}, at most"
-                f" {test.aim} may"
+                f"even when they begin on the plan, {failed} of {test.trials} trials fail; to prove a rate of {rate:g},"
+                f" at most {test.aim} may fail"
             )
         else:
             reason = "too many trials fail at all levels that were tried, down to the smallest"
@@ -129,7 +129,8 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
         failed, done = fresh(runs, level, test)
         simulated += done
         if failed > test.failures:
-            stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}; {test.failures} of {test.trials} may"
+            allowed = f"at most {test.failures} of {test.trials} may fail"
+            stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}; {allowed}"
             break
         passed = level, test.trials, test.trials - failed
     beyond = f"levels beyond {largest:.4g} were not tried" if passed[0] == largest else ""
@@ -234,11 +235,11 @@ def funnel(
 
     The trials are simulated, so limits, obstacles and everything else that ends a trial are taken into account. The
     rate is over states drawn uniformly in the ellipsoid, and over the disturbances; see `Funnel`. With the given
-    confidence all levels are right at once: the error probability is divided among the knots. A level of 0, with its
+    confidence all levels hold simultaneously: the error probability is divided among the knots. A level of 0, with its
     reason, means that no level was certified.
 
-    A run that begins at a later knot is assumed to have followed the plan until then; see `simulate_from`. What is not
-    named here is as in `simulate`.
+    A run that begins at a later knot is assumed to have followed the plan until then; see `simulate_from`. Arguments
+    that are not listed here are those of `simulate`.
 
     Args:
       disturbances: as in `simulate`, without those that change the start of a run, such as `InitialStateError`.

@@ -23,7 +23,7 @@ class Ellipsoids:
 
     centres: Array
     covariances: Array
-    end: float | None = None  # largest half axis in m, if ellipsoids are left out from the first larger one on
+    end: float | None = None  # half axis in m at which the tube is cut off; None if it is whole
 
     @classmethod
     def predicted(cls, centres: Array, covariances: Array) -> "Ellipsoids":
@@ -45,7 +45,7 @@ class Ellipsoids:
     @property
     def label(self) -> str:
         """The label of a predicted tube in a legend."""
-        return PREDICTED if self.end is None else f"{PREDICTED}; drawn up to {self.end:.2g} m"
+        return PREDICTED if self.end is None else f"{PREDICTED}; drawn up to half axes of {self.end:.2g} m"
 
     def axes(self) -> tuple[Array, Array]:
         """Half axes (k, d), and rotations (k, d, d) whose columns are their directions."""
