@@ -34,7 +34,7 @@ FIRST, LEAST, FALL = (
 )  # first and least barrier parameter, relative to the price; factor by which it falls
 LEAST_DECREASE = 0.1  # predicted decrease per row, relative to the parameter, below which the parameter falls
 LAST = 1e-6  # predicted decrease over all rows at the end: multipliers are accurate to its square root
-ARMIJO, SHORTEST = 1e-4, 1e-6
+ARMIJO, SHORTEST = 1e-4, 1e-6  # least part of the predicted decrease that a step must have; smallest step
 ROUNDING = 1e-13  # relative difference of merits that may be rounding
 INSIDE = 0.01  # fraction of the distance to a limit that a step leaves
 EDGE = 0.01  # distance from the limits at the beginning, relative to the range

@@ -285,7 +285,7 @@ class Dynamics:
     def grazed(self, states: Array) -> tuple[int, list[str]]:
         """The first step at which a plan (T+1, n) grazes geoms that are fixed to the world, and the names of these.
 
-        Ground does not count, nor what it touches at its start or at its end.
+        Ground does not count, nor geoms that the plan touches in its first or last state.
         """
         return 0, []
 

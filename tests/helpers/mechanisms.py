@@ -50,7 +50,7 @@ def arm(
     things: str = "",
     more: str = "",
 ) -> str:
-    """Capsules along x, each on a hinge at the end of that before; `gap` is from a hinge to where its capsule begins.
+    """Capsules along x, each hinged to the end of the one before; `gap` is from a hinge to where its capsule begins.
 
     `joint` and `geom` are attributes of all, `joints` and `geoms` those of each. Without actuators there are motors.
     """
