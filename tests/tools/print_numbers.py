@@ -4,7 +4,7 @@
     python3 run.py numbers --long             # those, too: some hours on an idle machine
     python3 run.py numbers --only league      # commands that contain this text
     python3 run.py numbers --list             # the commands, with the number of rows that each is to print
-    python3 run.py numbers --folder models    # also those that want a folder, of the models of other packages
+    python3 run.py numbers --folder models    # also those that want FOLDER, of the models of other packages
 
 A command in a table is that of its row. Rows without one, and text, belong to the command that the paragraph above
 them names first. A number counts as printed if the command's output has it, rounded as on the page; the row of a
@@ -13,6 +13,8 @@ reader to judge: build/numbers/ has each output, with the machine, the last comm
 it took. A rerun continues if code is committed and has not changed.
 
 docs/results.md is not read: `lqrsim reproduce` writes it.
+
+Commands that name a file of one's own, as FILE.xml, are left out, and named at the end.
 
 Exits with 1 if a command failed or a table has a number that was not printed.
 """
@@ -36,6 +38,7 @@ ROOT = Path(__file__).parents[2]
 OUT = ROOT / "build" / "numbers"
 CODE = ("lqrsim", "models", "experiments", "tests/tools", "pyproject.toml")
 NAMED = re.compile(r"`((?:python (?:experiments|tests/tools)/|lqrsim (?:demo|(?:reproduce|solve|simulate) \S+))[^`]*)`")
+PLACEHOLDER = re.compile(r"[A-Z]+(\.\w+)?")  # a word of a command that stands for a file of one's own
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)")
 
 
@@ -65,7 +68,7 @@ class Config:
     again: bool = False
     """Run a command also if its output, by the same code, is there."""
     folder: Path | None = None
-    """What FOLDER stands for in a command; without it, commands that want one are left out, and named."""
+    """What FOLDER stands for in a command; without it, commands that want one are left out."""
 
 
 def claims(page: Path) -> Iterator[Claim]:
@@ -192,14 +195,12 @@ def main(config: Config) -> int:
             print(f"{rows_of_tables:4} rows, {len(rows) - rows_of_tables:3} texts: {command}")
         return 0 if chosen else 2
     commit = last_commit()
-    failed = 0
+    failed, left_out = 0, list[str]()
     for command, rows in tqdm(chosen.items(), desc="numbers", disable=None):
-        words = shlex.split(command)
-        if "FOLDER" in words and config.folder is None:
-            failed += 1
-            tqdm.write(f"\n{command}: left out, for it wants --folder")
+        words = [str(config.folder or word) if word == "FOLDER" else word for word in shlex.split(command)]
+        if any(map(PLACEHOLDER.fullmatch, words)):
+            left_out.append(command)
             continue
-        words = [str(config.folder) if word == "FOLDER" else word for word in words]
         code, output = run(command, words, commit, again=config.again)
         tqdm.write(f"\n{command}" + (f": FAILED with exit code {code}" if code else ""))
         failed += bool(code)
@@ -216,6 +217,8 @@ def main(config: Config) -> int:
                 )
                 tqdm.write(f"  {row.page}:{row.line}: {', '.join(row.numbers)} ({row.text[:60]}): {how}")
         tqdm.write(f"  {printed} of {len(rows)} printed again")
+    for command in left_out:
+        print(f"left out, for it wants files of your own: {command}")
     print(f"\n{description()}, commit {commit}; the outputs are in {OUT.relative_to(ROOT)}/")
     return 1 if failed else 0
 
