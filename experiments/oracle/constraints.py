@@ -73,7 +73,14 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
     if isinstance(constraint, ls.GoalState):
         goal = constraint.final_states(dynamics)
         indices, wanted = list(goal), np.array(list(goal.values()))
-        return Kept(lambda z: z[..., indices] - wanted, np.tile(at_end[:, None], (1, len(indices))), True)
+        angles = () if constraint.count_turns else dynamics.state_coordinates.angles
+        turn = np.where(np.isin(indices, list(angles)), 2 * np.pi, 0.0)  # an angle reaches it up to whole turns
+
+        def missed(z: Values) -> Values:
+            off = z[..., indices] - wanted
+            return off - turn * np.round(off.real / (2 * np.pi))
+
+        return Kept(missed, np.tile(at_end[:, None], (1, len(indices))), True)
     if isinstance(constraint, ls.StateBounds):
         bounds = constraint.state_bounds(dynamics).items()
         rows = [(i, sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for i, bound in bounds]
