@@ -280,7 +280,7 @@ def test_ctrl_c_in_a_stress_test_says_how_to_go_on(ready: str, tmp_path: Path) -
         time.sleep(random.Random(ready).uniform(0, 0.5))
         os.killpg(process.pid, signal.SIGINT)
         _, error = process.communicate(timeout=600)
-    note, end = error.splitlines(keepends=True)
+    *_, note, end = error.splitlines(keepends=True)  # a slow solve says before how far it is
     assert (process.returncode, end) == (130, STOPPED)
     assert f"lqrsim stress quadrotor --resume --out {tmp_path / 'run'}" in note
     assert not list((tmp_path / "run").rglob(".unfinished-*"))

@@ -76,10 +76,10 @@ def run_campaign(
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(files.sole_writer(folder))
+        stack.enter_context(_resumable(folder, campaign.scenario))
         _write_or_check_manifest(campaign, folder, deterministic)
         results = Results(folder, scenario=campaign.scenario)
         results.campaign = campaign
-        stack.enter_context(_resumable(results))
         unfinished = _unfinished(results)
         if unfinished:
             if others := changed(results.manifest["versions"]):
@@ -109,14 +109,14 @@ def run_campaign(
 
 
 @contextlib.contextmanager
-def _resumable(results: Results) -> Iterator[None]:
-    """A block whose KeyboardInterrupt says how to go on."""
+def _resumable(folder: Path, scenario: str) -> Iterator[None]:
+    """A block whose KeyboardInterrupt says how to go on, once the folder has a campaign."""
     try:
         yield
     except KeyboardInterrupt as stop:
-        stop.add_note(
-            f"{results.folder} has what is done; to go on, call run_campaign again, or run: {results.command}"
-        )
+        if (folder / files.NAME).exists():
+            command = Results(folder, scenario=scenario).command
+            stop.add_note(f"{folder} has what is done; to go on, call run_campaign again, or run: {command}")
         raise
 
 
