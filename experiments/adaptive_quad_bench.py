@@ -309,7 +309,7 @@ def main(config: Config) -> Result:
     config = at_most(config, trials=1, failing=1, delayed=1)
     result = opening(config)
     try:
-        plant()
+        RotorPy()  # reads its vehicle from the package
     except ls.InputError as error:
         return result | {"skipped": str(error)}
     return result | {name: PARTS[name](config) for name in config.sections}

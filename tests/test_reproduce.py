@@ -95,6 +95,24 @@ def test_other_results_are_kept_on_request(scripts: Path, tmp_path: Path, capsys
     assert json.loads((out / "results.json").read_text())["results"]["table_1"] == before["results"]["table_1"]
 
 
+def test_what_is_not_installed_is_skipped_and_named(
+    scripts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (scripts / "table_1.py").write_text(GOOD.replace("quick=", "skipped='no A', b=dict(skipped='no B'), quick="))
+    (scripts / "figure_2.py").write_text(GOOD.replace("quick=", "skipped=dict(c='no C'), quick="))
+    assert main(["reproduce", "figure_2", "table_1", "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    named = ["figure_2: skipped c: no C", "table_1: skipped: no A", "table_1: skipped b: no B"]
+    assert [line for line in printed if ": skipped" in line] == named
+
+
+def test_a_benchmark_of_what_is_not_installed_skips_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rotorpy", None)
+    bench = import_module("adaptive_quad_bench")
+    result = bench.main(bench.Config(quick=True))
+    assert "skipped: rotorpy: got no such package, want it installed: pip install" in bench.report(result)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

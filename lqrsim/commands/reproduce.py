@@ -92,6 +92,8 @@ class Reproduce:
                 else:
                     results[name] = outcome | {"seconds": round(seconds), "machine": description()}
                     console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
+                    for part, reason in _skipped(outcome["result"]):
+                        console.say(f"{name}: skipped{part and f' {part}'}: {reason}")
                 bar.update()
         if results:
             together = earlier["results"] | results
@@ -142,6 +144,15 @@ def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
     except ValueError:
         sys.stderr.write(f"{name}: printed something that is not its result:\n{printed[:1000]}\n")
         return Failure(name, running.returncode)
+
+
+def _skipped(result: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, str]]:
+    """The parts of a result that were skipped, "" for all of it, and the reason of each: what is not installed."""
+    for key, value in result.items():
+        if key == "skipped":
+            yield from value.items() if isinstance(value, Mapping) else [(part, value)]
+        elif isinstance(value, Mapping):
+            yield from _skipped(value, key)
 
 
 def _end(running: subprocess.Popen[str]) -> None:
