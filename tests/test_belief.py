@@ -172,7 +172,7 @@ def test_averaged_noise_is_that_of_the_readings_drawn() -> None:
         [np.sqrt(0.01 + (states @ along) ** 2 / 2), np.full(trials, 0.5)]
     )
     for of, spread, number in zip(beliefs, (0.0, along @ predicted @ along), (0, 1), strict=True):
-        noise = np.diag([0.01 + ((along @ after) ** 2 + spread) / 2, 0.25])
+        noise = np.diag(np.array([0.01 + ((along @ after) ** 2 + spread) / 2, 0.25]))
         expected = predicted - predicted @ np.linalg.solve(predicted + noise, predicted)
         first = of.state(mean, covariance)
         np.testing.assert_allclose(of.covariance(of.step(first, control, DT)), expected, atol=1e-12)
@@ -422,7 +422,7 @@ def test_a_run_reads_its_true_states_as_late_as_is_stated() -> None:
     run = ls.simulate(scenario.plant(), controller=law, disturbances=[off], trials=trials, frames=False)
     x, y, heading = np.moveaxis(run.states, 2, 0)
     exact = [*(np.sqrt((x - place) ** 2 + y**2 + 0.01) for place in (-2.0, 2.0)), np.sin(heading)]
-    read, wanted = np.moveaxis(law.read, 0, 1), np.stack(exact, axis=2)
+    read, wanted = np.moveaxis(np.array(law.read), 0, 1), np.stack(exact, axis=2)
     assert np.isnan(read[:, :delay]).all()
     np.testing.assert_allclose(read[:, delay:], wanted[:, : read.shape[1] - delay], atol=1e-12)
 

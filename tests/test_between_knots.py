@@ -189,6 +189,7 @@ def test_a_robot_of_an_mjcf_is_looked_at_after_each_physics_step(tmp_path: Path)
 def test_what_has_no_problem_with_it_can_not_be_looked_at(tmp_path: Path) -> None:
     plan = ls.smooth(SWING)
     for other in (pickle.loads(pickle.dumps(plan)), ls.load(ls.save(plan, tmp_path / "plan.npz"))):
+        assert isinstance(other, ls.Solution)
         assert "between:" not in str(other)
         with pytest.raises(ls.InputError, match="between_knots: got a solution from a file"):
             other.between_knots()

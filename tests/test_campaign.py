@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -437,7 +438,7 @@ LONG = pa.DictionaryArray.from_arrays(pa.array(np.zeros(ROWS, np.int32)), pa.arr
     ],
 )
 def test_what_is_in_a_shard_is_bounded_before_it_is_unpacked(
-    reference: Results, changes: dict[str, pa.Array | None], options: dict[str, object], says: str
+    reference: Results, changes: dict[str, pa.Array | None], options: dict[str, Any], says: str
 ) -> None:
     """Texts of a file of some kilobytes would take gigabytes."""
     shard = next(reference.shards())

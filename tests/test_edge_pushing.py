@@ -87,7 +87,7 @@ def exact_hessian(formulas: list[Any], weights: Array, symbols: list[Any], at: A
         "cosine_ratio": lambda r: (1 - mpmath.cos(r)) / r**2,
         "cotangent_ratio": lambda r: (1 - r / 2 * mpmath.cot(r / 2)) / r**2,
     }
-    known = {name: lambda s, of=of: of(mpmath.sqrt(s)) for name, of in angles.items()}
+    known: dict[str, Any] = {name: lambda s, of=of: of(mpmath.sqrt(s)) for name, of in angles.items()}
     known["Heaviside"] = lambda a, half=0.5: (1 + mpmath.sign(a)) / 2
     function = sympy.lambdify(symbols, formulas, modules=[known, "mpmath"], cse=True)
     step = mpmath.mpf(10) ** -15

@@ -1,6 +1,7 @@
 """Limits of forces as constraints of a plan: what is linear, by MuJoCo; and plans that the file itself repeats."""
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -127,9 +128,11 @@ def test_a_limit_that_no_control_keeps_at_the_start_stays_in_the_dynamics(tmp_pa
     """The target is out of reach by 0.5 rad there, which is 450 N m of 20."""
     arm = robot(tmp_path, SERVOS.format(kp=900, kv=40, most=20, other=9).replace("-3 3", "-1 1"))
     problem = arm.problem(arm.at(a=1.5), arm.at(a=0.9), steps=20)
+    kept: Any
+    dynamics: Any = problem.dynamics
     (kept,) = problem.constraints
     assert [one.name for one in kept.limits] == ["of pb"]
-    assert problem.dynamics.physics.model.actuator_forcelimited.tolist() == [True, False]
+    assert dynamics.physics.model.actuator_forcelimited.tolist() == [True, False]
     assert not arm.problem(arm.at(a=1.5), arm.at(a=0.9), steps=20, force_limits=False).constraints
 
 
@@ -182,7 +185,7 @@ def test_a_plan_with_dry_friction_ends_where_the_cost_no_longer_changes(tmp_path
     """No gradient vanishes at a kink. Of plans beside it that clip nothing, none is cheaper by more than 2 %."""
     arm = robot(tmp_path, SERVOS.format(kp=900, kv=40, most=40, other=15), joint='frictionloss="0.3"')
     problem = arm.problem(arm.at(a=np.pi / 2), arm.at(a=np.pi / 2 + 0.5, b=0.5), steps=25, dt=0.02)
-    solution = ls.smooth(problem, time_limit=120.0)
+    solution, limits = ls.smooth(problem, time_limit=120.0), problem.control_coordinates
     assert solution.status is ls.Status.COST_CONVERGED, solution.detail
     assert "derivatives of the dynamics jump" in solution.detail
     draws, policy, kept = np.random.default_rng(0), solution.policy, []
@@ -190,7 +193,7 @@ def test_a_plan_with_dry_friction_ends_where_the_cost_no_longer_changes(tmp_path
         xs, us = [solution.trajectory.states[0]], []
         offsets = policy.offset + size * np.cumsum(draws.normal(size=policy.offset.shape), axis=0)
         for gain, offset in zip(policy.gain, offsets, strict=True):
-            us.append(np.clip(gain @ xs[-1] + offset, *problem.control_limits))
+            us.append(np.clip(gain @ xs[-1] + offset, limits.low, limits.high))
             xs.append(arm.dynamics.step(xs[-1], us[-1], problem.dt))
         plan = ls.Trajectory(np.array(xs), np.array(us), problem.dt)
         states, forces = replayed(arm, plan)

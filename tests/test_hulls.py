@@ -158,7 +158,7 @@ SIZES = {
 def test_distances_to_primitives_are_mujocos(kind: str) -> None:
     """Its tolerance of distances of convex bodies is 1e-6 m; for overlaps it finds no less than the least depth."""
     size = SIZES[kind]
-    rng, turn = np.random.default_rng(1), Rotation.random(rng=0)
+    rng, turn = np.random.default_rng(1), Rotation.random(rng=np.random.default_rng(0))
     thing = ls.Obstacle(kind, kind, np.array([0.1, 0.2, 0.3]), turn.as_matrix(), np.array(size))
     rock = rng.normal(size=(9, 3)) * 0.2
     rock -= rock[ConvexHull(rock).vertices].mean(axis=0)
@@ -203,7 +203,7 @@ def test_a_plan_passes_a_gap_that_no_ball_passes() -> None:
     """A slalom for a box of 0.5 by 0.25 m. Its plan keeps 1 cm from the boxes by `separated`."""
     solution = ls.smooth(problem())
     assert solution.status is ls.Status.CONVERGED, solution
-    boxes = [np.array(ls.types.Box(0.2, 0.8).corners(one.position[:2], 0.0)) for one in WORLD.obstacles]
+    boxes = [np.array(ls.types.Box(0.2, 0.8).corners(one.position[:2].tolist(), 0.0)) for one in WORLD.obstacles]
     least = np.inf
     for px, py, a, b in solution.trajectory.states.tolist():
         behind = (px - np.cos(b) / 2, py - np.sin(b) / 2)
@@ -241,7 +241,7 @@ GLIDER = ls.Dynamics(
 def lips() -> list[Array]:
     """The corners of what bounds the slot above and below."""
     across = np.array([0.0, -np.sin(SLOT), np.cos(SLOT)])
-    places = (np.array([1.2, 0.0, 0.0]) + side * (0.1 + 0.5) * across for side in (-1, 1))
+    places = ((np.array([1.2, 0.0, 0.0]) + side * (0.1 + 0.5) * across).tolist() for side in (-1, 1))
     return [np.array(ls.types.Box(0.2, 3.0, 1.0).corners(one, (SLOT, 0.0, 0.0)), dtype=float) for one in places]
 
 

@@ -22,7 +22,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
-NOISE = {"measurement": 0.1, "start": 0.3, "control": 0.2}
+NOISE: dict[str, Any] = {"measurement": 0.1, "start": 0.3, "control": 0.2}
 CONSTANT = Unknown("d0", 0.7)
 PASSING = Unknown("d0", 0.5, time_constant=0.4, order=2)
 # Unknowns, lag, sensors.

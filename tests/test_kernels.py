@@ -1102,7 +1102,8 @@ class TestParts:
     @pytest.mark.parametrize("by_knot", [True, *rarely(False)])
     def test_constraints_within_periods(self, by_knot: bool) -> None:
         margin = np.full(4, 0.01) if by_knot else 0.01
-        for shape in ({"radius": 0.1}, {"balls": BALLS["formula"]}):
+        shapes: list[dict[str, Any]] = [{"radius": 0.1}, {"balls": BALLS["formula"]}]
+        for shape in shapes:
             clear = ls.Clearance(WORLD, **shape, margin=margin)
             rows = clear.bind(CART).rows
             of_constraint(WithinPeriods(clear, np.ones((3, rows)), np.full(rows, 1e-3)).bind(CART))

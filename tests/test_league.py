@@ -82,12 +82,14 @@ def test_optimality_is_zero_at_the_optimum_and_nowhere_else(seed: int) -> None:
     def terms(controls: np.ndarray) -> np.ndarray:
         """The cost is half of the sum of their squares."""
         plan = verification.rolled_out(problem, controls.reshape(steps, m))
-        effort, state = terms_of(problem.stage_cost)
+        stage: Any = terms_of(problem.stage_cost)
+        final: Any = problem.final_cost
+        effort, state = stage
         parts = [
             controls.reshape(steps, m) * np.sqrt(np.diag(effort.weight)),
             plan[:-1] * np.sqrt(np.diag(state.weight)),
         ]
-        end = (plan[-1] - problem.final_cost.about) * np.sqrt(np.diag(problem.final_cost.weight))
+        end = (plan[-1] - final.about) * np.sqrt(np.diag(final.weight))
         return np.concatenate([part.ravel() for part in (*parts, end)])
 
     zero = terms(np.zeros(steps * m))

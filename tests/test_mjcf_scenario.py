@@ -55,6 +55,7 @@ def test_start_and_goal_are_at_rest_where_contacts_carry_the_robot(tmp_path: Pat
     )
     problem = resolve(f"{file},goal={{'arm': 0.5}},at_rest=True").problem
     for state, arm in ((problem.start, 0.0), (problem.goal, 0.5)):
+        assert state is not None
         np.testing.assert_allclose(state[:2], [-0.2, arm], rtol=0, atol=1e-3)
     with pytest.raises(InputError, match="at_rest: got 1, want True or False"):
         resolve(f"{file},at_rest=1")

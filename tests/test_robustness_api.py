@@ -150,7 +150,7 @@ def test_frozen_records_own_their_arrays(caller: Any) -> None:
     """What the caller writes into an array later changes no record that was made from it."""
     tried = 0
     for name, subject in caller.subjects.items():
-        kind = subject.call
+        kind: Any = subject.call
         if not (inspect.isclass(kind) and dataclasses.is_dataclass(kind)):
             continue
         copies = {key: value.copy() for key, value in subject.arguments.items() if isinstance(value, np.ndarray)}

@@ -1,6 +1,7 @@
 """Sensors of the MJCF: readings, errors and timing in runs, and the filter that estimates from them."""
 
 import dataclasses
+from typing import Any
 
 import hypothesis.strategies as st
 import mujoco
@@ -202,7 +203,7 @@ def test_of_unknowns_only_white_ones_are_noise_of_readings(cage, plan, problem):
     """Variances of controls and white forces, by MuJoCo's own readings, are added; what lasts is estimated."""
     sensors, t = cage.sensors(IMU), 17
 
-    def filter_of(*unknowns):
+    def filter_of(*unknowns) -> Any:
         return ls.OffsetFree(problem, plan, Uncertainty(unknowns=list(unknowns)), sensors=sensors)._sensing
 
     def slope(*step):  # of the readings, which are linear in controls and forces

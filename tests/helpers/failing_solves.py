@@ -61,7 +61,8 @@ def cost(of: Callable[[Any], Any]) -> ls.Cost:
 
 def reach(x: float, **others: Any) -> ls.Problem:
     """To stand at x, with 1 N for 1 kg and 1.5 s: 0.5625 m can be reached."""
-    return problem(mass, ls.GoalState(x=x, v=0.0), **{"limit": 1.0} | others)
+    options: dict[str, Any] = {"limit": 1.0} | others
+    return problem(mass, ls.GoalState(x=x, v=0.0), **options)
 
 
 @dataclass

@@ -53,7 +53,7 @@ def sentences(tree: ast.Module) -> Iterator[tuple[str, int, str]]:
         text = words(node)
         if len(text.replace("{}", "").split()) < 2:
             continue
-        above = [node]
+        above: list[ast.AST] = [node]
         while above[-1] in parent:
             above.append(parent[above[-1]])
         kind = "say"

@@ -5,8 +5,10 @@ complex steps, Hessians by central differences of these, so that nothing is shar
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -56,7 +58,7 @@ def _variables(case: Case, solution: ls.Solution) -> Array:
     return np.append(controls, solution.trajectory.dt) if case.problem.duration is not None else controls
 
 
-def _split(case: Case, z: Array) -> tuple[Array, Array | float]:
+def _split(case: Case, z: Array) -> tuple[Array, Any]:
     m, free = len(case.low), case.problem.duration is not None
     controls = z[:-1] if free else z
     return controls.reshape(-1, m, *z.shape[1:]), z[-1] if free else case.problem.dt
@@ -96,7 +98,7 @@ def rollout_of(case: Case) -> Array:
         return np.clip(given.controls, case.low, case.high)
     policy = given.policy if isinstance(given, ls.Solution) else given
     if not isinstance(policy, ls.AffinePolicy):
-        return np.clip(np.broadcast_to(given, (steps, len(case.low))), case.low, case.high)
+        return np.clip(np.broadcast_to(np.asarray(given), (steps, len(case.low))), case.low, case.high)
     controls = []
     x = np.asarray(case.problem.initial.numbers)  # type: ignore[union-attr]
     for t in range(steps):
@@ -124,7 +126,7 @@ class Dense:
 
     gradient: Array
     rows: Array
-    inequality: Array
+    inequality: NDArray[np.bool_]
     forces: Array
     left: Array
     hessian: Array

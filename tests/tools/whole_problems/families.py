@@ -163,7 +163,7 @@ def _case(
     ]  # fmt: skip
     own = [Row(lambda x, u, row=row: row(x, u, p, np), equality, last) for row, equality, last in rows]
     if goal is not None:
-        constraints.append(ls.GoalState(**goal))
+        constraints.append(ls.GoalState(goal))
         places = [names.index(name) for name in goal]
         own += [
             Row(lambda x, u, i=i, value=value: x[i] - value, equality=True, final=True)
