@@ -86,6 +86,11 @@ class Ladder:
     def converged(self) -> bool:
         return self._best is not None and self._best.success
 
+    @property
+    def idle(self) -> bool:
+        """Whether the interior point ended where the constraints do not act."""
+        return self._point.idle
+
     def climb(self) -> RunResult:
         """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
         for attempt in ATTEMPTS:
@@ -114,15 +119,20 @@ class Ladder:
         return self._interior(copied(begin), LITTLE if near else MUCH)
 
     def from_best_without_constraints(self) -> RunResult | None:
-        """From the best plan, by Newton's method without the constraints: they may not act at the optimum."""
-        best = self._best
+        """From the best plan, by Newton's method without the constraints: they may not act at the optimum.
+
+        Then the tolerance is that of the problem without them.
+        """
+        best, run = self._best, self._run
         if best is None or not best.violation <= self._allowed or not np.isfinite(best.cost):
             return None
         best = best.kept()
         self._point.without_multipliers()
-        self._run.work.set_best(*best.plan, best.cost)
-        result = self._run.newton(detail=best.detail, patient=True)
+        run.work.set_best(*best.plan, best.cost)
+        tolerance, run.final = run.final, run.settings.final(self._problem.with_constraints([]))
+        result = run.newton(detail=best.detail, patient=True)
         if not result.success or result.violation > 0:
+            run.final = tolerance
             return None
         return self._remember(replace(result, multipliers=()))
 
@@ -331,6 +341,13 @@ ATTEMPTS = (
         "the plan of smoothing without the constraints, after a few iterations",
         lambda tried: not tried.stay,
         Ladder.from_valley,
+    ),
+    # Where the cost has kinks, as where a flat side of the robot lies along an obstacle, the interior point's measures
+    # do not vanish.
+    Attempt(
+        "the best plan so far, if no constraint acts there, by Newton's method without the constraints",
+        lambda tried: not (tried.converged or tried.curved) and tried.idle,
+        Ladder.from_best_without_constraints,
     ),
     Attempt(
         "that plan, after the augmented Lagrangian",

@@ -30,6 +30,11 @@ KINKED = (
     "the derivatives of the dynamics jump along the plan, as by dry friction or at a joint's limit, where no gradient"
     f" vanishes; the cost has not changed by {FLAT:g} of itself in {ENDS} iterations, but plans beside it may cost less"
 )
+UNSETTLED = (
+    "no gradient vanishes along the plan, as where a flat side of the robot lies along an obstacle, so that the"
+    f" derivatives of a distance jump; from two plans the search ended at costs within {FLAT:g} of each other, but plans"
+    " beside them may cost less"
+)
 # Distance from the plan at which derivatives are compared, relative to sizes of states and controls; and the difference
 # that is a jump, relative to the largest derivative: along arms without dry friction it is 1e-5 to 1e-4.
 BESIDE, JUMP = 1e-4, 3e-3
@@ -48,7 +53,14 @@ MUCH, LITTLE = Barrier(1.0, 0.06, near=False), Barrier(0.01, 0.01, near=True)
 
 
 class InteriorRun:
-    """The interior point for the problem of a run, and the tolerance of its constraints."""
+    """The interior point for the problem of a run, and the tolerance of its constraints.
+
+    Attributes:
+      idle: whether the last plan did not press against any constraint.
+    """
+
+    idle = False
+    _flat: RunResult | None = None  # the last result where the cost no longer changed
 
     def __init__(self, run: SolveRun) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
@@ -97,13 +109,27 @@ class InteriorRun:
         """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
         if not np.isfinite(interior.plan.states).all():
             return None
+        self.idle = self._is_idle(interior)
         if interior.solved and (result := self._polished(interior)) is not None and result.success:
             return result
         result = self._rolled_out(interior.plan, interior.gain)
-        if interior.flat and result.violation <= self.allowed and self._jumps(interior):
+        if not interior.flat or result.violation > self.allowed:
+            return result
+        detail = KINKED if self._jumps(interior) else ""
+        if self._flat is not None and abs(self._flat.cost - result.cost) <= FLAT * abs(result.cost):
+            result, detail = min(self._flat, result, key=lambda flat: flat.cost), detail or UNSETTLED
+        self._flat = result.kept()
+        if detail:
             interior.measures._replace(cost=result.cost, gap=0.0, violation=result.violation).record(Laps(self._budget))
-            return replace(result, status=Status.COST_CONVERGED, detail=KINKED)
+            result = replace(result, status=Status.COST_CONVERGED, detail=detail)
         return result
+
+    def _is_idle(self, interior: InteriorResult) -> bool:
+        """Whether the multipliers of all constraints are remnants of the barrier."""
+        stages = self._run.stages
+        acting = stages.live & (stages.owners >= 0)
+        force = stages.of_constraints(interior.multipliers) * interior.sizes.rows**2 / interior.scale
+        return bool((~stages.equality & (force < stages.values(interior.plan)))[acting].all())
 
     def _jumps(self, interior: InteriorResult) -> bool:
         """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
