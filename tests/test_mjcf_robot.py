@@ -1339,3 +1339,37 @@ def test_a_plan_with_dry_friction_is_replayed_by_mujocos_own_steps(loss: float) 
         apart[dry] = worst
     assert apart[True] <= 1e-8  # warm starts differ
     assert apart[False] >= 0.01  # m or rad, if the friction is left out
+
+
+@pytest.mark.parametrize(
+    ("wheel", "rolls"),
+    [
+        ('<joint name="wheel" axis="0 1 0"/><geom type="cylinder" zaxis="0 1 0" size="0.1 0.03"/>', True),
+        ('<joint name="wheel" axis="0 1 0"/><geom type="sphere" size="0.1"/>', True),
+        ('<joint name="wheel" axis="0 1 0"/><geom type="cylinder" size="0.1 0.03"/>', False),
+        ('<joint name="wheel" axis="0 1 0"/><geom type="sphere" size="0.1" pos="0.05 0 0"/>', False),
+        ('<joint name="wheel" axis="0 1 0" range="-90 90"/><geom type="sphere" size="0.1"/>', False),
+    ],
+)
+def test_the_turn_of_a_wheel_is_no_goal_unless_it_is_named(wheel: str, rolls: bool, tmp_path: Path) -> None:
+    """A goal for it would hold it where it is: of all weights, those by which a wheel cannot roll on cost most."""
+    path = tmp_path / "cart.xml"
+    path.write_text(
+        f"""<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/><worldbody>
+        <geom type="plane" size="9 9 1"/><body pos="0 0 0.0999"><joint name="x" type="slide" axis="1 0 0"/>
+        <joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.2 0.05 0.02" mass="3"/><body>{wheel}</body>
+        </body></worldbody><actuator><motor joint="wheel" ctrlrange="-5 5"/></actuator></mujoco>"""
+    )
+    robot, stated = ls.MjcfRobot(path), {"steps": 50, "dt": 0.04}
+    assert [joint.name for joint in robot.mjcf.wheels] == ["wheel"] * rolls
+    begin = robot.at()
+
+    def has(goal: np.ndarray, wanted: list[float], **weights: Any) -> bool:
+        problems = (robot.problem(begin, goal, **stated, **one) for one in (weights, {"weights": wanted}))
+        return len({problem.digest for problem in problems}) == 1
+
+    goal, held = robot.at(x=1.0), 0.0 if rolls else 1.0
+    assert has(goal, [100, 100, 100 * held, 100, 100, 100])
+    assert has(goal, [1, 1, 2 * held, 0, 0, 0], weights={"m": 1.0, "rad": 2.0})
+    assert has(goal, [1, 1, 2, 0, 0, 0], weights={"m": 1.0, "wheel": 2.0})
+    assert has(robot.at(x=1.0, wheel=0.5), [100] * 6)

@@ -344,7 +344,8 @@ class MjcfRobot(Robot):
         Args:
           dt: the control period in seconds; by default about 0.02.
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
-            that are not named then have none.
+            that are not named then have none. The turn of a wheel has none unless it is named or (n,) are given, or the
+            goal turns it: a hinge without limits, about the axis of all that collides on its body.
           effort: weights of the controls, in the same form. By default 1 over the square of a control's largest value,
             so that a deviation of that size costs 1/2. The largest value comes from the control limits, else from the
             force limits, else it is 1.
@@ -405,10 +406,22 @@ class MjcfRobot(Robot):
         return Problem(
             dynamics=dynamics, dt=period,
             steps=steps, initial=FixedState(start), stage_cost=cost,
-            final_cost=QuadraticCost(_weights("weights", weights, n), about=goal),
+            final_cost=QuadraticCost(self._final_weights(weights, start, goal), about=goal),
             control_limits=(controls.low, controls.high),
             constraints=constraints, control_rate=control_rate,
         )  # fmt: skip
+
+    def _final_weights(self, weights: PerEntry, start: Array, goal: Array) -> PerEntry:
+        """Weights without those of the turns of wheels, which roll on, unless they are named or the goal turns them."""
+        names = self.dynamics.state_coordinates.names
+        rolling = [wheel.dof for wheel in self.mjcf.wheels if start[wheel.dof] == goal[wheel.dof]]
+        if isinstance(weights, Mapping):
+            return {**{names[dof]: 0.0 for dof in rolling}, **weights}
+        if np.ndim(weights) or not rolling:
+            return _weights("weights", weights, len(names))
+        numbers = np.full(len(names), check_number("weights", weights, at_least=0.0))
+        numbers[rolling] = 0.0
+        return numbers
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
         """Least and largest positions of joints, by name: at some distance from their limits, if both states are.

@@ -80,9 +80,9 @@ def mjcf(
             "%s: start and goal are the same, so there is nothing to do; say one by name, as goal={'%s': 0.1}",
             Path(path).name, space.names[0],
         )  # fmt: skip
+    per_entry("weights", weights, space)  # whose messages name the setting
     problem = robot.problem(
-        begin, end, steps=steps, dt=dt,
-        weights=per_entry("weights", weights, space),
+        begin, end, steps=steps, dt=dt, weights=weights,
         effort=None if effort is None else per_entry("effort", effort, controls, above=0.0),
         clearance=clearance,
     )  # fmt: skip

@@ -25,6 +25,7 @@ _KINDS = {
     mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball", mujoco.mjtJoint.mjJNT_SLIDE: "slide",
     mujoco.mjtJoint.mjJNT_HINGE: "hinge",
 }  # fmt: skip
+_OF_REVOLUTION = (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 TOTAL_MASS = "mass"  # name of the mass of all moving bodies together
@@ -33,6 +34,7 @@ _MEDIUM = ("density", "viscosity")
 _BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # bounds; all other numbers must not be negative
 _LONG = 1e3  # m, half length of a geom that stands for an infinite one
 FAR_PAST = 0.1  # fraction of a joint's range; springs of limits give way by less
+_ROUND = 1e-3  # distance from a wheel's axis relative to its radius, and error of the axis' cosine, that are rounding
 _SAME = 1e-12  # m, and of quaternions, within which a mocap body is where a keyframe has it
 
 Side = tuple[float, float]  # the least and the largest; infinite without a limit
@@ -184,6 +186,34 @@ class MjcfModel:
                 )
             )  # fmt: skip
         return tuple(joints)
+
+    @cached_property
+    def wheels(self) -> tuple[Joint, ...]:
+        """Hinges about which all turns look the same: without limits, the axis is that of all that collides there."""
+        return tuple(joint for number, joint in enumerate(self.joints) if self._is_wheel(number))
+
+    def _is_wheel(self, number: int) -> bool:
+        model, body = self.model, int(self.model.jnt_bodyid[number])
+        if self.joints[number].kind != "hinge" or self.joints[number].limits or model.jnt_stiffness[number]:
+            return False
+        if model.body_jntnum[body] > 1 or body in model.body_parentid:
+            return False
+        start, axis = model.jnt_pos[number], model.jnt_axis[number]
+
+        def is_round(geom: int) -> bool:
+            size, center = model.geom_size[geom], model.geom_pos[geom] - start
+            if np.linalg.norm(np.cross(center, axis)) > _ROUND * size[0]:
+                return False
+            kind, turned = mujoco.mjtGeom(model.geom_type[geom]), np.empty(9)
+            if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+                return True
+            if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID and size[0] != size[1]:
+                return False
+            mujoco.mju_quat2Mat(turned, model.geom_quat[geom])
+            return kind in _OF_REVOLUTION and abs(float(turned[2::3] @ axis)) > 1 - _ROUND
+
+        geoms = np.flatnonzero((model.geom_bodyid == body) & ((model.geom_contype | model.geom_conaffinity) != 0))
+        return len(geoms) > 0 and all(is_round(geom) for geom in geoms.tolist())
 
     @cached_property
     def actuators(self) -> tuple[Actuator, ...]:
