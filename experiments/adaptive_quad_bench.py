@@ -19,7 +19,7 @@ there all the time and its inertia does not count; theirs comes and goes. Their 
 deviation of 0.98 to 1.96 m/s at the 100 Hz at which RotorPy draws it, and ours fades with a time constant of 1 s.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal, get_args
@@ -162,9 +162,9 @@ class ReferenceCost(ls.Cost):
         return True
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        return self._bind_at(dynamics, np.zeros(1))
+        return self._bind_at(dynamics, np.zeros(1), {})
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> CostTerm:
         return CostTerm(SOURCE, np.concatenate([[len(times)], self.weight, self.reference(times).ravel()]))
 
 

@@ -147,7 +147,7 @@ def test_rows_within_periods_are_the_constraint_on_the_way(margin: float | Array
     world = ls.World([ls.Obstacle("ball", "sphere", np.array([1.0, 0.3, 0.0]), np.eye(3), np.array([0.2, 0.0, 0.0]))])
     dynamics, clear = between_knots.ROBOTS["drive"].dynamics, ls.Clearance(world, radius=0.1, margin=margin)
     term = WithinPeriods(clear, np.array([[1.0], [0.0], [1.0], [1.0]]), np.array([0.01]))._bind_at(
-        dynamics, 0.2 * np.arange(5)
+        dynamics, 0.2 * np.arange(5), {}
     )
     plain, z = PlainTerm(term, 4, 2), np.array([0.2, -0.1, 0.4, 1.2, 0.5, -0.8])
     for row in range(TIMES):

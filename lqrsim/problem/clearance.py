@@ -1,7 +1,7 @@
 """The constraint that a robot keeps clear of obstacles: class and kernel."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Self
 
 import numpy as np
@@ -65,9 +65,9 @@ class Clearance(KeepsClear, Constraint):
         return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        return self._bind_at(dynamics, np.zeros(len(np.atleast_1d(self.margin))))
+        return self._bind_at(dynamics, np.zeros(len(np.atleast_1d(self.margin))), {})
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
         shape = self.in_world(dynamics)
         world = shape.world

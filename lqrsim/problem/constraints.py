@@ -133,10 +133,6 @@ class Constraint(ProblemPart[ConstraintTerm]):
         """
         return None
 
-    def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
-        """As `_bind_at`, beside constraints that require final values of states, by their indices."""
-        return self._bind_at(dynamics, times)
-
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
     """The final values that all constraints require, by the index of the state. Raises InputError if two of them
@@ -156,7 +152,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
     goals, terms = goals_of(constraints, dynamics), []
     _check_bounds([constraint.state_bounds(dynamics) for constraint in constraints], dynamics, len(times))
     for constraint in constraints:
-        term = constraint._bind_beside(dynamics, times, goals)
+        term = constraint._bind_at(dynamics, times, goals)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
 

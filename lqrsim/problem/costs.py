@@ -151,8 +151,12 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """An argument as it is printed."""
         return brief(value)
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
-        """Bind the term to a system and the times (T+1,) in s of a problem's knots."""
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> _BoundTerm:
+        """Bind the term to a system, for a problem.
+
+        Args:
+          times: (T+1,) in s, of the knots. goals: the final values that constraints require of states, by index.
+        """
         return self.bind(dynamics)
 
 

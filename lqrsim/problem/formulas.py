@@ -255,7 +255,7 @@ class SymbolicConstraint(OfFormula, Constraint):
         numbers = np.concatenate([[len(self.at)], self.at, self._table.ravel()])
         return replace(term, source=kernel.filled(**filled), data=numbers)
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         if not isinstance(self.at, str) and self.at and self.at[-1] >= len(times):
             got, want = f"knot {self.at[-1]}", f"knots up to {len(times) - 1}, the number of steps"
             raise InputError(f"SymbolicConstraint: at: got {got}, want {want}")

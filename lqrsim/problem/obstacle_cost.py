@@ -1,6 +1,7 @@
 """The cost of coming near obstacles: class and kernel."""
 
 import copy
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -70,9 +71,9 @@ class ObstacleCost(KeepsClear, Cost):
         return self.weight * self.sharpness**2
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        return self._bind_at(dynamics, np.zeros(1))
+        return self._bind_at(dynamics, np.zeros(1), {})
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> CostTerm:
         shape, reach = self.in_world(dynamics), FAR / self.sharpness
         distances = shape.distances(reach)
         if distances is not None:

@@ -216,10 +216,8 @@ class Problem(OneVersion):
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
-        return tuple(
-            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
-            for cost in costs
-        )
+        pairs = [(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times, {})) for cost in costs]
+        return tuple(check_kind(field, term, CostTerm, "a CostTerm") for field, term in pairs)
 
     def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
         """The rest of the problem after some steps, from a state (n,) that is given exactly.

@@ -129,7 +129,7 @@ class _SquareCost(Cost):
         kernel = source_of(__name__, CONTROL=self.controls, BY_KNOT=cost.by_knot)
         return CostTerm(kernel, data, uses_control=self.controls)
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> CostTerm:
         steps = len(times) - 1
         for name, array, single in (("about", self.about, 1), ("weight", self.weight, 2)):
             rows = len(array)

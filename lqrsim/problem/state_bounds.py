@@ -117,9 +117,9 @@ class StateBounds(Constraint):
         return StateBounds({names[i]: sides for i, sides in self.state_bounds(dynamics).items()})
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        return self._bind_beside(dynamics, np.zeros(1), {})
+        return self._bind_at(dynamics, np.zeros(1), {})
 
-    def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         """Raises InputError if a goal is outside the bounds."""
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         rows, described, named = [], [], []

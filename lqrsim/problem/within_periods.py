@@ -55,13 +55,10 @@ class WithinPeriods(Constraint):
         return type(self)(self.constraint.with_added_state(dynamics), self.acts, self.spares)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        return self._bind_at(dynamics, np.arange(len(self.acts) + 1.0))
+        return self._bind_at(dynamics, np.arange(len(self.acts) + 1.0), {})
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
-        return self._bind_beside(dynamics, times, {})
-
-    def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
-        term = self.constraint._bind_beside(dynamics, times, goals)
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
+        term = self.constraint._bind_at(dynamics, times, goals)
         numbers = [times[1] - times[0], *self.acts.shape, *dynamics.data, *self.spares, *self.acts.ravel()]
         kernel = source_of(
             __name__, AT=len(term.functions) + len(term.data), PARAMETERS=len(dynamics.data), SHARED=term.shared,
