@@ -148,7 +148,7 @@ def with_last_command(problem: Problem) -> Problem:
     parts = {"initial": begun, "stage_cost": stage, "final_cost": final}
     terms = {name: other._bound(terms_of(cost)) for name, cost in parts.items()}
     bound = bind_all(constraints, wide, problem.times)
-    return other._with(_terms=terms, constraints=tuple(constraints), _constraint_terms=bound)
+    return other._with(_terms=terms, constraints=tuple(constraints), constraint_terms=bound)
 
 
 # The kernels. g is called at its address, with sizes of its own, so that it may be any: a formula's Runge-Kutta step, a

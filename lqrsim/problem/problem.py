@@ -134,6 +134,9 @@ class Problem(OneVersion):
         steps in a period as that needs. By default it takes one.
       between_knots: whether inequalities are to hold between the knots, too; by default they hold at the knots. The
         dynamics must be a formula, and obstacles stand still. Re-plans keep them at the knots.
+      constraint_terms, noise_term: constraints and noise, bound to the dynamics.
+      control_coordinates: names, units and limits of the controls, as used for planning.
+      applied_coordinates: the same, with limits narrowed to the actuators', as a policy respects them.
     """
 
     _prefix = ""
@@ -157,9 +160,10 @@ class Problem(OneVersion):
     accuracy: Annotated[float, Bounds(at_least=ACCURATE)] | None = None
     between_knots: bool = False
     _terms: dict[str, tuple[CostTerm, ...]] = field(init=False, repr=False, compare=False)
-    _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
-    _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
-    _controls: tuple[Coordinates, Coordinates] = field(init=False, repr=False, compare=False)
+    constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
+    noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
+    control_coordinates: Coordinates = field(init=False, repr=False, compare=False)
+    applied_coordinates: Coordinates = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self.dynamics.check_period(self.dt)
@@ -178,15 +182,15 @@ class Problem(OneVersion):
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
-        keep(self, _terms=bound)
-        keep(self, _constraint_terms=bind_all(self.constraints, self.dynamics, self.times))
-        keep(self, _noise_term=None if self.noise is None else self.noise.bind(self.dynamics))
+        constraint_terms = bind_all(self.constraints, self.dynamics, self.times)
+        noise_term = None if self.noise is None else self.noise.bind(self.dynamics)
+        keep(self, _terms=bound, constraint_terms=constraint_terms, noise_term=noise_term)
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         self._check_duration()
         self._check_rate()
         self._check_between_knots()
-        controls = self.dynamics.control_coordinates
+        limited = controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
             sides = zip(limited.names, limited.low, limited.high, controls.low, controls.high, strict=True)
@@ -196,9 +200,8 @@ class Problem(OneVersion):
                         f"control_limits: got {low:g} to {high:g} for {name}, want a range that overlaps the"
                         f" actuator's, {lowest:g} to {highest:g}"
                     )
-            keep(self, control_limits=(limited.low, limited.high), _controls=(limited, limited.within(controls)))
-        else:
-            keep(self, _controls=(controls, controls))
+            keep(self, control_limits=(limited.low, limited.high))
+        keep(self, control_coordinates=limited, applied_coordinates=limited.within(controls))
         start, terms = self.start, [cost.kept_clear for cost in self.obstacle_costs]
         if start is not None and (collision := self._inside(terms, start, self.begin)) is not None:
             where, advice = collision
@@ -267,7 +270,7 @@ class Problem(OneVersion):
     @checked
     def with_constraints(self, constraints: Constraints) -> "Problem":
         """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`."""
-        return self._with(constraints=constraints, _constraint_terms=bind_all(constraints, self.dynamics, self.times))
+        return self._with(constraints=constraints, constraint_terms=bind_all(constraints, self.dynamics, self.times))
 
     @checked
     def later(self, seconds: Finite) -> "Problem":
@@ -329,7 +332,7 @@ class Problem(OneVersion):
         stage = zip(terms_of(self.stage_cost), self._terms["stage_cost"], strict=True)
         terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
         constraints = bind_all(self.constraints, self.dynamics, self.times)
-        return self._with(_terms=self._terms | {"stage_cost": terms}, _constraint_terms=constraints)
+        return self._with(_terms=self._terms | {"stage_cost": terms}, constraint_terms=constraints)
 
     def _with(self, **changed: Any) -> "Problem":
         """The problem with other parts, without checks.
@@ -386,16 +389,6 @@ class Problem(OneVersion):
         return goal
 
     @property
-    def control_coordinates(self) -> Coordinates:
-        """Names, units and limits of the controls, as used for planning."""
-        return self._controls[0]
-
-    @property
-    def applied_coordinates(self) -> Coordinates:
-        """The same, with limits narrowed to the actuators', as a policy respects them."""
-        return self._controls[1]
-
-    @property
     def nominal_control(self) -> Array:
         """u*, (m,), at which the sum of the ControlCosts is least; zeros if there is none. The mean if it has one for
         each step.
@@ -431,14 +424,6 @@ class Problem(OneVersion):
     def terms(self, which: str) -> tuple[CostTerm, ...]:
         """The bound terms of "initial", "stage_cost" or "final_cost"."""
         return self._terms[check_name("which", which, self._terms)]
-
-    @property
-    def constraint_terms(self) -> tuple[ConstraintTerm, ...]:
-        return self._constraint_terms
-
-    @property
-    def noise_term(self) -> NoiseTerm | None:
-        return self._noise_term
 
     def driven_by(self, noise: Noise | None, risk: float | None) -> "Problem":
         """The same problem under other noise or with another risk, in units of 1/cost; None keeps the problem's own."""
@@ -490,9 +475,9 @@ class Problem(OneVersion):
             for term in terms:
                 parts += term.digested
                 functions += term.functions
-        if self._noise_term is not None:
-            parts += [*self._noise_term.digested, repr(self.risk)]
-            functions += self._noise_term.functions
+        if self.noise_term is not None:
+            parts += [*self.noise_term.digested, repr(self.risk)]
+            functions += self.noise_term.functions
         if self.duration is not None:
             parts.append(repr((self.duration, self.time_weight, *((self.segments,) if self.segments else ()))))
         if (rate := self.control_rate) is not None:

@@ -162,7 +162,7 @@ class LocalPlanner:
         half = (np.array(controls.high) - controls.low) / 2
         effort = ControlCost(1 / np.where(np.isfinite(half), half, 1.0) ** 2, about=problem.nominal_control)
         free = problem._with(
-            initial=FixedState(start), duration=None, time_weight=0.0, segments=(), noise=None, _noise_term=None,
+            initial=FixedState(start), duration=None, time_weight=0.0, segments=(), noise=None, noise_term=None,
             risk=0.0, control_rate=None, accuracy=None, between_knots=False,
         ).with_constraints([])  # fmt: skip
         self._free = free.with_costs(stage_cost=effort, final_cost=QuadraticCost(np.ones(n), about=goal))
