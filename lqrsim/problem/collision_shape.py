@@ -123,7 +123,8 @@ class ShapeInWorld:
         kernel = source_of(
             module, AT=centers.numbers, BALLS=self.balls, PARTS=len(self.radii), AXES=axes, HULLS=int(bool(self.hulls))
         )
-        return centers.filling(kernel), np.concatenate([centers.data, numbers]), centers.functions
+        filled = kernel.filled(places=centers.code, places_jacobian=centers.code)
+        return filled, np.concatenate([centers.data, numbers]), centers.functions
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -277,7 +278,7 @@ def shape_in(
         return GeomsInWorld(dynamics, world, np.array([geoms.size]), geoms=geoms)
     if balls is not None:
         centers = balls.bind(dynamics)
-        seen = centers.world_seen(world, space)
+        seen = world.seen_by(space.plane or "xy", space.offset) if centers.in_plane else world
         if not balls.hulls:
             hulls = (1,) * len(balls) if seen.has_meshes else None
             return ShapeInWorld(dynamics, seen, balls.radii, balls.names, centers, hulls)

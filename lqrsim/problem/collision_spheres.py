@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Index, checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
-from lqrsim.codegen.sources import Source, source_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import (
     Term,
     axes_of,
@@ -40,7 +40,6 @@ from lqrsim.kernels import differences, sphere_centers, user_functions
 from lqrsim.kernels.obstacle_distances import MOST_CORNERS
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.scenes.world import SPACE, World
 
 
 @checked
@@ -64,18 +63,6 @@ class SphereCenters(Term):
     @property
     def _defines(self) -> Mapping[str, int]:
         return {"places": 3, "places_jacobian": 4}
-
-    def world_seen(self, world: World, space: Coordinates) -> World:
-        """The obstacles in the coordinates of the places."""
-        return world.seen_by(space.plane or "xy", space.offset) if self.in_plane else world.seen_by(SPACE)
-
-    def filling(self, kernel: Source) -> Source:
-        """The kernel of a cost or a constraint, with these places.
-
-        Args:
-          kernel: the source of the kernel.
-        """
-        return kernel.filled(places=self.code, places_jacobian=self.code)
 
 
 def one_at(position: tuple[int, ...]) -> SphereCenters:

@@ -167,7 +167,7 @@ class MjcfRobot(Robot):
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
         outline_balls = outline_of(model)
         many = not dofs and len(outline_balls.radii) > 0 if outline is None else outline
-        self.balls = MjcfBalls(outline_balls, mjcf) if many else None
+        self.balls = MjcfBalls(outline_balls) if many else None
 
     @cached_property
     def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -1,6 +1,5 @@
 """What of a robot from an MJCF collides: its geoms, by MuJoCo's own distances, with each other; or balls along them."""
 
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -18,7 +17,6 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes import mjcf_obstacles
-from lqrsim.scenes.mjcf_kinematics import places_on
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_obstacles import Outline
 from lqrsim.scenes.scene import Scene
@@ -28,7 +26,7 @@ MOST_ROWS = 128  # largest number of distances per step; beyond it, one per body
 # Distance beyond the margin from which on links have slopes, relative to the largest geom's bounding sphere. Links that
 # are two joints apart are always within twice its radius, the reach of a Clearance; all these slopes take time.
 SEEN = 0.25
-_FAR = 1e6  # m, a distance beyond all obstacles
+_UNBOUNDED = 1e6  # m, a distance beyond all obstacles
 
 
 class MjcfGeoms(CollisionGeoms):
@@ -59,9 +57,10 @@ class MjcfGeoms(CollisionGeoms):
             keys = [(body, -1) for body, _ in keys]
         rows = sorted(set(keys))
         index = {key: row for row, key in enumerate(rows)}
-        data = self._data(chosen, np.array([index[key] for key in keys], dtype=np.int64), max(1, len(rows)), reach)
+        count, numbered = max(1, len(rows)), np.array([index[key] for key in keys], dtype=np.int64)
         return GeomDistances(
-            source=source_of(mjcf_distances, ROWS=max(1, len(rows))), data=data,
+            source=source_of(mjcf_distances, ROWS=count),
+            data=mjcf_obstacles.distance_data(self.scene.model, self._pairs[chosen], numbered, count, reach),
             parts=tuple(self.scene.model.body(body).name for body, _ in rows),
             obstacles=tuple(number for _, number in rows), leading_states=self.scene.model.nv,
             functions=(MjcfMemory.of(mjcf_dynamics),),
@@ -119,17 +118,14 @@ class MjcfGeoms(CollisionGeoms):
             numbers.append(number)
         return mjcf_dynamics, np.array(numbers, dtype=np.int64)
 
-    def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
-        """The kernel's data, except the address of p."""
-        return mjcf_obstacles.distance_data(self.scene.model, self._pairs[chosen], rows, count, reach)
-
     def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.intp], Array]:
         """The indices of the pairs, and the kernel's data with the address of p, for all distances to each obstacle."""
         place = np.full(len(self.scene.world), -1, dtype=np.int64)
         place[numbers] = np.arange(len(numbers))
         rows = np.asarray(place[self._number], dtype=np.int64)
         chosen = np.flatnonzero(rows >= 0)
-        data = self._data(chosen, rows[chosen], len(numbers), _FAR)
+        pairs = self._pairs[chosen]
+        data = mjcf_obstacles.distance_data(self.scene.model, pairs, rows[chosen], len(numbers), _UNBOUNDED)
         return chosen, np.concatenate([[float(dynamics.physics.address())], data])
 
 
@@ -222,15 +218,10 @@ def _module(states: int) -> Any:
 
 
 class MjcfBalls(CollisionSpheres):
-    """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them.
+    """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them."""
 
-    Args:
-      outline: bodies, positions on them, and radii. mjcf: the MJCF.
-    """
-
-    def __init__(self, outline: Outline, mjcf: MjcfModel) -> None:
+    def __init__(self, outline: Outline) -> None:
         self.outline, self.level = outline, "compiled"
-        self.function, self.jacobian, self.depends_on = partial(_centres, mjcf, outline), None, None
         self._set_balls(outline.radii, outline.names, outline.sites)
 
     @property
@@ -245,11 +236,6 @@ class MjcfBalls(CollisionSpheres):
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
         source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_distances))
         return SphereCenters(source, data, positions, functions=(memory,))
-
-
-def _centres(mjcf: MjcfModel, outline: Outline, state: Array) -> Array:
-    """Centres of balls, (K, 3), at a state (n,), by MuJoCo's bindings."""
-    return places_on(mjcf.model, mjcf.qpos_of(state[: mjcf.model.nv]), outline.bodies, outline.offsets)
 
 
 def _same(one: Obstacle, other: Obstacle | None) -> bool:

@@ -153,12 +153,6 @@ def position_of(mjcf: "MjcfModel", body: int) -> Axes:
     return Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))
 
 
-def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:
-    """World positions of points (K, 3) in the axes of bodies (K,), at MuJoCo's positions (nq,)."""
-    data = placed(model, qpos)
-    return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
-
-
 def in_axes_of_bodies(model: mujoco.MjModel, geoms: npt.NDArray[np.int64], vectors: Array) -> Array:
     """Vectors (..., k, 3) along the world's axes, each in the axes of the body of its geom (k,), at rest."""
     axes = placed(model).xmat[model.geom_bodyid[geoms]].reshape(-1, 3, 3)
