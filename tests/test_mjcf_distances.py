@@ -76,16 +76,17 @@ def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str
     robot, rng = arm(own, other, seed), np.random.default_rng(seed)
     n = len(robot.dynamics.state_coordinates)
     states = robot.at() + np.concatenate([rng.normal(0, 0.3, (4, n // 2)), np.zeros((4, n // 2))], axis=1)
-    found, slopes = robot.geoms.slopes(robot.dynamics, robot.scene.world, states)
+    shape = robot.geoms.in_world(robot.dynamics, robot.scene.world)
+    found, slopes = shape.with_slopes(states, range(n))
     expected = np.array([by_bindings(robot, state) for state in states])
     # MuJoCo's own tolerance of distances is 1e-6 m; ours is less.
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
     h = 1e-5
     for state, slope in zip(states, slopes, strict=True):
         ends = np.stack([state + side * h * e for e in np.eye(n) for side in (1, -1)]).reshape(n, 2, n)
-        sides = robot.geoms.clearances(robot.dynamics, robot.scene.world, ends)
+        sides = shape.clearances(ends)
         one = (sides[:, 0] - sides[:, 1]) / (2 * h)
-        middle = robot.geoms.clearances(robot.dynamics, robot.scene.world, state)
+        middle = shape.clearances(state)
         kink = np.abs(sides[:, 0] - 2 * middle + sides[:, 1]) > 1e-8  # an edge, or another geom, is nearest there
         # Moving the whole robot changes a distance by as much. How deep MuJoCo says that a box is in a capsule is not
         # always a depth: of seed 9817 it is half of it.
@@ -101,7 +102,8 @@ def test_obstacles_that_are_elsewhere(seed: int) -> None:
     robot, rng = arm("mesh", "box", seed), np.random.default_rng(seed)
     n = len(robot.dynamics.state_coordinates)
     states, displaced = robot.at() + rng.normal(0, 0.2, (2, 3, n)), rng.normal(0, 0.2, (2, 2, 3))
-    found = robot.geoms.clearances(robot.dynamics, robot.scene.world, states, displaced)
+    shape = robot.geoms.in_world(robot.dynamics, robot.scene.world)
+    found = shape.clearances(states, displaced)
     expected = [
         [by_bindings(robot, state, away) for state in some] for some, away in zip(states, displaced, strict=True)
     ]
@@ -109,8 +111,8 @@ def test_obstacles_that_are_elsewhere(seed: int) -> None:
     plant = ls.Plant(robot, robot.scene)
     np.testing.assert_allclose(plant.clearance(states, displaced), found.min(axis=-1), rtol=0, atol=1e-12)
     # No point goes farther than is said: the distances of two states differ by no more.
-    travel = robot.geoms.travel(states[:, :-1], states[:, 1:])
-    still = robot.geoms.clearances(robot.dynamics, robot.scene.world, states)
+    travel = shape.travel(shape.places(states[:, :-1]), shape.places(states[:, 1:]))
+    still = shape.clearances(states)
     assert (np.abs(np.diff(still, axis=1)) <= travel[..., None] + 1e-6).all()
 
 

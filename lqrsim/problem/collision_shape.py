@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.codegen.distances import hull_distances, signed_distance
 from lqrsim.codegen.sources import Source, source_of
@@ -20,8 +19,6 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import World
-
-TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,42 +44,21 @@ class CollisionGeoms(abc.ABC):
         """The radius of the largest geom's bounding sphere, in metres."""
 
     @abc.abstractmethod
-    def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
-        """The distances up to `reach` in m, for a system. `clearances` and `slopes` raise InputError in the same cases.
+    def in_world(self, dynamics: Dynamics, world: World) -> "ShapeInWorld":
+        """The geoms among obstacles.
 
         Raises:
-          InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF, or moves.
+          InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF.
         """
-
-    @abc.abstractmethod
-    def clearances(
-        self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
-    ) -> Array:
-        """Signed distances (..., O) in m to the obstacles at states (..., n).
-
-        With obstacles displaced by (K, O, 3) in m, the states are (K, ..., n).
-        """
-
-    @abc.abstractmethod
-    def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
-        """Signed distances (K, O) in m to the obstacles at states (K, n), and their derivatives (K, O, n)."""
-
-    @abc.abstractmethod
-    def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
-        """The names of the body and of the obstacle's body that are nearest to each other at a state (n,)."""
 
     @abc.abstractmethod
     def of_scene(self, scene: Scene) -> bool:
         """Whether these geoms belong to that scene, with its obstacles."""
 
-    @abc.abstractmethod
-    def travel(self, before: Array, after: Array) -> Array:
-        """The largest distance that any point moves on a straight line between states (..., n): (...) in m."""
-
 
 @dataclass(frozen=True, eq=False)
 class ShapeInWorld:
-    """A robot's collision shape among obstacles: one ball or several. For geoms see `GeomsInWorld`.
+    """A robot's collision shape among obstacles: one ball or several; `robots/mjcf_shapes.py` has that of geoms.
 
     Its *places* at states (..., n) are the centres of its balls, (..., B, 2 or 3) in m; for geoms, they are the states,
     (..., 1, n).
@@ -112,7 +88,10 @@ class ShapeInWorld:
         return len(self.dynamics.state_coordinates.position) == 2 if self.centers is None else self.centers.in_plane
 
     def distances(self, reach: float) -> GeomDistances | None:
-        """The distances of geoms up to `reach` in m; None for balls, whose distances have second derivatives."""
+        """The distances of geoms up to `reach` in m; None for balls, whose distances have second derivatives.
+
+        Raises InputError for geoms among obstacles that move.
+        """
         return None
 
     def placed(self, module: str, numbers: Array) -> tuple[Source, Array, tuple[UserFunction, ...]]:
@@ -214,60 +193,6 @@ class ShapeInWorld:
         return np.concatenate([space.of_world(vectors), (vectors @ normal)[..., None]], axis=-1)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GeomsInWorld(ShapeInWorld):
-    """Geoms among obstacles."""
-
-    geoms: CollisionGeoms
-
-    @property
-    def depends_on(self) -> tuple[int, ...]:
-        return tuple(range(self.distances(0.0).leading_states))
-
-    @property
-    def in_plane(self) -> bool:
-        return False
-
-    def distances(self, reach: float) -> GeomDistances:
-        return self.geoms.bind(self.dynamics, self.world, reach)
-
-    def places(self, states: Array) -> Array:
-        return states[..., None, :]
-
-    def clearance(self, places: Array, displaced: Array | None = None) -> Array:
-        """NaN where a state has a NaN."""
-        states = places[..., 0, :]
-        known = np.asarray(np.isfinite(states).all(axis=-1))
-        if not len(self.world):
-            return np.full(known.shape, np.inf)
-        states = np.where(known[..., None], states, 0.0)
-        distances = self.geoms.clearances(self.dynamics, self.world, states, displaced).min(axis=-1)
-        return distances if known.all() else np.where(known, distances, np.nan)
-
-    def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
-        distances, slopes = self.geoms.slopes(self.dynamics, self.world, states)
-        return distances, slopes[..., list(along)]
-
-    def nearest(self, places: Array, displaced: Array) -> int:
-        return int(self.geoms.clearances(self.dynamics, self.world, places[None], displaced[None])[0, 0].argmin())
-
-    def travel(self, before: Array, after: Array) -> Array:
-        return self.geoms.travel(before[..., 0, :], after[..., 0, :])
-
-    def inside(self, state: Array) -> tuple[str, str] | None:
-        if not len(self.world) or np.isnan(state[list(self.depends_on)]).any():
-            return None
-        state = np.where(np.isnan(state), 0.0, state)  # velocities and activations, which move no geom
-        distances = self.geoms.clearances(self.dynamics, self.world, state)
-        if distances.min() >= -TOUCHING:
-            return None
-        obstacle = self.world.names[int(distances.argmin())]
-        body, other = self.geoms.nearest_bodies(self.dynamics, self.world, state)
-        where = f"with {body!r} {-distances.min():.3g} m inside obstacle {obstacle!r}"
-        exclude = f'<contact><exclude body1="{other}" body2="{body}"/></contact> in the MJCF'
-        return where, f"; or, if they may overlap, {exclude}; or obstacles= of the robot without it"
-
-
 def shape_in(
     dynamics: Dynamics, world: World, *, radius: float = 0.0, balls: CollisionSpheres | None = None,
     geoms: CollisionGeoms | None = None,
@@ -275,7 +200,7 @@ def shape_in(
     """The shape of a robot among obstacles. A robot without a position is among none by its radius."""
     space = dynamics.state_coordinates
     if geoms is not None:
-        return GeomsInWorld(dynamics, world, np.array([geoms.size]), geoms=geoms)
+        return geoms.in_world(dynamics, world)
     if balls is not None:
         centers = balls.bind(dynamics)
         seen = world.seen_by(space.plane or "xy", space.offset) if centers.in_plane else world

@@ -22,7 +22,7 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
+from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.constraints import Constraint
 from lqrsim.problem.control_rate import ControlRate
 from lqrsim.problem.costs import Cost
@@ -177,14 +177,14 @@ class MjcfRobot(Robot):
     def among(self, world: World) -> ShapeInWorld:
         """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them."""
         if not len(world):
-            return shape_in(self.dynamics, world, geoms=self.geoms)
+            return self.geoms.in_world(self.dynamics, world)
         copy = Scene(self.mjcf.with_obstacles(world), World(), ())
         stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
         other = MjcfRobot(copy, **stated)
         # Their places in the compiled model, which differ in the last bits.
         pairs = zip(other.scene.world.obstacles, world.obstacles, strict=True)
         moved = World([replace(compiled, velocity=obstacle.velocity) for compiled, obstacle in pairs])
-        return shape_in(other.dynamics, moved, geoms=other.geoms)
+        return other.geoms.in_world(other.dynamics, moved)
 
     def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
         axes = self._axes

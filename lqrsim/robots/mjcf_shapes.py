@@ -1,5 +1,7 @@
 """What of a robot from an MJCF collides: its geoms, by MuJoCo's own distances, with each other; or balls along them."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +12,7 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, vectors_of
 from lqrsim.kernels import differences, mjcf_distances
-from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances
+from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances, ShapeInWorld
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -26,88 +28,40 @@ MOST_ROWS = 128  # largest number of distances per step; beyond it, one per body
 # Distance beyond the margin from which on links have slopes, relative to the largest geom's bounding sphere. Links that
 # are two joints apart are always within twice its radius, the reach of a Clearance; all these slopes take time.
 SEEN = 0.25
+TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
 _UNBOUNDED = 1e6  # m, a distance beyond all obstacles
 
 
 class MjcfGeoms(CollisionGeoms):
-    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls."""
+    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
+
+    Attributes:
+      pairs: (K, 2) geoms that may collide, the second of which is an obstacle. obstacles: (K,) its index in the scene.
+      levers: (nv,) in m/rad, or 1 for slides, as `mjcf_obstacles.levers` has them.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        model, pairs = scene.model, mjcf_obstacles.pairs_of(scene.model, list(scene.geoms))
-        self._pairs, self._levers = pairs, mjcf_obstacles.levers(model)
+        self.pairs, self.levers = (
+            mjcf_obstacles.pairs_of(scene.model, list(scene.geoms)),
+            mjcf_obstacles.levers(scene.model),
+        )
         number = {geom: i for i, geom in enumerate(scene.geoms)}
-        self._number = np.array([number[geom] for geom in pairs[:, 1].tolist()], dtype=np.int64)
-        self._bodies = model.geom_bodyid[pairs[:, 0]].astype(np.int64)
+        self.obstacles = np.array([number[geom] for geom in self.pairs[:, 1].tolist()], dtype=np.int64)
 
     @property
     def size(self) -> float:
-        """The radius of the largest geom's bounding sphere, in metres."""
         geoms = mjcf_obstacles.solid_geoms(self.scene.model)
         return float(self.scene.model.geom_rbound[geoms].max(initial=0.0))
-
-    def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
-        mjcf_dynamics, numbers = self._bound(dynamics, world)
-        if world.moving:
-            raise InputError("geoms: got obstacles that move, want balls=robot.balls for them")
-        chosen = np.flatnonzero(np.isin(self._number, numbers))
-        place = {int(number): i for i, number in enumerate(numbers)}
-        keys = [(int(self._bodies[k]), place[int(self._number[k])]) for k in chosen]
-        if len(set(keys)) > MOST_ROWS:
-            keys = [(body, -1) for body, _ in keys]
-        rows = sorted(set(keys))
-        index = {key: row for row, key in enumerate(rows)}
-        count, numbered = max(1, len(rows)), np.array([index[key] for key in keys], dtype=np.int64)
-        return GeomDistances(
-            source=source_of(mjcf_distances, ROWS=count),
-            data=mjcf_obstacles.distance_data(self.scene.model, self._pairs[chosen], numbered, count, reach),
-            parts=tuple(self.scene.model.body(body).name for body, _ in rows),
-            obstacles=tuple(number for _, number in rows), leading_states=self.scene.model.nv,
-            functions=(MjcfMemory.of(mjcf_dynamics),),
-        )  # fmt: skip
-
-    def clearances(
-        self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
-    ) -> Array:
-        mjcf_dynamics, numbers = self._bound(dynamics, world)
-        states = vectors_of("states", states, len(dynamics.state_coordinates))
-        _, data = self._to_each(mjcf_dynamics, numbers)
-        distances, _ = _distances(states.reshape(-1, states.shape[-1]), data, displaced)
-        return distances.reshape(*states.shape[:-1], len(numbers))
-
-    def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
-        mjcf_dynamics, numbers = self._bound(dynamics, world)
-        flat, count = in_c_order(vectors_of("states", states, len(dynamics.state_coordinates))), len(numbers)
-        distances, slopes = np.empty(len(flat) * count), np.zeros((len(flat) * count, flat.shape[1]))
-        _, data = self._to_each(mjcf_dynamics, numbers)
-        _module(flat.shape[1]).slopes_of(
-            len(flat), flat, data, distances, slopes, np.empty(count), np.empty((count, 6))
-        )
-        return distances.reshape(-1, count), slopes.reshape(-1, count, flat.shape[1])
-
-    def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
-        mjcf_dynamics, numbers = self._bound(dynamics, world)
-        chosen, data = self._to_each(mjcf_dynamics, numbers)
-        distances, pairs = _distances(np.asarray(state, dtype=np.float64)[None], data)
-        pair = self._pairs[chosen[int(pairs[int(distances.argmin())])]]
-        first, second = (self.scene.model.body(body).name for body in self.scene.model.geom_bodyid[pair].tolist())
-        return first, second
 
     def of_scene(self, scene: Scene) -> bool:
         return scene is self.scene or (scene.xml == self.scene.xml and scene.geoms == self.scene.geoms)
 
-    def travel(self, before: Array, after: Array) -> Array:
-        nv = len(self._levers)
-        return np.abs(after[..., :nv] - before[..., :nv]) @ self._levers
-
-    def _bound(self, dynamics: Dynamics, world: World) -> tuple[MjcfDynamics, npt.NDArray[np.int64]]:
-        """MuJoCo's dynamics, and the index in the scene of each obstacle of the world. Raises InputError."""
-        if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
+    def in_world(self, dynamics: Dynamics, world: World) -> "GeomsInWorld":
+        if not isinstance(dynamics.calling, MjcfDynamics):
             raise InputError(f"geoms: got an MJCF's geoms for {dynamics.name}, want its own dynamics, robot.dynamics")
-        if world is self.scene.world:
-            return mjcf_dynamics, np.arange(len(world))
         known = {obstacle.name: (number, obstacle) for number, obstacle in enumerate(self.scene.world.obstacles)}
-        numbers = []
+        numbers = list[int]()
         for obstacle in world.obstacles:
             number, stated = known.get(obstacle.name, (-1, None))
             if not _same(obstacle, stated):
@@ -116,17 +70,113 @@ class MjcfGeoms(CollisionGeoms):
                     f" robot.scene.world: {', '.join(known) or 'there are none'}; or balls=robot.balls"
                 )
             numbers.append(number)
-        return mjcf_dynamics, np.array(numbers, dtype=np.int64)
+        return GeomsInWorld(dynamics, world, np.array([self.size]), geoms=self, numbers=np.array(numbers, np.int64))
 
-    def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.intp], Array]:
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GeomsInWorld(ShapeInWorld):
+    """The geoms of an MJCF among all or some obstacles of its scene.
+
+    Attributes:
+      numbers: (O,) the index in the scene of each obstacle.
+    """
+
+    geoms: MjcfGeoms
+    numbers: npt.NDArray[np.int64]
+
+    @property
+    def depends_on(self) -> tuple[int, ...]:
+        return tuple(range(self.geoms.scene.model.nv))
+
+    @property
+    def in_plane(self) -> bool:
+        return False
+
+    def distances(self, reach: float) -> GeomDistances:
+        if self.world.moving:
+            raise InputError("geoms: got obstacles that move, want balls=robot.balls for them")
+        model, obstacles = self.geoms.scene.model, self.geoms.obstacles
+        chosen = np.flatnonzero(np.isin(obstacles, self.numbers))
+        place = {int(number): i for i, number in enumerate(self.numbers)}
+        bodies = model.geom_bodyid[self.geoms.pairs[:, 0]].tolist()
+        keys = [(bodies[k], place[int(obstacles[k])]) for k in chosen]
+        if len(set(keys)) > MOST_ROWS:
+            keys = [(body, -1) for body, _ in keys]
+        rows = sorted(set(keys))
+        index = {key: row for row, key in enumerate(rows)}
+        count, numbered = max(1, len(rows)), np.array([index[key] for key in keys], dtype=np.int64)
+        return GeomDistances(
+            source=source_of(mjcf_distances, ROWS=count),
+            data=mjcf_obstacles.distance_data(model, self.geoms.pairs[chosen], numbered, count, reach),
+            parts=tuple(model.body(body).name for body, _ in rows),
+            obstacles=tuple(number for _, number in rows), leading_states=model.nv,
+            functions=(MjcfMemory.of(self._mjcf_dynamics),),
+        )  # fmt: skip
+
+    def places(self, states: Array) -> Array:
+        return states[..., None, :]
+
+    def clearances(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
+        """Signed distances (..., O) in m to the obstacles at states (..., n).
+
+        With obstacles displaced by (K, O, 3) in m, the states are (K, ..., n).
+        """
+        states = vectors_of("states", states, len(self.dynamics.state_coordinates))
+        distances, _ = _distances(states.reshape(-1, states.shape[-1]), self._to_each()[1], displaced)
+        return distances.reshape(*states.shape[:-1], len(self.world))
+
+    def clearance(self, places: Array, displaced: Array | None = None) -> Array:
+        """NaN where a state has a NaN."""
+        states = places[..., 0, :]
+        known = np.asarray(np.isfinite(states).all(axis=-1))
+        if not len(self.world):
+            return np.full(known.shape, np.inf)
+        distances = self.clearances(np.where(known[..., None], states, 0.0), displaced).min(axis=-1)
+        return distances if known.all() else np.where(known, distances, np.nan)
+
+    def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
+        flat, count = in_c_order(vectors_of("states", states, len(self.dynamics.state_coordinates))), len(self.world)
+        distances, slopes = np.empty(len(flat) * count), np.zeros((len(flat) * count, flat.shape[1]))
+        pair_of_row, segments = np.empty(count), np.empty((count, 6))
+        _module(flat.shape[1]).slopes_of(len(flat), flat, self._to_each()[1], distances, slopes, pair_of_row, segments)
+        return distances.reshape(-1, count), slopes.reshape(-1, count, flat.shape[1])[..., list(along)]
+
+    def nearest(self, places: Array, displaced: Array) -> int:
+        return int(self.clearances(places[None], displaced[None])[0, 0].argmin())
+
+    def travel(self, before: Array, after: Array) -> Array:
+        nv = len(self.geoms.levers)
+        return np.abs(after[..., 0, :nv] - before[..., 0, :nv]) @ self.geoms.levers
+
+    def inside(self, state: Array) -> tuple[str, str] | None:
+        if not len(self.world) or np.isnan(state[list(self.depends_on)]).any():
+            return None
+        state = np.where(np.isnan(state), 0.0, state)  # velocities and activations, which move no geom
+        chosen, data = self._to_each()
+        distances, pairs = _distances(state[None], data)
+        if distances.min() >= -TOUCHING:
+            return None
+        nearest, model = int(distances.argmin()), self.geoms.scene.model
+        pair = self.geoms.pairs[chosen[int(pairs[nearest])]]
+        body, other = (model.body(number).name for number in model.geom_bodyid[pair].tolist())
+        where = f"with {body!r} {-distances.min():.3g} m inside obstacle {self.world.names[nearest]!r}"
+        exclude = f'<contact><exclude body1="{other}" body2="{body}"/></contact> in the MJCF'
+        return where, f"; or, if they may overlap, {exclude}; or obstacles= of the robot without it"
+
+    @property
+    def _mjcf_dynamics(self) -> MjcfDynamics:
+        assert isinstance(self.dynamics.calling, MjcfDynamics)
+        return self.dynamics.calling
+
+    def _to_each(self) -> tuple[npt.NDArray[np.intp], Array]:
         """The indices of the pairs, and the kernel's data with the address of p, for all distances to each obstacle."""
-        place = np.full(len(self.scene.world), -1, dtype=np.int64)
-        place[numbers] = np.arange(len(numbers))
-        rows = np.asarray(place[self._number], dtype=np.int64)
+        place = np.full(len(self.geoms.scene.world), -1, dtype=np.int64)
+        place[self.numbers] = np.arange(len(self.numbers))
+        rows = np.asarray(place[self.geoms.obstacles], dtype=np.int64)
         chosen = np.flatnonzero(rows >= 0)
-        pairs = self._pairs[chosen]
-        data = mjcf_obstacles.distance_data(self.scene.model, pairs, rows[chosen], len(numbers), _UNBOUNDED)
-        return chosen, np.concatenate([[float(dynamics.physics.address())], data])
+        pairs, count = self.geoms.pairs[chosen], len(self.numbers)
+        data = mjcf_obstacles.distance_data(self.geoms.scene.model, pairs, rows[chosen], count, _UNBOUNDED)
+        return chosen, np.concatenate([[float(self._mjcf_dynamics.physics.address())], data])
 
 
 class SelfClearance(Constraint):
@@ -238,8 +288,8 @@ class MjcfBalls(CollisionSpheres):
         return SphereCenters(source, data, positions, functions=(memory,))
 
 
-def _same(one: Obstacle, other: Obstacle | None) -> bool:
-    if other is None or one.kind != other.kind:
-        return False
-    pairs = ((one.position, other.position), (one.rotation, other.rotation), (one.size, other.size))
-    return all(np.array_equal(mine, its) for mine, its in pairs)
+def _same(obstacle: Obstacle, other: Obstacle | None) -> bool:
+    """Whether two obstacles have the same shape in the same place; one of them may move."""
+    if other is None or obstacle is other or obstacle.kind != other.kind:
+        return obstacle is other
+    return all(np.array_equal(getattr(obstacle, key), getattr(other, key)) for key in ("position", "rotation", "size"))
