@@ -34,7 +34,7 @@ class _SquareCost(Cost):
 
     controls: ClassVar[bool]
 
-    def __init__(self, weight: PerKnot, about: PerKnot | None, longer: bool) -> None:
+    def __init__(self, weight: PerKnot, *, about: PerKnot | None = None, longer: bool = False) -> None:
         self.longer = check_flag(f"{self.name}: longer", longer)
         self._given = {"weight": weight, "about": about}
         self._numbers: tuple[Array, Array] | None = None
@@ -169,7 +169,7 @@ class QuadraticCost(_SquareCost):
         if about is None:  # zero is no state that one would expect, unlike a control
             want = "the state at which the cost is zero, such as [0.0, 1.0] or {'x': 1.0}"
             raise InputError(f"{self.name}: about: got none, want {want}")
-        super().__init__(weight, about, longer)
+        super().__init__(weight, about=about, longer=longer)
 
     @property
     def state_reference(self) -> "QuadraticCost":
@@ -198,9 +198,6 @@ class ControlCost(_SquareCost):
     """
 
     controls = True
-
-    def __init__(self, weight: PerKnot, *, about: PerKnot | None = None, longer: bool = False) -> None:
-        super().__init__(weight, about, longer)
 
     @property
     def control_reference(self) -> "ControlCost":

@@ -42,7 +42,7 @@ from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
 from lqrsim.scenes.mjcf_text import listed
 from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
-from lqrsim.scenes.world import KINDS, OTHER_KINDS, World
+from lqrsim.scenes.world import World
 
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
 _ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
@@ -130,7 +130,7 @@ class MjcfRobot(Robot):
         default = in_the_way(model, candidates, number, floors=floors)
         geoms = chosen_geoms(model, obstacles, default, who)
         self._candidates = candidates if floors and obstacles is True else []
-        self.scene, self.mjcf = scene_of(mjcf, geoms, (*KINDS, *OTHER_KINDS)), mjcf
+        self.scene, self.mjcf = scene_of(mjcf, geoms), mjcf
         self._stated: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
             "turns_about": turns_about,
@@ -258,8 +258,7 @@ class MjcfRobot(Robot):
         `dynamics.numbers` has the names and values. `dynamics.with_parameters` changes the numbers for a plan alone.
         """
         changed = self.dynamics.with_parameters(**values)
-        scene = scene_of(changed.mjcf, self.scene.geoms, (*KINDS, *OTHER_KINDS))
-        return MjcfRobot(scene, **self._stated)
+        return MjcfRobot(scene_of(changed.mjcf, self.scene.geoms), **self._stated)
 
     def hold(self, state: npt.ArrayLike) -> Array:
         """The controls (m,) that hold the robot still, by MuJoCo's own forces: torques, or the targets of servos.

@@ -149,25 +149,21 @@ class MjcfPhysics:
         return row.tolist()
 
     def _numbers(self, carriers: tuple[int, ...], turns_about: str | None) -> Array:
-        model, functions = self.model, _functions()
+        model = self.model
         joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
-        numbers = np.zeros(kernel.TABLE)
-        numbers[kernel.FLAGS], numbers[kernel.SLOTS] = self._flags.ctypes.data, self._table.ctypes.data
-        numbers[kernel.COUNT], numbers[kernel.MODEL] = len(self._flags), model._address
-        numbers[kernel.STEP], numbers[kernel.STEP_SKIP] = functions["mj_step"], functions["mj_stepSkip"]
-        # RK4 ends with the stages of its last evaluation.
-        numbers[kernel.KEEPS] = model.opt.integrator != RK4
-        numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
-        numbers[kernel.JOINTS] = model.njnt
-        numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
-        numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
-        numbers[kernel.RESET], numbers[kernel.COMPOS] = functions["mj_resetData"], functions["mj_comPos"]
-        numbers[kernel.JAC], numbers[kernel.DISTANCE] = functions["mj_jac"], functions["mj_geomDistance"]
-        numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size
         loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
-        numbers[kernel.CONSTANTS] = functions["mj_setConst"]
+        entries = _functions() | {
+            kernel.FLAGS: self._flags.ctypes.data, kernel.SLOTS: self._table.ctypes.data,
+            kernel.COUNT: len(self._flags), kernel.TEAM: self.team.ctypes.data, kernel.JOB: self._job.ctypes.data,
+            kernel.MODEL: model._address, kernel.TIMESTEP: model.opt.timestep, kernel.NV: model.nv,
+            kernel.NA: model.na, kernel.JOINTS: model.njnt,
+            kernel.KEEPS: model.opt.integrator != RK4,  # RK4 ends with the stages of its last evaluation
+            kernel.LOADED: len(carriers), kernel.LOADS: kernel.TABLE + joints.size,
+        }  # fmt: skip
         if turns_about is not None:
-            numbers[kernel.AXIS + AXES.index(turns_about)] = 1.0
+            entries[kernel.AXIS + AXES.index(turns_about)] = 1.0
+        numbers = np.zeros(kernel.TABLE)
+        numbers[list(entries)] = list(entries.values())
         return np.concatenate([numbers, joints.ravel(), *loads])
 
 
@@ -183,25 +179,22 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
 
 
 @cache
-def _yield() -> int:
-    """The address of a function that yields to other threads; 0 if there is none."""
-    if platform.system() == "Windows":
-        return 0
-    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
-
-
-@cache
-def _functions() -> dict[str, int]:
-    """The addresses of MuJoCo's functions, in the library that the bindings have loaded."""
+def _functions() -> dict[int, float]:
+    """The addresses of the functions that the kernel calls, by their indices: MuJoCo's, in the library that the
+    bindings have loaded, and one that yields to other threads, if there is one.
+    """
     folder = Path(mujoco.__file__).parent
     patterns = {"Windows": "mujoco.dll", "Darwin": "libmujoco*.dylib"}
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
     loaded = ctypes.CDLL(str(library))
-    names = (
-        "mj_step", "mj_stepSkip", "mj_kinematics", "mj_resetData", "mj_comPos", "mj_jac", "mj_geomDistance",
-        "mj_setConst",
-    )  # fmt: skip
-    return {name: ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value or 0 for name in names}
+    functions = {
+        kernel.STEP: loaded.mj_step, kernel.STEP_SKIP: loaded.mj_stepSkip, kernel.KINEMATICS: loaded.mj_kinematics,
+        kernel.RESET: loaded.mj_resetData, kernel.COMPOS: loaded.mj_comPos, kernel.JAC: loaded.mj_jac,
+        kernel.DISTANCE: loaded.mj_geomDistance, kernel.CONSTANTS: loaded.mj_setConst,
+    }  # fmt: skip
+    if platform.system() != "Windows":
+        functions[kernel.YIELD] = ctypes.CDLL(None).sched_yield
+    return {index: float(ctypes.cast(call, ctypes.c_void_p).value or 0) for index, call in functions.items()}
 
 
 class MjcfDynamics(Dynamics):

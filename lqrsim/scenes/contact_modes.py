@@ -69,14 +69,12 @@ class Period:
 
     Attributes:
       state: (n,) at its end. jacobian: (n, n+m). switches: k switches. slopes: (k, n+m), NaN if unknown.
-      certain: whether all differences stayed in the mode.
     """
 
     state: Array
     jacobian: Array
     switches: Switches
     slopes: Array
-    certain: bool
 
 
 class ContactModes:
@@ -179,7 +177,6 @@ class ContactModes:
         n, point = len(state), np.concatenate([state, control])
         end, switches = self.step(state, control)
         jacobian, slopes = np.empty((n, len(point))), np.empty((len(switches.names), len(point)))
-        certain = True
         for k in range(len(point)):
             ends, sides, width = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
             for share in _SMALLER:
@@ -192,12 +189,12 @@ class ContactModes:
                 if sides:
                     break
             else:
-                sides, certain = ends, False
+                sides = ends
             high, low = sides.get(1, (end, switches)), sides.get(-1, (end, switches))
             width *= len(sides)
             jacobian[:, k] = (high[0] - low[0]) / width
             slopes[:, k] = (high[1].at(switches.names) - low[1].at(switches.names)) / width
-        return Period(end, jacobian, switches, slopes, certain)
+        return Period(end, jacobian, switches, slopes)
 
 
 def _among(types: npt.NDArray[np.int32], kinds: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

@@ -127,11 +127,6 @@ def _with_choice(mjcf: MjcfModel, obstacles: Choice, kinds: Collection[str] = KI
     return scene_of(mjcf, geoms, kinds)
 
 
-def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str]) -> Scene:
-    """The scene in which these geoms are the obstacles. Raises InputError if a geom is not of these kinds."""
-    return Scene(mjcf, World(_obstacles(mjcf.model, mjcf.name, geoms, kinds)), tuple(geoms))
-
-
 def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int], what: str) -> list[int]:
     """Ids of the geoms that the `obstacles=` of `load_scene` chooses; `default` for True."""
     if isinstance(obstacles, bool):
@@ -167,8 +162,10 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     return np.flatnonzero(fixed & collides).tolist()
 
 
-def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: Collection[str]) -> list[Obstacle]:
-    data, text = placed(model), model.names
+def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str] = (*KINDS, *OTHER_KINDS)) -> Scene:
+    """The scene in which these geoms are the obstacles. Raises InputError if a geom is not of these kinds."""
+    model, text = mjcf.model, mjcf.model.names
+    data = placed(model)
     names = [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
     used_names, types = set(names), model.geom_type.tolist()
     kind_of = {number: mujoco.mjtGeom(number).name.removeprefix("mjGEOM_").lower() for number in set(types)}
@@ -180,7 +177,7 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
         name = names[geom] or free_name(f"{kind} {geom}", used_names)
         if kind not in kinds:
             raise InputError(
-                f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"
+                f"scene {mjcf.name}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"
                 ' or contype="0" conaffinity="0" if it is only to be drawn; or obstacles= to choose others; or an'
                 " MjcfRobot, which has MuJoCo's distances"
             )
@@ -197,7 +194,7 @@ def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: C
     for i, obstacle in enumerate(obstacles):
         if obstacle.kind in ("capsule", "cylinder") and all(_walled_off(obstacle, end, planes) for end in (-1, 1)):
             obstacles[i] = replace(obstacle, size=np.array([obstacle.size[0], np.inf, 0.0]))
-    return obstacles
+    return Scene(mjcf, World(obstacles), tuple(geoms))
 
 
 def _hull_of(model: mujoco.MjModel, mesh: int) -> Array:

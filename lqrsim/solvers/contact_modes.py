@@ -388,7 +388,7 @@ def linearized(problem: Problem, modes: ContactModes, state: Array, control: Arr
     if len(switches.names):
         return modes.linearize(state, control)
     jacobian = np.hstack(problem.dynamics.linearize(state, control, problem.dt)[:2])
-    return Period(end, jacobian, switches, np.zeros((0, jacobian.shape[1])), True)
+    return Period(end, jacobian, switches, np.zeros((0, jacobian.shape[1])))
 
 
 def changed(problem: Problem, plan: CostedPlan, model: ModeModel, change: Array) -> CostedPlan:
