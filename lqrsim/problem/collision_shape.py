@@ -277,14 +277,6 @@ def each_once(terms: Sequence[KeepsClear]) -> list[KeepsClear]:
 
 def _same(one: World, other: World) -> bool:
     """Whether two worlds have the same obstacles in the same order, such as those of one file that was read twice."""
-    return one is other or (
-        one.names == other.names
-        and all(
-            mine.kind == its.kind
-            and all(
-                np.array_equal(getattr(mine, name), getattr(its, name))
-                for name in ("position", "rotation", "size", "velocity", "corners")
-            )
-            for mine, its in zip(one.obstacles, other.obstacles, strict=True)
-        )
-    )
+    fields = "name", "kind", "position", "rotation", "size", "velocity", "corners"
+    pairs = zip(one.obstacles, other.obstacles, strict=False)
+    return len(one) == len(other) and all(mine._equals(its, *fields) for mine, its in pairs)

@@ -140,26 +140,20 @@ class RateLimits(Constraint):
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         assert isinstance(self.rate.limits, tuple)
         space, (low, high) = dynamics.control_coordinates, np.asarray(self.rate.limits)
-        rows = [
-            (i, sign, bound, name, unit)
-            for sign, sides in ((1.0, low), (-1.0, high))
-            for i, (bound, name, unit) in enumerate(zip(sides, space.names, space.units, strict=True))
-            if np.isfinite(bound)
-        ]
-        words = {1.0: "at least", -1.0: "at most"}
-        described = [
-            f"a rate of {name} of {words[sign]} {bound:g} {unit}/s".replace(" /s", " 1/s")
-            for _, sign, bound, name, unit in rows
-        ]
-        numbers = np.concatenate(
-            [self.rate._numbers(self.dt, dynamics), *([i, sign, bound] for i, sign, bound, *_ in rows)]
-        )
+        sides = (1.0, low), (-1.0, high)
+        rows = [(i, sign, side[i]) for sign, side in sides for i in np.flatnonzero(np.isfinite(side)).tolist()]
+
+        def describe(row: int) -> str:
+            i, sign, bound = rows[row]
+            words = f"{space.names[i]} of {'at least' if sign > 0 else 'at most'} {bound:g} {space.units[i]}/s"
+            return f"a rate of {words}".replace(" /s", " 1/s")
+
         kernels = source_of(__name__)
         return ConstraintTerm(
-            kernels.filled(value=(kernels, "room"), slope=(kernels, "room_slope")), numbers, len(rows),
-            described.__getitem__, uses_control=True, convex=True, linear=True,
-            ranges=np.array([high[i] - low[i] for i, *_ in rows]),
-            names=tuple(f"{name} {'low' if sign > 0 else 'high'}" for _, sign, _, name, _ in rows),
+            kernels.filled(value=(kernels, "limit_value"), slope=(kernels, "limit_slope")),
+            np.concatenate([self.rate._numbers(self.dt, dynamics), *rows]), len(rows), describe,
+            uses_control=True, convex=True, linear=True, ranges=np.array([high[i] - low[i] for i, *_ in rows]),
+            names=tuple(f"{space.names[i]} {'low' if sign > 0 else 'high'}" for i, sign, _ in rows),
         )  # fmt: skip
 
 
@@ -196,7 +190,7 @@ def derivatives(x, u, t, data, hessian, gradient):
     return total
 
 
-def room(x, u, t, row, data):
+def limit_value(x, u, t, row, data):
     """The distance of a rate to a limit; infinite for a first command that is free."""
     if t == 0 and data[KNOWN] == 0:
         return inf
@@ -204,7 +198,7 @@ def room(x, u, t, row, data):
     return data[first + 1] * (rate_of(int(data[first]), x, u, t, data) - data[first + 2])
 
 
-def room_slope(x, u, t, row, data, gradient):
+def limit_slope(x, u, t, row, data, gradient):
     """Add its gradient (W,)."""
     first = PREVIOUS + M + 3 * row
     i, slope = int(data[first]), data[first + 1] / data[DT]

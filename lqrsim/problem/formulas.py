@@ -188,13 +188,10 @@ class SymbolicConstraint(OfFormula, Constraint):
             columns = {key: numbers_of(f"parameters: {key}", entry, want) for key, entry in (parameters or {}).items()}
             for key, column in columns.items():
                 check_shape(f"parameters: {key}", column, (len(self.at),) if column.ndim else ())
-            self._set_formula(
-                function, {key: float(column.ravel()[0]) for key, column in columns.items()}, name, WANTED
-            )
+            parameters = {key: float(column.ravel()[0]) for key, column in columns.items()}
             rows = [np.broadcast_to(column, len(self.at)) for column in columns.values()]
             self._table = np.array(rows, dtype=np.float64).reshape(len(rows), len(self.at)).T
-        else:
-            self._set_formula(function, parameters, name, WANTED)
+        self._set_formula(function, parameters, name, WANTED)
 
     @property
     def by_knot(self) -> bool:
@@ -266,19 +263,19 @@ class SymbolicConstraint(OfFormula, Constraint):
         if not traced:
             raise InputError(f"{self.name}: got no entries, want at least one: each must be nonnegative, or zero")
         parts, choices = [], {"value": [], "slope": []}
+        write = functools.partial(symbolic.write_function, data="data", of=self.name)
         for row, entry in enumerate(traced):
             if not entry.free_symbols & {*x, *u}:
                 raise InputError(f"{self.name}: got {entry} as entry {row}, want it to depend on x or u")
             slopes = {f"gradient[{i}]+": entry.diff(symbol) for i, symbol in enumerate([*x, *u])}
             slopes = {target: slope for target, slope in slopes.items() if slope != 0}
-            value, slope = f"value_{row}(x, u, data)", f"slope_{row}(x, u, data, gradient)"
-            parts.append(_written(value, {"entry": entry}, self.name, returns="entry"))
-            parts.append(_written(slope, slopes, self.name))
-            choices["value"].append(f"    if row == {row}:\n        return {value}")
-            choices["slope"].append(f"    if row == {row}:\n        {slope}")
+            parts.append(write(f"value_{row}", "x, u, data", assignments={"entry": entry}, returns="entry"))
+            parts.append(write(f"slope_{row}", "x, u, data, gradient", assignments=slopes))
+            choices["value"].append(f"    if row == {row}:\n        return value_{row}(x, u, data)")
+            choices["slope"].append(f"    if row == {row}:\n        slope_{row}(x, u, data, gradient)")
         words = {f"x{i}": name for i, name in enumerate(states)} | {f"u{i}": name for i, name in enumerate(controls)}
         words |= {f"p{i}": f"p.{name}" for i, name in enumerate(self.parameters)}
-        texts = [re.sub(r"\b[xup]\d+\b", lambda found: words[found[0]], str(entry)) for entry in traced]
+        texts = [re.sub(r"\b[xup]\d+\b", lambda match: words[match[0]], str(entry)) for entry in traced]
         value = "\n".join(["def value(x, u, t, row, data):", *choices["value"], "    return 0.0"])
         slope = "\n".join(["def slope(x, u, t, row, data, gradient):", *choices["slope"]])
         return {
@@ -366,11 +363,6 @@ def _knots(at: npt.ArrayLike) -> tuple[int, ...]:
     if knots.ndim != 1 or not knots.size or (knots != np.floor(knots)).any() or (np.diff(knots, prepend=-1) <= 0).any():
         raise InputError(f"SymbolicConstraint: at: got {excerpt(at)}, want {want}")
     return tuple(knots.astype(int).tolist())
-
-
-def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:
-    name, arguments = signature.removesuffix(")").split("(")
-    return symbolic.write_function(name, arguments, "data", assignments, of=of, returns=returns)
 
 
 # The kernel. `data` has the number of knots, the knots, and for each its COUNT numbers.

@@ -572,9 +572,8 @@ class Problem(OneVersion):
             rows = violated(term, states, controls, rollout.counts, EQUALITY_TOLERANCE)
             for name, (by, knots) in zip(names, rows, strict=True):
                 worst = np.stack([by, rollout.times[knots]], axis=1)
-                of_term[name] = (
-                    np.where(by[:, None] > of_term[name][:, :1], worst, of_term[name]) if name in of_term else worst
-                )
+                before = of_term.get(name, worst)
+                of_term[name] = np.where(by[:, None] > before[:, :1], worst, before)
             for name, worst in of_term.items():
                 unused = (f"{name} ({number})" for number in itertools.count(2))
                 worsts[name if name not in worsts else next(key for key in unused if key not in worsts)] = worst

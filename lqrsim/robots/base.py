@@ -106,10 +106,8 @@ def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int)
 
 def indices_in(robot: Robot, model: "mujoco.MjModel") -> tuple[Indices, Indices, Indices]:
     """The indices of a robot's joints in the qpos and qvel of a model, and of its controls in ctrl."""
-    joints, actuators = (
-        [model.joint(name) for name in robot.joints],
-        [model.actuator(name).id for name in robot.actuators],
-    )
+    joints = [model.joint(name) for name in robot.joints]
+    actuators = [model.actuator(name).id for name in robot.actuators]
     spans = (
         [(joint.qposadr[0], joint.qpos0.size) for joint in joints],
         [(joint.dofadr[0], joint.damping.size) for joint in joints],

@@ -78,10 +78,8 @@ class ForceLimits(Constraint):
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
-        actuators, joints = (
-            tuple(limit.id for limit in self.limits if limit.of_joint is joint) for joint in (False, True)
-        )
-        return dynamics.stating(unlimited=(actuators, joints))
+        ids = [tuple(limit.id for limit in self.limits if limit.of_joint is joint) for joint in (False, True)]
+        return dynamics.stating(unlimited=tuple(ids))
 
     def within(self, dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> "ForceLimits":
         """These limits at all physics steps of each period, predicted by the derivatives at a state."""

@@ -324,8 +324,8 @@ class MjcfRobot(Robot):
         dt: float | None = None,
         weights: PerEntry = 100.0,
         effort: PerEntry | None = None,
-        damping: float = 1e-3,
-        attitude: float = 0.1,
+        damping: NonNegative = 1e-3,
+        attitude: NonNegative = 0.1,
         limits: NonNegative = 100.0,
         clearance: Finite | None = None,
         self_clearance: Finite | None = None,
@@ -369,9 +369,6 @@ class MjcfRobot(Robot):
         about = (at_start.controls + at_goal.controls) / 2 if at_start.held and at_goal.held else at_start.controls
         effort_weights = efforts(self.mjcf) ** -2.0 if effort is None else effort
         cost: Cost = ControlCost(_weights("effort", effort_weights, len(controls)), about=about)
-        damping, attitude = (
-            check_number(*field, at_least=0.0) for field in (("damping", damping), ("attitude", attitude))
-        )
         state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
         for joint in self.mjcf.joints:
             if joint.kind != "free":

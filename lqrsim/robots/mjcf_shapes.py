@@ -22,7 +22,7 @@ from lqrsim.scenes import mjcf_obstacles
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_obstacles import Outline
 from lqrsim.scenes.scene import Scene
-from lqrsim.scenes.world import Obstacle, World
+from lqrsim.scenes.world import World
 
 MOST_ROWS = 128  # largest number of distances per step; beyond it, one per body: to the nearest obstacle
 # Distance beyond the margin from which on links have slopes, relative to the largest geom's bounding sphere. Links that
@@ -42,10 +42,8 @@ class MjcfGeoms(CollisionGeoms):
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.pairs, self.levers = (
-            mjcf_obstacles.pairs_of(scene.model, list(scene.geoms)),
-            mjcf_obstacles.levers(scene.model),
-        )
+        self.pairs = mjcf_obstacles.pairs_of(scene.model, list(scene.geoms))
+        self.levers = mjcf_obstacles.levers(scene.model)
         number = {geom: i for i, geom in enumerate(scene.geoms)}
         self.obstacles = np.array([number[geom] for geom in self.pairs[:, 1].tolist()], dtype=np.int64)
 
@@ -64,7 +62,7 @@ class MjcfGeoms(CollisionGeoms):
         numbers = list[int]()
         for obstacle in world.obstacles:
             number, stated = known.get(obstacle.name, (-1, None))
-            if not _same(obstacle, stated):
+            if stated is None or not obstacle._equals(stated, "kind", "position", "rotation", "size"):
                 raise InputError(
                     f"geoms: got the obstacle {obstacle.name!r}, which is not one of the robot's MJCF, want those of"
                     f" robot.scene.world: {', '.join(known) or 'there are none'}; or balls=robot.balls"
@@ -286,10 +284,3 @@ class MjcfBalls(CollisionSpheres):
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
         source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_distances))
         return SphereCenters(source, data, positions, functions=(memory,))
-
-
-def _same(obstacle: Obstacle, other: Obstacle | None) -> bool:
-    """Whether two obstacles have the same shape in the same place; one of them may move."""
-    if other is None or obstacle is other or obstacle.kind != other.kind:
-        return obstacle is other
-    return all(np.array_equal(getattr(obstacle, key), getattr(other, key)) for key in ("position", "rotation", "size"))

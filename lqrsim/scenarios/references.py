@@ -80,11 +80,8 @@ def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]
         )
     if not colon:
         return disturbances
-    check_name(
-        f"kind of disturbance in {set_name}",
-        kind,
-        dict.fromkeys(type(disturbance).__name__ for disturbance in disturbances),
-    )
+    kinds = dict.fromkeys(type(disturbance).__name__ for disturbance in disturbances)
+    check_name(f"kind of disturbance in {set_name}", kind, kinds)
     return tuple(disturbance for disturbance in disturbances if type(disturbance).__name__ == kind)
 
 

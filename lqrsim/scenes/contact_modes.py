@@ -115,10 +115,8 @@ class ContactModes:
                 mujoco.mj_step(self._model, data)
                 self._observe(step, qpos, observed)
         names = np.concatenate([np.zeros(0, np.int64), *(switch_names for switch_names, _ in observed)])
-        values, order = (
-            np.concatenate([np.zeros(0), *(switch_values for _, switch_values in observed)]),
-            np.argsort(names),
-        )
+        values = np.concatenate([np.zeros(0), *(switch_values for _, switch_values in observed)])
+        order = np.argsort(names)
         return np.concatenate([data.qpos, data.qvel]), Switches(names[order], values[order])
 
     def _runge_kutta(self, stage: int, switches: list[tuple[Names, Array]]) -> None:

@@ -357,11 +357,8 @@ def _force_limits(model: mujoco.MjModel, forces: Array, now: Array) -> Iterator[
         outputs = slice(outs[number], outs[number] + model.actuator_outnum[number])
         largest = float(np.linalg.norm(now[outputs]))
         if largest > 0:
-            yield (
-                (now[outputs] / largest @ forces[outputs])[None],
-                np.array([-np.inf]),
-                np.array([most[number] - largest]),
-            )
+            along = (now[outputs] / largest @ forces[outputs])[None]
+            yield along, np.array([-np.inf]), np.array([most[number] - largest])
     for tendon in np.flatnonzero(model.tendon_actfrclimited).tolist():
         outputs = outs[_on_tendon(model, tendon)]
         least, most = model.tendon_actfrcrange[tendon, :, None] - now[outputs].sum()
@@ -547,9 +544,8 @@ def efforts(mjcf: MjcfModel) -> Array:
     joints, largest = {joint.name: joint for joint in mjcf.joints}, np.ones(len(mjcf.controls))
     for actuator in mjcf.actuators:
         sides = []
-        if (
-            actuator.gain is not None and actuator.gain[0] and not any(actuator.bias or ())
-        ):  # else its control is no force
+        # Otherwise its control is no force.
+        if actuator.gain is not None and actuator.gain[0] and not any(actuator.bias or ()):
             sides.append(np.abs(actuator.forces) / abs(actuator.gain[0]))
             if actuator.joint is not None and actuator.gear:
                 sides.append(np.abs(joints[actuator.joint].forces) / abs(actuator.gain[0] * actuator.gear))

@@ -44,10 +44,8 @@ def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
     data = placed(model, qpos)
     mujoco.mj_collision(model, data)
     bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
-    return [
-        (model.body(first).name, model.body(second).name)
-        for first, second in dict.fromkeys(map(tuple, bodies.tolist()))
-    ]
+    pairs = dict.fromkeys(map(tuple, bodies.tolist()))
+    return [(model.body(first).name, model.body(second).name) for first, second in pairs]
 
 
 def leaders_of(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:

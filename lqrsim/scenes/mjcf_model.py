@@ -245,17 +245,11 @@ class MjcfModel:
         low, high = ranges(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange)
         for number, actuator in enumerate(self.actuators):
             if model.actuator_dyntype[number] == mujoco.mjtDyn.mjDYN_MUSCLE.value:  # MuJoCo passes on what is in 0..1
-                low[actuator.controls], high[actuator.controls] = (
-                    side[actuator.controls].clip(0, 1) for side in (low, high)
-                )
-            for entry, name in zip(
-                range(actuator.controls.start, actuator.controls.stop), actuator.inputs, strict=True
-            ):
-                full, unit = (
-                    f"{actuator.name}_{name}" if len(actuator.inputs) > 1 else actuator.name,
-                    _unit(actuator, joints, name),
-                )
-                controls.append(Control(full, unit, float(low[entry]), float(high[entry])))
+                for side in (low, high):
+                    side[actuator.controls] = side[actuator.controls].clip(0, 1)
+            for entry, name in enumerate(actuator.inputs, actuator.controls.start):
+                full = f"{actuator.name}_{name}" if len(actuator.inputs) > 1 else actuator.name
+                controls.append(Control(full, _unit(actuator, joints, name), float(low[entry]), float(high[entry])))
         return tuple(controls)
 
     @cached_property

@@ -199,11 +199,9 @@ def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> 
         if joint.range[0] > joint.range[1]:
             got = f"got limits from {joint.range[0]:g} to {joint.range[1]:g} for {joint.name}"
             raise InputError(f"{name}: {got}, want lower below upper")
-    coupled, names = (
-        {equality.name1 for equality in spec.equalities},
-        [element.get("name", "") for element in root.iterfind("joint[mimic]")],
-    )
-    if loose := [follower for follower in names if follower not in coupled]:
+    coupled = {equality.name1 for equality in spec.equalities}
+    followers = [element.get("name", "") for element in root.iterfind("joint[mimic]")]
+    if loose := [follower for follower in followers if follower not in coupled]:
         _log.warning(
             "%s: no joint is followed by %s: want a <mimic> of one that turns or slides", name, listed(loose, _LISTED)
         )

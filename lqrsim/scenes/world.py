@@ -92,6 +92,10 @@ class Obstacle:
         vars(obstacle).update(fields)
         return obstacle
 
+    def _equals(self, other: "Obstacle", *fields: str) -> bool:
+        """Whether these fields of two obstacles are the same."""
+        return self is other or all(np.array_equal(getattr(self, field), getattr(other, field)) for field in fields)
+
     @property
     def row(self) -> Array:
         """This obstacle as `ROW` numbers."""
@@ -215,18 +219,12 @@ class World:
         turn[2] = np.cross(turn[0], turn[1])
         origin = np.zeros(3)
         origin[across] = 0.0 if offset is None else offset
-        return World(
-            [
-                replace(
-                    obstacle,
-                    position=turn @ (obstacle.position - origin),
-                    rotation=turn @ obstacle.rotation,
-                    velocity=turn @ obstacle.velocity,
-                )
-                for obstacle in obstacles
-                if not _parallel(obstacle, across)
-            ]
-        )
+
+        def seen(obstacle: Obstacle) -> Obstacle:
+            position, rotation = turn @ (obstacle.position - origin), turn @ obstacle.rotation
+            return replace(obstacle, position=position, rotation=rotation, velocity=turn @ obstacle.velocity)
+
+        return World([seen(obstacle) for obstacle in obstacles if not _parallel(obstacle, across)])
 
     def upright(self) -> "World":
         """The obstacles of a plane as infinite prisms, for hulls in it.
