@@ -212,9 +212,9 @@ class View:
     @staticmethod
     def _given(scenario: "ls.Scenario", path: Path) -> "ls.Solution":
         """Load the solution of a file. Raises InputError if it cannot run in the scenario."""
-        from lqrsim.scenarios.solutions import given, remarks
+        from lqrsim.scenarios.solutions import check_solution, remarks
 
-        solution = given(scenario, path)
+        solution = check_solution(scenario, path)
         console.say(console.summary_of(solution))
         for remark in remarks(scenario, solution):
             console.say(f"{path} {remark}")

@@ -28,7 +28,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, resolve
-from lqrsim.scenarios.solutions import given, remarks, solve
+from lqrsim.scenarios.solutions import check_solution, remarks, solve
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.simulation.closed_loop import ClosedLoop
 from lqrsim.simulation.disturbances import Disturbance
@@ -64,7 +64,7 @@ class Task:
         spaces, robot = spaces_of(scenario.problem.dynamics), self.plant.robot
         check_same_system("scenario", "a problem", spaces, spaces_of(robot.dynamics), f"robot {robot.name}")
         self._actions = actions
-        self._given = None if solution is None else given(self.scenario, solution)
+        self._given = None if solution is None else check_solution(self.scenario, solution)
         for remark in [] if self._given is None else remarks(self.scenario, self._given):
             _log.warning("the given solution %s", remark)
         space = self.plant.robot.dynamics.control_coordinates

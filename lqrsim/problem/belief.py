@@ -363,11 +363,11 @@ class Belief(Dynamics):
                 off = sum(
                     (s * (now[i] - mean[i]) for s, i in zip(slope, rows, strict=True)), name(reading.xreplace(at))
                 )
-                share = name((sympy.Symbol(f"w{row}", real=True) - off) / sums[0])
+                factor = name((sympy.Symbol(f"w{row}", real=True) - off) / sums[0])
                 now = list(now)
                 for i, entry in zip(rows, column, strict=True):
-                    now[i] = name(now[i] + entry * share)
-            root = _informed(operations, root, seen, sums)
+                    now[i] = name(now[i] + entry * factor)
+            root = _root_after_reading(operations, root, seen, sums)
         return _Step(operations, x, u, [*now, *(entry for row in root for entry in row)], columns)
 
     def _variance(
@@ -500,12 +500,12 @@ def _step_jacobian(
     state, slopes, h = x, identity, sympy.Float(dt / robot.substeps)
     for _ in range(robot.substeps):
         stages: list[tuple[list[Any], dict[int, list[Any]]]] = []
-        for share in (0, h / 2, h / 2, h):
+        for factor in (0, h / 2, h / 2, h):
             shifted, slopes_shifted = state, slopes
-            if share:
+            if factor:
                 k, K = stages[-1]
-                shifted = [name(a + share * b) for a, b in zip(state, k, strict=True)]
-                slopes_shifted = {i: [name(slopes[i][j] + share * K[i][j]) for j in columns] for i in moved}
+                shifted = [name(a + factor * b) for a, b in zip(state, k, strict=True)]
+                slopes_shifted = {i: [name(slopes[i][j] + factor * K[i][j]) for j in columns] for i in moved}
             stages.append(at(shifted, slopes_shifted))
         weights = (h / 6, h / 3, h / 3, h / 6)
         weighed = list(zip(weights, stages, strict=True))
@@ -529,7 +529,7 @@ def _cholesky(operations: Operations, B: list[list[Any]], n: int) -> list[list[A
     return L
 
 
-def _informed(operations: Operations, L: list[list[Any]], v: list[Any], sums: list[Any]) -> list[list[Any]]:
+def _root_after_reading(operations: Operations, L: list[list[Any]], v: list[Any], sums: list[Any]) -> list[list[Any]]:
     """L C, with the lower triangular C of C C' = I - v v' / sums[0], for the sums of r^2 and v_j^2 from each j on.
 
     C_jj = sqrt(sums_j+1 / sums_j), and below it C_ij = -v_i v_j / sqrt(sums_j sums_j+1).
@@ -540,8 +540,8 @@ def _informed(operations: Operations, L: list[list[Any]], v: list[Any], sums: li
     after = [list[Any](row) for row in L]
     for j in range(n):
         diagonal = name(sympy.sqrt(name(sums[j + 1] / sums[j])))
-        share = name(v[j] / name(sums[j] * diagonal))
+        factor = name(v[j] / name(sums[j] * diagonal))
         for i in range(j, n):
             below = name(sum(L[i][k] * v[k] for k in range(j + 1, i + 1)))
-            after[i][j] = name(L[i][j] * diagonal - share * below)
+            after[i][j] = name(L[i][j] * diagonal - factor * below)
     return after

@@ -59,9 +59,9 @@ class Clearance(KeepsClear, Constraint):
     def by_knot(self) -> bool:
         return isinstance(self.margin, np.ndarray)
 
-    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
         other = copy.copy(self)
-        other.margin = cut(np.asarray(self.margin))
+        other.margin = select(np.asarray(self.margin))
         return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:

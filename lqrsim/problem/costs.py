@@ -129,10 +129,10 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         filled = horizon == "moving"
         if not self.by_knot:
             return self
-        return self._with_rows(lambda rows: left_after(min(steps, len(rows) - 1), rows, filled=filled))
+        return self._at_other_knots(lambda rows: left_after(min(steps, len(rows) - 1), rows, filled=filled))
 
-    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
-        """The same with each array of rows for knots as `cut` leaves it; for what has such rows."""
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
+        """The same with each array of rows for knots as `select` leaves it; for what has such rows."""
         raise InputError(f"{type(self).__name__}: got rows for knots, but no method ahead, want both")
 
     def _stated(self) -> Mapping[str, object]:

@@ -201,12 +201,12 @@ class SymbolicConstraint(OfFormula, Constraint):
         columns = dict(zip(self.parameters, self._table.T, strict=True)) if self.by_knot else self.parameters
         return {**super()._stated(), "parameters": columns}
 
-    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
         # As for any array of rows: at knots from the first to the last of all, which row holds at each, or none.
         assert not isinstance(self.at, str)
         rows = np.full(max(self.at, default=-1) + 2, -1.0)  # a row that is repeated says that none does
         rows[list(self.at)] = np.arange(len(self.at))
-        row_at = cut(rows)
+        row_at = select(rows)
         other = copy.copy(self)
         other.at = tuple(np.flatnonzero(row_at >= 0).tolist())
         other._table = self._table[row_at[row_at >= 0].astype(int)]

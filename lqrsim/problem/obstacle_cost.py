@@ -18,7 +18,7 @@ from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
-FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
+CUTOFF = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing, instead of exp(-CUTOFF)
 
 
 class ObstacleCost(KeepsClear, Cost):
@@ -74,7 +74,7 @@ class ObstacleCost(KeepsClear, Cost):
         return self._bind_at(dynamics, np.zeros(1), {})
 
     def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> CostTerm:
-        shape, reach = self.in_world(dynamics), FAR / self.sharpness
+        shape, reach = self.in_world(dynamics), CUTOFF / self.sharpness
         distances = shape.distances(reach)
         if distances is not None:
             numbers, axes = np.array([self.sharpness, self.weight, reach]), tuple(range(distances.leading_states))

@@ -34,15 +34,15 @@ class PlainTerm:
 
     def value(self, z: Array, row: int, knot: int = 1) -> float:
         """One row of the constraint at a knot."""
-        return float(self._functions["value"](*self._given(z), knot, row, self._data))
+        return float(self._functions["value"](*self._point(z), knot, row, self._data))
 
     def slope(self, z: Array, row: int) -> Array:
         """The gradient (n+m,) of one row of the constraint."""
         gradient = np.zeros(self.size)
-        self._functions["slope"](*self._given(z), 1, row, self._data, gradient)
+        self._functions["slope"](*self._point(z), 1, row, self._data, gradient)
         return gradient
 
-    def _given(self, z: Array) -> tuple[Array, Array]:
+    def _point(self, z: Array) -> tuple[Array, Array]:
         """State and control; or, in their place, the values that all rows share and their derivatives."""
         x, u = z[: self.states], z[self.states :]
         if not self.shared:

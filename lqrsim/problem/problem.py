@@ -316,11 +316,11 @@ class Problem(OneVersion):
         inside = ~np.isin(np.arange(self.steps + 1), new)
         rows[inside] = np.clip(rows, old[segment] + 1, old[segment + 1] - 1)[inside]
 
-        def cut(table: Array) -> Array:
+        def select(table: Array) -> Array:
             return table[np.minimum(rows, len(table) - 1)]
 
-        def at_knots(one: Any) -> Any:
-            return one._with_rows(cut) if one.by_knot else one
+        def at_knots(part: Any) -> Any:
+            return part._at_other_knots(select) if part.by_knot else part
 
         return replace(
             self, segments=tuple(knots), constraints=[at_knots(constraint) for constraint in self.constraints],

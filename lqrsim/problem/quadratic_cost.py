@@ -36,13 +36,13 @@ class _SquareCost(Cost):
 
     def __init__(self, weight: PerKnot, *, about: PerKnot | None = None, longer: bool = False) -> None:
         self.longer = check_flag(f"{self.name}: longer", longer)
-        self._given = {"weight": weight, "about": about}
+        self._arguments = {"weight": weight, "about": about}
         self._numbers: tuple[Array, Array] | None = None
-        if not any(isinstance(numbers, Mapping) for numbers in self._given.values()):
+        if not any(isinstance(numbers, Mapping) for numbers in self._arguments.values()):
             self._numbers = self._checked(weight, about)
 
     def _stated(self) -> Mapping[str, object]:
-        numbers = self._given if self._numbers is None else {"weight": self.weight, "about": self.about}
+        numbers = self._arguments if self._numbers is None else {"weight": self.weight, "about": self.about}
         return {**numbers, "longer": self.longer}
 
     def _brief(self, name: str, value: object) -> str:
@@ -85,9 +85,9 @@ class _SquareCost(Cost):
     def by_knot(self) -> bool:
         return self.weight.ndim == 3 or self.about.ndim == 2
 
-    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
         weight, about = self._known
-        return self._with(cut(weight) if weight.ndim == 3 else weight, cut(about) if about.ndim == 2 else about)
+        return self._with(select(weight) if weight.ndim == 3 else weight, select(about) if about.ndim == 2 else about)
 
     def times(self, factor: float) -> Self:
         return self._with(factor * self.weight, self.about)
@@ -100,7 +100,7 @@ class _SquareCost(Cost):
     def _in(self, dynamics: Dynamics) -> Self:
         space = dynamics.control_coordinates if self.controls else dynamics.state_coordinates
         if self._numbers is None:
-            weight = self._given["weight"]
+            weight = self._arguments["weight"]
             if self.controls and isinstance(weight, Mapping):
                 weighed = space._by_name(f"{self.name}: weight", weight, _number_or_column)
                 missing = [name for i, name in enumerate(space.names) if i not in weighed]
@@ -110,7 +110,7 @@ class _SquareCost(Cost):
                     )
             fields = {
                 field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
-                for field, given in self._given.items()
+                for field, given in self._arguments.items()
             }
             if isinstance(weight, Mapping) and np.ndim(fields["weight"]) == 2:  # diagonals, one for each knot
                 fields["weight"] = fields["weight"][:, :, None] * np.eye(len(space))

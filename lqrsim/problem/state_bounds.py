@@ -98,9 +98,9 @@ class StateBounds(Constraint):
     def by_knot(self) -> bool:
         return any(isinstance(side, np.ndarray) for sides in self.bounds.values() for side in sides)
 
-    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
         def later(side: Side) -> Side:
-            return cut(side) if isinstance(side, np.ndarray) else side
+            return select(side) if isinstance(side, np.ndarray) else side
 
         other = copy.copy(self)
         other.bounds = {name: (later(low), later(high)) for name, (low, high) in self.bounds.items()}
@@ -228,11 +228,11 @@ def value(x, u, t, row, data):
     first = row_at(row, data)
     if t > data[first + LAST]:
         return inf
-    far = x[int(data[first + INDEX])] - data[first + BOUNDS + min(t, int(data[0]) - 1)]
+    distance = x[int(data[first + INDEX])] - data[first + BOUNDS + min(t, int(data[0]) - 1)]
     period = data[first + PERIOD]
     if period > 0:
-        far -= period * floor(far / period + 0.5)
-    return data[first + SIGN] * far
+        distance -= period * floor(distance / period + 0.5)
+    return data[first + SIGN] * distance
 
 
 def slope(x, u, t, row, data, gradient):

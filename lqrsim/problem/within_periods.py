@@ -48,8 +48,8 @@ class WithinPeriods(Constraint):
     def by_knot(self) -> bool:
         return True
 
-    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
-        return type(self)(self.constraint, cut(self.acts), self.spares)
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
+        return type(self)(self.constraint, select(self.acts), self.spares)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return type(self)(self.constraint.with_added_state(dynamics), self.acts, self.spares)

@@ -83,9 +83,10 @@ class ForceLimits(Constraint):
 
     def within(self, dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> "ForceLimits":
         """These limits at all physics steps of each period, predicted by the derivatives at a state."""
-        return ForceLimits(self.limits, self._ahead(dynamics, state, control, round(dt / dynamics.period))[None])
+        later = self._at_later_steps(dynamics, state, control, round(dt / dynamics.period))
+        return ForceLimits(self.limits, later[None])
 
-    def _ahead(self, dynamics: MjcfDynamics, x: Array, u: Array, count: int) -> Array:
+    def _at_later_steps(self, dynamics: MjcfDynamics, x: Array, u: Array, count: int) -> Array:
         """The forces ((count-1) L, 1+n+m) at the physics steps of a period but the first, by its state and control."""
         state, a, b = x, np.eye(len(x)), np.zeros((len(x), len(u)))
         by_state, by_control = np.split(self._slopes[:, 1:], [len(x)], axis=1)
@@ -105,7 +106,7 @@ class ForceLimits(Constraint):
         assert isinstance(mjcf_dynamics, MjcfDynamics)
         states, count = plan.states[:, : len(mjcf_dynamics.state_coordinates)], round(plan.dt / mjcf_dynamics.period)
         pairs = zip(states, plan.controls, strict=False)
-        later = np.stack([self._ahead(mjcf_dynamics, x, u, count) for x, u in pairs])
+        later = np.stack([self._at_later_steps(mjcf_dynamics, x, u, count) for x, u in pairs])
         forces = later[..., 0] + np.einsum("tki,ti->tk", later[..., 1:], np.hstack([states[:-1], plan.controls]))
         low, high = (np.tile([getattr(limit, side) for limit in self.limits], count - 1) for side in ("low", "high"))
         return ForceLimits(self.limits, later) if ((forces < low) | (forces > high)).any() else None

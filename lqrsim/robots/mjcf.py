@@ -44,12 +44,12 @@ from lqrsim.scenes.mjcf_text import listed
 from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
 from lqrsim.scenes.world import World
 
-_SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
-_ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
+_SHARPNESS, _CONTACT_COST = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
+_LIMIT_MARGIN = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
 _PAST = 1e-3  # fraction of a joint's range that a goal may be past its limits
 _REST = 1e-6  # m/s^2, largest acceleration at rest
 _PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
-_WILD = 2.0  # factor by which a deviation grows in a period where MuJoCo's steps are unstable; robots fall slower
+_UNSTABLE = 2.0  # factor by which a deviation grows in a period where MuJoCo's steps are unstable; robots fall slower
 
 
 class MjcfRobot(Robot):
@@ -398,7 +398,7 @@ class MjcfRobot(Robot):
                 dynamics = unlimited
                 constraints.append(forces.within(dynamics, start, at_start.controls, period))
         if len(self.scene.world):
-            cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
+            cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_CONTACT_COST)
         return Problem(
             dynamics=dynamics, dt=period,
             steps=steps, initial=FixedState(start), stage_cost=cost,
@@ -438,7 +438,7 @@ class MjcfRobot(Robot):
             if end != begin and (complaint := joint.past_limits(end, _PAST)):
                 raise InputError(f"goal: {complaint}")
             least, most = joint.limits
-            margin = min(_ROOM[0], _ROOM[1] * (most - least))
+            margin = min(_LIMIT_MARGIN[0], _LIMIT_MARGIN[1] * (most - least))
             low[names[joint.dof]] = max(least, min(least + margin, begin, end))
             high[names[joint.dof]] = min(most, max(most - margin, begin, end))
         return low, high
@@ -604,12 +604,12 @@ class MjcfRobot(Robot):
 
 
 def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> bool:
-    """Whether no deviation from a state grows by more than `_WILD` in a period: explicit steps of stiff servos may."""
+    """Whether no deviation from a state grows by `_UNSTABLE` in a period: explicit steps of stiff servos may."""
     try:
         motion = dynamics.linearize(state, control, dt)[0]
     except InputError:  # beyond all numbers
         return False
-    return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _WILD
+    return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _UNSTABLE
 
 
 def _weights(field: str, weights: PerEntry, size: int) -> PerEntry:

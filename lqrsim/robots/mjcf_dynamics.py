@@ -37,7 +37,7 @@ RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
 _DIFFERENCE = 1e-6  # step of `mjd_transitionFD`, that of MuJoCo's own tests
 _GRAZED = 1e-3  # m; a plan along a geom is this close to it, in contact or just not
-_CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
+_TOLERANCE, _ITERATIONS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
 _KINDS = mujoco.mjtConstraint.__members__.items()
 _ONE_SIDED = [int(kind) for name, kind in _KINDS if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
 
@@ -130,7 +130,7 @@ class MjcfPhysics:
         off.
         """
         exact = copy.copy(self.model)
-        exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _CLOSE, max(_LOOKS, exact.opt.ccd_iterations)
+        exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _TOLERANCE, max(_ITERATIONS, exact.opt.ccd_iterations)
         # The other algorithm is wrong at a distance.
         exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         return exact
@@ -383,7 +383,7 @@ class MjcfDynamics(Dynamics):
             return
         approaches = Approaches(self.mjcf, states, motion)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
-            dynamics = self.stating(obstacles=(*self._stated["obstacles"], *approaches.thing))
+            dynamics = self.stating(obstacles=(*self._stated["obstacles"], *approaches.body_geoms))
             for words, positions in approaches:
                 yield words, dynamics, np.pad(positions, [(0, 0), (0, len(change) - nv)], constant_values=np.nan)
 

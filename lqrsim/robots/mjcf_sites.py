@@ -169,10 +169,10 @@ def residual(x, data, out):
     """Write the rows."""
     p = at(data[0])
     slot = claim_slot(p)
-    one, point = at(p[SLOTS] + 8 * SLOT * slot), stack(3)
-    write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
-    write_errors(one, data, out, point)
+    arrays, point = at(p[SLOTS] + 8 * SLOT * slot), stack(3)
+    write_positions(x, p, at(arrays[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(arrays[DATA]))
+    write_errors(arrays, data, out, point)
     store(p[FLAGS], slot, 0)
 
 
@@ -180,12 +180,12 @@ def residual_jacobian(x, data, out, slopes):
     """Write the rows and their derivatives in the states (any, N), which are zero on entry."""
     p = at(data[0])
     slot, nv, body = claim_slot(p), int(p[NV]), int(data[BODY])
-    one, point, moves, turns = at(p[SLOTS] + 8 * SLOT * slot), stack(3), stack(3 * N), stack(3 * N)
-    write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
-    call(p[COMPOS], at(p[MODEL]), at(one[DATA]))
-    write_errors(one, data, out, point)
-    call(p[JAC], at(p[MODEL]), at(one[DATA]), moves, turns, point, int32(body))
+    arrays, point, moves, turns = at(p[SLOTS] + 8 * SLOT * slot), stack(3), stack(3 * N), stack(3 * N)
+    write_positions(x, p, at(arrays[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(arrays[DATA]))
+    call(p[COMPOS], at(p[MODEL]), at(arrays[DATA]))
+    write_errors(arrays, data, out, point)
+    call(p[JAC], at(p[MODEL]), at(arrays[DATA]), moves, turns, point, int32(body))
     if PLACED:
         for i in range(3):
             for j in range(nv):
@@ -205,10 +205,10 @@ def residual_jacobian(x, data, out, slopes):
     store(p[FLAGS], slot, 0)
 
 
-def write_errors(one, data, out, point):
+def write_errors(arrays, data, out, point):
     """Write the rows, and the position of the site, for an MjData with computed positions."""
     body = int(data[BODY])
-    origins, axes = at(one[XPOS]), at(one[XMAT])
+    origins, axes = at(arrays[XPOS]), at(arrays[XMAT])
     for i in range(3):
         point[i] = origins[3 * body + i]
         for j in range(3):

@@ -78,7 +78,7 @@ class RobotSensors:
             raise InputError(f"sensors: got {[sensor.name for sensor in stated]}, want at least one, each at most once")
         self._robot, self._scene = robot, scene
         self.drag = robot.drag
-        model, sensors, places, far = scene.model, list[Sensor](), list[npt.NDArray[np.intp]](), list[Array]()
+        model, sensors, places, rangefinders = scene.model, list[Sensor](), list[npt.NDArray[np.intp]](), list[Array]()
         columns, names, quaternions, count = list[slice](), list[str](), list[bool](), 0
         for sensor in stated:
             number = _number_of(model, sensor.name)
@@ -96,11 +96,11 @@ class RobotSensors:
             names += [f"{sensor.name}[{i}]" for i in range(size)] if size > 1 else [sensor.name]
             quaternions.append(kind in _QUATERNIONS)
             places.append(int(model.sensor_adr[number]) + np.arange(size))
-            far.append(np.full(size, kind == _TYPES.mjSENS_RANGEFINDER))
+            rangefinders.append(np.full(size, kind == _TYPES.mjSENS_RANGEFINDER))
             count += size
         self.sensors, self.columns, self.names = tuple(sensors), tuple(columns), tuple(names)
         self.quaternions = tuple(quaternions)
-        self._places, self._far = np.concatenate(places), np.concatenate(far)
+        self._places, self._rangefinders = np.concatenate(places), np.concatenate(rangefinders)
 
     def __repr__(self) -> str:
         return f"RobotSensors({', '.join(sensor.name for sensor in self.sensors)})"
@@ -134,7 +134,7 @@ class RobotSensors:
     def readings(self, sensordata: Array) -> Array:
         """The readings (K, Y) in MuJoCo's `sensordata` (K, any); NaN where a rangefinder meets nothing."""
         readings = sensordata[:, self._places]
-        readings[(readings == _NO_HIT) & self._far] = np.nan
+        readings[(readings == _NO_HIT) & self._rangefinders] = np.nan
         return readings
 
     def reader(self) -> Reader:

@@ -65,7 +65,7 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
     return plan
 
 
-def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> Solution:
+def check_solution(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> Solution:
     """Check a solution that is given instead of solving the scenario.
 
     The solution may not have converged, or may be of another problem; `remarks` then says so.

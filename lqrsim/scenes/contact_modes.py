@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-_NEAR = 0.02  # m or rad; smaller distances are watched
+_WATCHED = 0.02  # m or rad; smaller distances are watched
 _SMALLER = 1.0, 1e-2, 1e-4  # steps of differences, relative to the first; tried until one stays in the mode
 _KIND = mujoco.mjtConstraint
 _LIMITS = np.array([int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)])
@@ -88,10 +88,10 @@ class ContactModes:
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._model, self._substeps = model, substeps
-        self._data, self._ahead = mujoco.MjData(model), copy.copy(model)
-        for margins in (self._ahead.jnt_margin, self._ahead.tendon_margin, self._ahead.geom_margin):
-            margins[:] += _NEAR
-        self._seen, self._nv = mujoco.MjData(self._ahead), model.nv
+        self._data, self._wide_model = mujoco.MjData(model), copy.copy(model)
+        for margins in (self._wide_model.jnt_margin, self._wide_model.tendon_margin, self._wide_model.geom_margin):
+            margins[:] += _WATCHED
+        self._wide_data, self._nv = mujoco.MjData(self._wide_model), model.nv
         self._four = model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
 
     @staticmethod
@@ -126,9 +126,9 @@ class ContactModes:
         mujoco.mj_forward(model, data)
         self._observe(stage, data.qpos, switches)
         speeds, rates = [qvel], [data.qacc.copy()]
-        for number, share in enumerate((0.5, 0.5, 1.0)):
-            data.qpos[:] = qpos + h * share * speeds[number]
-            data.qvel[:], data.time = qvel + h * share * rates[number], time + h * share
+        for number, fraction in enumerate((0.5, 0.5, 1.0)):
+            data.qpos[:] = qpos + h * fraction * speeds[number]
+            data.qvel[:], data.time = qvel + h * fraction * rates[number], time + h * fraction
             mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
             self._observe(stage + number + 1, data.qpos, switches)
             speeds.append(data.qvel.copy())
@@ -139,15 +139,15 @@ class ContactModes:
 
     def _observe(self, stage: int, qpos: Array, switches: list[tuple[Names, Array]]) -> None:
         """Add the switches of a stage at these positions (nq,), whose forces are in the data."""
-        model, seen = self._model, self._seen
+        model, seen = self._model, self._wide_data
         seen.qpos[:] = qpos
-        mujoco.mj_fwdPosition(self._ahead, seen)
+        mujoco.mj_fwdPosition(self._wide_model, seen)
         limits, first = _among(seen.efc_type, _LIMITS), stage * _STAGE
         if limits.any():
-            distances = (seen.efc_pos - seen.efc_margin)[limits] + _NEAR
-            switches.append((first + _limits(self._ahead, seen, limits), distances))
+            distances = (seen.efc_pos - seen.efc_margin)[limits] + _WATCHED
+            switches.append((first + _limits(self._wide_model, seen, limits), distances))
         if seen.ncon:
-            geoms, wide_margin, geom_margin = seen.contact.geom, self._ahead.geom_margin, model.geom_margin
+            geoms, wide_margin, geom_margin = seen.contact.geom, self._wide_model.geom_margin, model.geom_margin
             # Versions of MuJoCo differ in whether the margin of two geoms is their sum or their maximum.
             summed = np.abs(seen.contact.includemargin - wide_margin[geoms].sum(axis=1)) < 1e-9
             margins = np.where(summed, geom_margin[geoms].sum(axis=1), geom_margin[geoms].max(axis=1))
@@ -177,8 +177,8 @@ class ContactModes:
         jacobian, slopes = np.empty((n, len(point))), np.empty((len(switches.names), len(point)))
         for k in range(len(point)):
             ends, sides, width = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
-            for share in _SMALLER:
-                width = share * 1e-6 * max(1.0, abs(point[k]))
+            for fraction in _SMALLER:
+                width = fraction * 1e-6 * max(1.0, abs(point[k]))
                 for sign in (1, -1):
                     shifted = point.copy()
                     shifted[k] += sign * width

@@ -41,8 +41,8 @@ class Approaches:
         are to change until the end.
 
     Attributes:
-      thing: ids of the geoms of the body that can collide. tools: ids of the driven geoms that can collide with them,
-        the nearest first.
+      body_geoms: ids of the geoms of the body that can collide. tools: ids of the driven geoms that can collide with
+        them, the nearest first.
     """
 
     def __init__(self, mjcf: MjcfModel, states: Array, change: Array) -> None:
@@ -54,11 +54,11 @@ class Approaches:
         for body in range(model.nbody):  # parents come first
             carried[body] = body == root or (body > 0 and carried[model.body_parentid[body]])
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        self.thing = np.flatnonzero(carried[model.geom_bodyid] & collides).tolist()
+        self.body_geoms = np.flatnonzero(carried[model.geom_bodyid] & collides).tolist()
         self._place(self._positions[0])
         driven = np.unique(model.dof_treeid[self._data.moment_colind[: self._data.moment_rownnz.sum()]])
         self._dofs = np.isin(model.dof_treeid, driven) & ~carried[model.dof_bodyid]
-        movers = touching_pairs(model, self.thing)[:, 0]
+        movers = touching_pairs(model, self.body_geoms)[:, 0]
         bodies = model.geom_bodyid[movers]
         tools = movers[np.isin(model.body_treeid[bodies], driven) & ~carried[bodies]]
         self.tools = sorted(set(tools.tolist()), key=self._gap)
@@ -82,28 +82,28 @@ class Approaches:
             mujoco.mj_fwdPosition(self._model, self._data)
 
     def _gap(self, tool: int) -> float:
-        return min(mujoco.mj_geomDistance(self._model, self._data, tool, geom, 1e3, None) for geom in self.thing)
+        return min(mujoco.mj_geomDistance(self._model, self._data, tool, geom, 1e3, None) for geom in self.body_geoms)
 
     def _way(self, begin: int, end: int) -> Array:
         """Places (T+1, 3) of the body's centre: those of the plan, moved on from rest to rest between two knots."""
-        shares = np.clip((np.arange(self._steps + 1) - begin) / max(end - begin, 1), 0.0, 1.0)
+        fractions = np.clip((np.arange(self._steps + 1) - begin) / max(end - begin, 1), 0.0, 1.0)
         way = np.empty((self._steps + 1, 3))
-        for t, share in enumerate(shares**2 * (3 - 2 * shares)):
-            self._place(self._positions[t] + share * self._change)
-            way[t] = self._data.geom_xpos[self.thing].mean(axis=0)
+        for t, fraction in enumerate(fractions**2 * (3 - 2 * fractions)):
+            self._place(self._positions[t] + fraction * self._change)
+            way[t] = self._data.geom_xpos[self.body_geoms].mean(axis=0)
         return way
 
     def _pushes(self, tool: int, way: Array, begin: int, end: int) -> Iterator[tuple[str, Array]]:
         """Pushes by a tool, along each path to the far side of the body that it can follow."""
-        ahead, centre = _unit(way[end] - way[begin]), way[begin]
+        forward, centre = _unit(way[end] - way[begin]), way[begin]
         self._place(self._positions[0])
         point = self._tip(tool, way[0])
         offset = self._spot(tool, point) - centre
-        touching = self._reach(tool, point, centre, -ahead)
+        touching = self._reach(tool, point, centre, -forward)
         radii = np.linspace(max(float(np.linalg.norm(offset)), touching), touching, begin + 1)
         radii[1:-1] = np.maximum(radii[1:-1], _ROUND * touching)
-        for words, directions in _paths(_unit(offset), -ahead):
-            spots = way - touching * ahead
+        for words, directions in _paths(_unit(offset), -forward):
+            spots = way - touching * forward
             knots = np.linspace(0, len(directions) - 1, begin + 1)
             parts = [np.interp(knots, range(len(directions)), part) for part in np.transpose(directions)]
             mixed = np.stack(parts, axis=1)
@@ -117,8 +117,8 @@ class Approaches:
         self._place(self._positions[0])
         points = [self._tip(tool, way[0]) for tool in pair]
         spots = np.array([self._spot(*tip) for tip in zip(pair, points, strict=True)])
-        ahead, line, sides = _unit(way[end] - way[begin]), spots[0] - spots[1], np.array([[1.0], [-1.0]])
-        line = _unit(line - (line @ ahead) * ahead)
+        forward, line, sides = _unit(way[end] - way[begin]), spots[0] - spots[1], np.array([[1.0], [-1.0]])
+        line = _unit(line - (line @ forward) * forward)
         touching = [
             self._reach(tool, point, way[begin], side * line)
             for tool, point, side in zip(pair, points, sides, strict=True)
@@ -137,7 +137,7 @@ class Approaches:
         """Pairs of tools that can close along the line between them, the nearest first."""
         model, pairs = self._model, list[tuple[float, tuple[int, int]]]()
         self._place(self._positions[0])
-        place = self._data.geom_xpos[self.thing].mean(axis=0)
+        place = self._data.geom_xpos[self.body_geoms].mean(axis=0)
         spots = [self._spot(tool, self._tip(tool, place)) for tool in self.tools]
         slopes = np.zeros((len(self.tools), 3, model.nv))
         for slope, tool, spot in zip(slopes, self.tools, spots, strict=True):
@@ -171,8 +171,8 @@ class Approaches:
         """
         model, places = self._model, self._data.geom_xpos
         place, offset = places[tool].copy(), self._spot(tool, point) - places[tool]
-        bounds = float(model.geom_rbound[tool] + np.linalg.norm(point) + model.geom_rbound[self.thing].max())
-        middle, distance = places[self.thing].mean(axis=0), 2 * bounds
+        bounds = float(model.geom_rbound[tool] + np.linalg.norm(point) + model.geom_rbound[self.body_geoms].max())
+        middle, distance = places[self.body_geoms].mean(axis=0), 2 * bounds
         for _ in range(_SEARCHES):
             places[tool] = middle + distance * side - offset
             gap = self._gap(tool)

@@ -20,11 +20,11 @@ _STEPS, _HALVES, _NUDGE = 60, 12, 1e-6  # limits of steps and halvings; relative
 _EXACT, _PROGRESS = 1e-12, 0.99  # of the score: small enough, and the factor by which a step must lower it to go on
 _LIGHT = 1e-4  # weight of controls relative to forces: selects the smallest that hold
 _HEAVY = 1e2  # weight of the force that a limit cuts off: actuators do not push against their limits
-_FAR = 2.0 ** np.arange(-3, 20)  # distances at which an activation may be at rest
+_DISTANCES = 2.0 ** np.arange(-3, 20)  # distances at which an activation may be at rest
 _DRIFTS = 2  # mode of an activation that cannot rest
 _REST, _TIGHT = 1e-7, 1e-4  # what is no rate, relative; weight of rates that may be left over
 _SCALES = 10.0 ** np.arange(13)  # relative lengths of a step that bounds make
-_NEAR = 0.1  # 1 / (1 + square) of a right one
+_WELL_SCALED = 0.1  # least 1 / (1 + square) of a length that is right
 _END = 1e-9  # relative distance from the end of its range within which an activation is there
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
@@ -127,7 +127,7 @@ class _AtRest:
 
             begin = float(z[place])
             if (first_rate := rate(begin)) != 0:
-                ends = (begin + np.sign(first_rate) * distance for distance in _FAR)
+                ends = (begin + np.sign(first_rate) * distance for distance in _DISTANCES)
                 end = next((end for end in ends if rate(end) * first_rate <= 0), None)
                 z[place] = begin if end is None else float(brentq(rate, begin, end, xtol=1e-15))  # pyright: ignore[reportArgumentType]
         return z
@@ -142,9 +142,9 @@ class _AtRest:
         self._apply(model, z)
         step, inside = model.opt.timestep, slice(model.nu, None)
         held = model.actuator_actlimited[self.of[inside]].astype(bool)  # their next value stays within the range
-        ahead = act + step * data.act_dot
-        ahead = np.where(held, np.clip(ahead, self.low[inside], self.high[inside]), ahead)
-        return data.qfrc_actuator.copy(), (ahead - act) / step
+        following = act + step * data.act_dot
+        following = np.where(held, np.clip(following, self.low[inside], self.high[inside]), following)
+        return data.qfrc_actuator.copy(), (following - act) / step
 
     def _unlimited(self, z: Array) -> Array:
         """Forces of actuators and rates of activations, (nout + na,), without limits of either."""
@@ -154,13 +154,13 @@ class _AtRest:
     def linear(self, z: Array) -> _Linear:
         """Forces and rates without limits about z, with slopes by differences within the range."""
         nudge = _NUDGE * np.maximum(1.0, np.abs(z))
-        ahead, behind = (np.clip(z + side * nudge, self.low, self.high) for side in (1, -1))
-        stuck = ahead == behind
-        ahead[stuck], behind[stuck] = (z + nudge)[stuck], (z - nudge)[stuck]
+        above, below = (np.clip(z + side * nudge, self.low, self.high) for side in (1, -1))
+        stuck = above == below
+        above[stuck], below[stuck] = (z + nudge)[stuck], (z - nudge)[stuck]
         slopes = np.zeros((self.model.nout + self.model.na, len(z)))
         for k in range(len(z)):
-            sides = [np.concatenate([z[:k], side[k : k + 1], z[k + 1 :]]) for side in (ahead, behind)]
-            slopes[:, k] = (self._unlimited(sides[0]) - self._unlimited(sides[1])) / (ahead[k] - behind[k])
+            sides = [np.concatenate([z[:k], side[k : k + 1], z[k + 1 :]]) for side in (above, below)]
+            slopes[:, k] = (self._unlimited(sides[0]) - self._unlimited(sides[1])) / (above[k] - below[k])
         values, outs = self._unlimited(z), self.model.nout
         return _Linear(values[:outs], values[outs:], slopes[:outs], slopes[outs:])
 
@@ -195,7 +195,7 @@ class _Search:
     def __init__(self, rest: _AtRest) -> None:
         self._rest, model = rest, rest.model
         first = rest.linear(rest.neutral)
-        self._kept, self._carried = _carried(model, rest.data.qpos, rest.driven(first))
+        self._free_dofs, self._to_free = _free_joints(model, rest.data.qpos, rest.driven(first))
         self._modes = np.zeros(model.na, dtype=np.intp)
         # What nothing changes at rest, such as the bristles of a model of dry friction, is not to carry anything.
         self._idle = np.asarray(~first.rates_by.any(axis=1))
@@ -211,13 +211,13 @@ class _Search:
         self._limited = np.flatnonzero(np.repeat(limited, model.actuator_outnum))
         self._limited_dofs = model.jnt_dofadr[np.flatnonzero(model.jnt_actfrclimited)]
 
-    def _left(self, z: Array) -> tuple[Array, Array]:
+    def _remaining(self, z: Array) -> tuple[Array, Array]:
         """The missing forces of the free joints in N or N m, and how far activations (na,) are from rest."""
         forces, rates = self._rest.exerted(z)
-        return self._carried @ (self._rest.wanted - forces), rates / self._steepness
+        return self._to_free @ (self._rest.wanted - forces), rates / self._steepness
 
     def _score(self, z: Array) -> float:
-        missing, moving = self._left(z)
+        missing, moving = self._remaining(z)
         missing, moving = missing / self._size, moving * self._weights[self._rest.model.nu :]
         return float(missing @ missing) + float(moving @ moving)
 
@@ -227,35 +227,36 @@ class _Search:
         self._low, self._high = low, high
         self._modes[:] = 0
         z = rest.neutral.copy()
-        score = self._score(z) if (np.abs(self._left(z)[1]) < _REST).all() else np.inf
+        score = self._score(z) if (np.abs(self._remaining(z)[1]) < _REST).all() else np.inf
         first = True
         for _ in range(_STEPS):
             linear = rest.linear(z)
             aim = self._aim(z, linear, rest.neutral if first else z)
             if aim is None:  # some activations cannot be at rest within their ranges
-                if not self._leave(z, linear):
+                if not self._give_up_rest(z, linear):
                     break
                 score = np.inf
                 continue
             first = False
             last_score, shorter = score, False
-            for share in 0.5 ** np.arange(_HALVES):
+            for fraction in 0.5 ** np.arange(_HALVES):
                 resting = np.flatnonzero((self._modes == 0) & ~self._idle)
-                trial = rest.rested(np.clip(z + share * (aim - z), low, high), resting).clip(low, high)
+                trial = rest.rested(np.clip(z + fraction * (aim - z), low, high), resting).clip(low, high)
                 if (trial_score := self._score(trial)) < score:
-                    z, score, shorter = trial, trial_score, share < 1
+                    z, score, shorter = trial, trial_score, fraction < 1
                     break
-            if score <= _EXACT**2 or (score > _PROGRESS * last_score and not shorter and not self._turn(z[model.nu :])):
+            stuck = score > _PROGRESS * last_score and not shorter
+            if score <= _EXACT**2 or (stuck and not self._fix_at_ends(z[model.nu :])):
                 break
         z = np.clip(np.where(np.abs(z) * self._weights < _EXACT, 0.0, z), low, high)  # rounding
-        missing, moving = self._left(z)
+        missing, moving = self._remaining(z)
         missed, drifting = np.zeros(model.nv), np.zeros(model.nactuator, dtype=bool)
-        missed[self._kept] = missing
+        missed[self._free_dofs] = missing
         drifting[rest.of[model.nu :][np.abs(moving) > _HELD * np.maximum(1.0, np.abs(z[model.nu :]))]] = True
         held = bool((np.abs(missing) <= _HELD * rest.largest).all()) and not drifting.any()
         return Holding(z[: model.nu], z[model.nu :], missed, drifting, held)
 
-    def _turn(self, act: Array) -> bool:
+    def _fix_at_ends(self, act: Array) -> bool:
         """Let activations that are at the ends of their ranges (na,) stay there; whether there are any."""
         nu = self._rest.model.nu
         lower, upper = (np.isclose(act, side[nu:], rtol=_END, atol=_END) for side in (self._low, self._high))
@@ -284,8 +285,8 @@ class _Search:
         beyond = (required > joint_range[1]).astype(float) - (required < joint_range[0])
         price = np.concatenate([np.ones(len(self._limited)), np.where(beyond != 0, _LIGHT / _HEAVY, 1.0)])
         price *= _HEAVY / self._size
-        rows = self._carried @ joints / self._size, self._sparing[:, None] * change, price[:, None] * cut
-        aims = [self._carried @ (rest.wanted - now) / self._size, self._sparing * (neutral - z), np.zeros(len(cut))]
+        rows = self._to_free @ joints / self._size, self._sparing[:, None] * change, price[:, None] * cut
+        aims = [self._to_free @ (rest.wanted - now) / self._size, self._sparing * (neutral - z), np.zeros(len(cut))]
         rates, rates_now = linear.rates_by @ change / self._steepness[:, None], linear.rates / self._steepness
         follows, at_end = (self._modes == 0) & ~self._idle, np.isin(self._modes, (-1, 1))
         stays = at_end | self._idle
@@ -309,7 +310,7 @@ class _Search:
         solution = _least_squares(np.concatenate(rows), np.concatenate(aims), (met, met_at), sides)
         return None if solution is None else z + solution[:count]
 
-    def _leave(self, z: Array, linear: _Linear) -> bool:
+    def _give_up_rest(self, z: Array, linear: _Linear) -> bool:
         """Let activations that cannot be at rest within their ranges go to the ends, or drift; whether there are any.
 
         Of an actuator's activations as few as may be, the last first, which follow the others.
@@ -321,7 +322,7 @@ class _Search:
             acts = acts[(self._modes[acts] == 0) & ~self._idle[acts]]
             now = linear.rates[acts] / self._steepness[acts]
             rates = linear.rates_by[np.ix_(acts, entries)] / self._steepness[acts, None]
-            remaining, left_out = _unmet(rates, now, (self._low - z)[entries], (self._high - z)[entries])
+            remaining, left_out = _left_nonzero(rates, now, (self._low - z)[entries], (self._high - z)[entries])
             end = np.where(remaining > 0, self._high[nu + acts], self._low[nu + acts])
             modes = np.where(np.isfinite(end), np.where(remaining > 0, 1, -1), _DRIFTS)
             self._modes[acts[left_out]] = modes[left_out]
@@ -329,7 +330,7 @@ class _Search:
         return any_left
 
 
-def _unmet(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _left_nonzero(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Of the rates now + rates x of an actuator, with low <= x <= high: what they are, and which are left nonzero.
 
     Those are as few as may be, of several the last.
@@ -403,7 +404,7 @@ def _least_squares(
     for distance in farthest * _SCALES if farthest > 0 else ():
         matrix = np.concatenate([bound.T, least[None] / distance])
         residual = matrix @ nnls(matrix, aim)[0] - aim
-        if -residual[-1] > _NEAR:
+        if -residual[-1] > _WELL_SCALED:
             nearest = nearest - distance * residual[:-1] / residual[-1]
             break
     else:
@@ -465,10 +466,10 @@ def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
             for change in _SMALL * np.eye(len(free))
         ]
         step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), forces, rcond=1e-6)[0]
-        for share in 0.5 ** np.arange(_HALVES):
-            trial, trial_forces = missing(displacement + share * step)
+        for fraction in 0.5 ** np.arange(_HALVES):
+            trial, trial_forces = missing(displacement + fraction * step)
             if np.linalg.norm(trial_forces) < np.linalg.norm(forces):
-                displacement, positions, forces = displacement + share * step, trial, trial_forces
+                displacement, positions, forces = displacement + fraction * step, trial, trial_forces
                 break
         else:
             break
@@ -521,7 +522,9 @@ def _let_down(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_])
     return lowered
 
 
-def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], Array]:
+def _free_joints(
+    model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]
+) -> tuple[npt.NDArray[np.intp], Array]:
     """The free joints, and the map from forces on all joints to those on them, (free, nv), through equalities.
 
     In a loop those follow that are not driven, as far as there are enough of them.

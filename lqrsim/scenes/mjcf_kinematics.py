@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from lqrsim.scenes.mjcf_model import MjcfModel
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
-_TYPED = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding
+_MET_AS_GIVEN = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding
 _RANK = 1e-9  # relative size of singular values that count as zero
 _STRIDE = 0.05  # m or rad, of joints that others follow
 
@@ -101,7 +101,7 @@ class Equalities:
                     break
             else:
                 return None
-        return positions if np.abs(residual).max(initial=0.0) < _TYPED else None
+        return positions if np.abs(residual).max(initial=0.0) < _MET_AS_GIVEN else None
 
     def closed(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Positions (nq,) and velocities (nv,) near those given at which they are met; None if none were found."""

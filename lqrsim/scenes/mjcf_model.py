@@ -65,12 +65,12 @@ class Joint:
         """The first of its indices in qvel; a slide or hinge has only this index."""
         return self.dofs.start
 
-    def past_limits(self, position: float, share: float) -> str | None:
-        """What a message says of a position past the joint's limits by more than a share of its range; else None."""
+    def past_limits(self, position: float, fraction: float) -> str | None:
+        """What a message says of a position past the joint's limits by more than a fraction of its range; else None."""
         if self.limits is None:
             return None
         least, most = self.limits
-        if least - share * (most - least) <= position <= most + share * (most - least):
+        if least - fraction * (most - least) <= position <= most + fraction * (most - least):
             return None
         unit, more = "m", ""
         if self.kind == "hinge":
@@ -566,18 +566,18 @@ def ranges(limited: npt.NDArray[np.bool_], sides: Array) -> tuple[Array, Array]:
     return low, high
 
 
-def _unit(one: Actuator, joints: Mapping[str, Joint], what: str) -> str:
+def _unit(actuator: Actuator, joints: Mapping[str, Joint], entry: str) -> str:
     """The unit of an actuator's input, for plain motors and servos of joints; empty for others, which have none."""
-    joint = joints.get(one.joint or "")
-    if joint is None or joint.kind not in ("slide", "hinge") or one.gear != 1:
+    joint = joints.get(actuator.joint or "")
+    if joint is None or joint.kind not in ("slide", "hinge") or actuator.gear != 1:
         return ""
     force, length = ("N", "m") if joint.kind == "slide" else ("N m", "rad")
-    if what or one.gain is None or one.bias is None or any(one.gain[1:]):
+    if entry or actuator.gain is None or actuator.bias is None or any(actuator.gain[1:]):
         units = {"pos": length, "vel": f"{length}/s", "ff": force, "voltage": "V"}
-        return units.get(what, "")
-    (gain, _, _), (constant, stiffness, damping) = one.gain, one.bias
-    if not any(one.bias):
-        return force if gain == 1 and one.activations.start == one.activations.stop else ""
+        return units.get(entry, "")
+    (gain, _, _), (constant, stiffness, damping) = actuator.gain, actuator.bias
+    if not any(actuator.bias):
+        return force if gain == 1 and actuator.activations.start == actuator.activations.stop else ""
     if gain == -stiffness and constant == 0:
         return length
     return f"{length}/s" if stiffness == 0 and gain == -damping else ""

@@ -16,7 +16,7 @@ _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE
 
 Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geom
 
-_NEAR = 1e-3  # m; a geom nearer to another touches it
+_TOUCHING = 1e-3  # m; a geom nearer to another touches it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 _LOWERED, _CARRIES = 1e-3, 0.7  # m; a geom carries another if lowering it by this widens the gap by this share or more
 TOLERANCE = 0.25  # largest part of a capsule outside its balls, relative to its radius
@@ -217,13 +217,13 @@ def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDAr
     """Flags (K,) of the pairs whose geoms touch or overlap."""
     touching, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
     apart = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1) - sizes.sum(axis=1)
-    for k in np.flatnonzero((apart < _NEAR) | (sizes == 0).any(axis=1)):  # planes have no size
+    for k in np.flatnonzero((apart < _TOUCHING) | (sizes == 0).any(axis=1)):  # planes have no size
         touching[k] = _close(model, data, pairs[k])
     return touching
 
 
 def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
-    return mujoco.mj_geomDistance(model, data, *pair.tolist(), 2 * _NEAR, None) < _NEAR
+    return mujoco.mj_geomDistance(model, data, *pair.tolist(), 2 * _TOUCHING, None) < _TOUCHING
 
 
 def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) -> npt.NDArray[np.bool_]:
@@ -274,7 +274,7 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
     floating, moving = _carried_by(model, pairs, _FREE), _carried_by(model, pairs, _FREE, _SLIDE)
     if not moving.any():
         return set()
-    supports, reach = set[int](), _NEAR + 2 * _LOWERED
+    supports, reach = set[int](), _TOUCHING + 2 * _LOWERED
     for k, data in enumerate(posed(model, [model.qpos0, *model.key_qpos])):
         candidates = pairs[floating if k else moving]
         for geom, support in candidates[_touch(model, data, candidates)].tolist():

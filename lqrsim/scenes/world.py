@@ -273,25 +273,25 @@ def _parallel(obstacle: Obstacle, across: int) -> bool:
     return obstacle.kind == "plane" and bool(abs(abs(obstacle.rotation[across, 2]) - 1) < 1e-9)
 
 
-def _prism(one: Obstacle) -> Obstacle:
+def _prism(obstacle: Obstacle) -> Obstacle:
     """An obstacle of a plane as an infinite prism. Raises InputError if its outline depends on the height."""
-    axis = np.abs(one.rotation[2])  # how much of each local axis is along the normal of the plane
-    up, high, size = int(axis.argmax()), abs(one.position[2]), one.size.copy()
-    size[up] = np.inf
-    match one.kind:
+    axis = np.abs(obstacle.rotation[2])  # how much of each local axis is along the normal of the plane
+    up, high, size = int(axis.argmax()), abs(obstacle.position[2]), obstacle.size.copy()
+    size[up], cylinder_size = np.inf, np.array([obstacle.size[0], np.inf, 0.0])
+    match obstacle.kind:
         case "plane" if axis[2] < 1e-9:
-            return one
+            return obstacle
         case "sphere" if not high:
-            return replace(one, kind="cylinder", rotation=np.eye(3), size=np.array([one.size[0], np.inf, 0.0]))
-        case "capsule" | "cylinder" if axis[2] > 1 - 1e-9 and high <= one.size[1]:
-            return replace(one, kind="cylinder", size=np.array([one.size[0], np.inf, 0.0]))
-        case "box" if axis[up] > 1 - 1e-9 and high <= one.size[up] and np.isfinite(np.delete(size, up)).all():
-            return replace(one, size=size)
-        case "mesh" if axis[2] > 1 - 1e-9 and one.size[2] == np.inf:
-            return one
+            return replace(obstacle, kind="cylinder", rotation=np.eye(3), size=cylinder_size)
+        case "capsule" | "cylinder" if axis[2] > 1 - 1e-9 and high <= obstacle.size[1]:
+            return replace(obstacle, kind="cylinder", size=cylinder_size)
+        case "box" if axis[up] > 1 - 1e-9 and high <= obstacle.size[up] and np.isfinite(np.delete(size, up)).all():
+            return replace(obstacle, size=size)
+        case "mesh" if axis[2] > 1 - 1e-9 and obstacle.size[2] == np.inf:
+            return obstacle
     raise InputError(
-        f"obstacle {one.name!r}: got a {one.kind} across the plane of hulls=, want it upright on the plane, and of"
-        " finite width; or balls without hulls"
+        f"obstacle {obstacle.name!r}: got a {obstacle.kind} across the plane of hulls=, want it upright on the plane,"
+        " and of finite width; or balls without hulls"
     )
 
 

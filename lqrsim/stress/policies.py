@@ -92,7 +92,7 @@ def solve(
     "smooth".
 
     Args:
-      given: a solution from `solutions.given`, in place of the result of its solver.
+      given: a solution from `solutions.check_solution`, in place of the result of its solver.
       remark: whether to warn of plans that have not converged, or are of another problem.
     """
     check_used(given, policies)

@@ -128,7 +128,7 @@ class Setup:
     @cached_property
     def given(self) -> Solution | None:
         """The solution that was given instead of solving, or None. Raises InputError if the solution does not fit."""
-        return None if self.solution is None else solutions.given(self.resolved, self.solution)
+        return None if self.solution is None else solutions.check_solution(self.resolved, self.solution)
 
     @cached_property
     def goal_options(self) -> dict[str, Any]:
