@@ -39,7 +39,7 @@ from lqrsim.rotations import AXES
 from lqrsim.scenes.mjcf_holding import Holding, at_rest, efforts, falling, holding
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
-from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
+from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, solid_geoms
 from lqrsim.scenes.mjcf_text import listed
 from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
 from lqrsim.scenes.world import World
@@ -165,9 +165,8 @@ class MjcfRobot(Robot):
         )  # fmt: skip
         reach = reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
-        outline_balls = outline_of(model)
-        many = not dofs and len(outline_balls.radii) > 0 if outline is None else outline
-        self.balls = MjcfBalls(outline_balls) if many else None
+        many = not dofs and len(solid_geoms(model)) > 0 if outline is None else outline
+        self.balls = MjcfBalls(model) if many else None
 
     @cached_property
     def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +13,7 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, vectors_of
 from lqrsim.kernels import differences, mjcf_distances
+from lqrsim.outlines import Capsule
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances, ShapeInWorld
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
@@ -20,7 +22,6 @@ from lqrsim.problem.residual import Residual
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes import mjcf_obstacles
 from lqrsim.scenes.mjcf_model import MjcfModel
-from lqrsim.scenes.mjcf_obstacles import Outline
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import World
 
@@ -28,6 +29,7 @@ MOST_ROWS = 128  # largest number of distances per step; beyond it, one per body
 # Distance beyond the margin from which on links have slopes, relative to the largest geom's bounding sphere. Links that
 # are two joints apart are always within twice its radius, the reach of a Clearance; all these slopes take time.
 SEEN = 0.25
+TOLERANCE = 0.25  # largest part of a capsule outside its balls, relative to its radius
 TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
 _UNBOUNDED = 1e6  # m, a distance beyond all obstacles
 
@@ -266,11 +268,32 @@ def _module(states: int) -> Any:
 
 
 class MjcfBalls(CollisionSpheres):
-    """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them."""
+    """Balls that are fixed to bodies of an MJCF and cover its colliding geoms; `MjcfRobot` makes them.
 
-    def __init__(self, outline: Outline) -> None:
-        self.outline, self.level = outline, "compiled"
-        self._set_balls(outline.radii, outline.names, outline.sites)
+    A sphere is a ball, a capsule a chain of balls, and for any other geom a ball about its centre contains it. The last
+    ball is in the centre of a geom. Geoms that are only drawn count if nothing collides.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.level, points, radii = "compiled", list[Array](), list[float]()
+        names, sites = list[str](), list[str | None]()
+        for geom in mjcf_obstacles.solid_geoms(model).tolist():
+            middle, name, radius = model.geom_pos[geom], model.geom(geom).name, float(model.geom_rbound[geom])
+            centres = [middle]
+            if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
+                radius, half = (float(number) for number in model.geom_size[geom, :2])
+                axis = np.zeros(3)
+                mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, half]), model.geom_quat[geom])
+                capsule = Capsule(2 * half, radius, TOLERANCE * radius)
+                chain = np.array(capsule.between(tuple(middle - axis), tuple(middle + axis)))
+                centres = [*(centre for centre in chain if np.linalg.norm(centre - middle) > 1e-9), middle]
+            for number, centre in enumerate(centres, start=1 - len(centres)):
+                points.append(np.array([model.geom_bodyid[geom], *centre], dtype=np.float64))
+                radii.append(radius)
+                names.append(f"{name} ({-number} before)" if number else name)
+                sites.append(None if number else name)
+        self._points = np.array(points)  # of each ball the number of its body and its place in the body's axes
+        self._set_balls(radii, names, sites)
 
     @property
     def name(self) -> str:
@@ -281,6 +304,6 @@ class MjcfBalls(CollisionSpheres):
             raise InputError(f"balls: got an MJCF's balls for {dynamics.name}, want its own dynamics, robot.dynamics")
         memory = MjcfMemory.of(mjcf_dynamics)
         positions = tuple(range(mjcf_dynamics.physics.model.nv))
-        data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
+        data = np.concatenate([[len(self)], self._points.ravel()])
         source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_distances))
         return SphereCenters(source, data, positions, functions=(memory,))

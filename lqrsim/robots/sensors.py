@@ -1,6 +1,7 @@
 """Sensors of a robot's MJCF, with their errors and their timing."""
 
 import copy
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -76,31 +77,21 @@ class RobotSensors:
         stated = check_items("sensors", sensors, Sensor, "a list of Sensor")
         if not stated or len({sensor.name for sensor in stated}) < len(stated):
             raise InputError(f"sensors: got {[sensor.name for sensor in stated]}, want at least one, each at most once")
-        self._robot, self._scene = robot, scene
-        self.drag = robot.drag
-        model, sensors, places, rangefinders = scene.model, list[Sensor](), list[npt.NDArray[np.intp]](), list[Array]()
-        columns, names, quaternions, count = list[slice](), list[str](), list[bool](), 0
-        for sensor in stated:
-            number = _number_of(model, sensor.name)
-            kind, size = _TYPES(model.sensor_type[number]), int(model.sensor_dim[number])
-            interval = float(model.sensor_interval[number, 0])  # 0 for each physics step
-            sensors.append(
-                replace(
-                    sensor,
-                    noise=float(model.sensor_noise[number]) if sensor.noise is None else sensor.noise,
-                    rate=1 / interval if sensor.rate is None and interval else sensor.rate,
-                    delay=float(model.sensor_delay[number]) if sensor.delay is None else sensor.delay,
-                )
-            )
-            columns.append(slice(count, count + size))
-            names += [f"{sensor.name}[{i}]" for i in range(size)] if size > 1 else [sensor.name]
-            quaternions.append(kind in _QUATERNIONS)
-            places.append(int(model.sensor_adr[number]) + np.arange(size))
-            rangefinders.append(np.full(size, kind == _TYPES.mjSENS_RANGEFINDER))
-            count += size
-        self.sensors, self.columns, self.names = tuple(sensors), tuple(columns), tuple(names)
-        self.quaternions = tuple(quaternions)
-        self._places, self._rangefinders = np.concatenate(places), np.concatenate(rangefinders)
+        self._robot, self._scene, self.drag, model = robot, scene, robot.drag, scene.model
+        numbers = [_number_of(model, sensor.name) for sensor in stated]
+        kinds = [_TYPES(model.sensor_type[number]) for number in numbers]
+        self.quaternions = tuple(kind in _QUATERNIONS for kind in kinds)
+        self._sizes = model.sensor_dim[numbers].tolist()
+        ends = itertools.pairwise(np.cumsum([0, *self._sizes]).tolist())
+        self.columns = tuple(slice(first, end) for first, end in ends)
+        places = zip(model.sensor_adr[numbers].tolist(), self._sizes, strict=True)
+        self._places = np.concatenate([first + np.arange(size) for first, size in places])
+        self._rangefinders = np.repeat([kind == _TYPES.mjSENS_RANGEFINDER for kind in kinds], self._sizes)
+        pairs = zip(stated, self._sizes, strict=True)
+        self.names = tuple(
+            f"{sensor.name}[{i}]" if size > 1 else sensor.name for sensor, size in pairs for i in range(size)
+        )
+        self.sensors = tuple(_completed(sensor, model, k) for sensor, k in zip(stated, numbers, strict=True))
 
     def __repr__(self) -> str:
         return f"RobotSensors({', '.join(sensor.name for sensor in self.sensors)})"
@@ -118,8 +109,7 @@ class RobotSensors:
 
     def each(self, field: str) -> Array:
         """A field of the sensors, for each number of the readings, (Y,)."""
-        sizes = [columns.stop - columns.start for columns in self.columns]
-        return np.repeat([float(getattr(sensor, field)) for sensor in self.sensors], sizes)
+        return np.repeat([float(getattr(sensor, field)) for sensor in self.sensors], self._sizes)
 
     def due(self, knot: int, dt: float) -> npt.NDArray[np.bool_]:
         """Whether each sensor is read at a knot, for a control period of dt seconds."""
@@ -161,6 +151,17 @@ class RobotSensors:
             return self.readings(sensordata)
 
         return read
+
+
+def _completed(sensor: Sensor, model: mujoco.MjModel, number: int) -> Sensor:
+    """The sensor with the file's numbers where none are stated."""
+    interval = float(model.sensor_interval[number, 0])  # 0 for each physics step
+    return replace(
+        sensor,
+        noise=float(model.sensor_noise[number]) if sensor.noise is None else sensor.noise,
+        rate=1 / interval if sensor.rate is None and interval else sensor.rate,
+        delay=float(model.sensor_delay[number]) if sensor.delay is None else sensor.delay,
+    )
 
 
 def _number_of(model: mujoco.MjModel, name: str) -> int:

@@ -1,7 +1,6 @@
 """The obstacles of a robot that consists of all moving bodies of an MJCF, and its geoms that can touch them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -9,7 +8,6 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Finite, checked
 from lqrsim.errors import Array
-from lqrsim.outlines import Capsule
 from lqrsim.scenes.mjcf_kinematics import placed, posed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -19,7 +17,6 @@ Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geo
 _TOUCHING = 1e-3  # m; a geom nearer to another touches it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 _LOWERED, _CARRIES = 1e-3, 0.7  # m; a geom carries another if lowering it by this widens the gap by this share or more
-TOLERANCE = 0.25  # largest part of a capsule outside its balls, relative to its radius
 _POSITIONS = 64  # random positions of joints in which a geom must touch what carries it
 
 
@@ -298,46 +295,3 @@ def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
     """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
     upward = np.abs(data.xaxis[:, 2]) > 1e-9
     return any(kind == _FREE or (kind == _SLIDE and upward[joint]) for kind, joint in _joints(model, body))
-
-
-@dataclass(frozen=True, eq=False)
-class Outline:
-    """B balls.
-
-    Attributes:
-      bodies: (B,) numbers of the bodies that they are fixed to. offsets: (B, 3) positions in the axes of these bodies,
-        in metres. radii: (B,) in metres. names: names of the balls. sites: names of the geoms in whose centre they are;
-        None for other balls.
-    """
-
-    bodies: Array
-    offsets: Array
-    radii: Array
-    names: tuple[str, ...]
-    sites: tuple[str | None, ...]
-
-
-def outline_of(model: mujoco.MjModel) -> Outline:
-    """Spheres as balls, capsules as chains of balls, other geoms as a ball about their centre that contains them.
-
-    Geoms that are only drawn count if nothing collides. The last ball is in the centre of a geom.
-    """
-    rows, names, sites = list[tuple[int, Array, float]](), list[str](), list[str | None]()
-    for geom in solid_geoms(model).tolist():
-        body, middle, name = int(model.geom_bodyid[geom]), model.geom_pos[geom], model.geom(geom).name
-        radius, places = float(model.geom_rbound[geom]), [middle]
-        if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
-            radius, half = (float(number) for number in model.geom_size[geom, :2])
-            capsule = Capsule(2 * half, radius, TOLERANCE * radius)
-            axis = np.zeros(3)
-            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, half]), model.geom_quat[geom])
-            chain = np.array(capsule.between(tuple(middle - axis), tuple(middle + axis)))
-            places = [*(center for center in chain if np.linalg.norm(center - middle) > 1e-9), middle]
-        for number, place in enumerate(places, start=1 - len(places)):
-            rows.append((body, np.asarray(place, dtype=np.float64), radius))
-            names.append(f"{name} ({-number} before)" if number else name)
-            sites.append(None if number else name)
-    return Outline(
-        bodies=np.array([body for body, _, _ in rows]), offsets=np.array([place for _, place, _ in rows]),
-        radii=np.array([radius for _, _, radius in rows]), names=tuple(names), sites=tuple(sites),
-    )  # fmt: skip
