@@ -248,10 +248,9 @@ class Problem(OneVersion):
         if not after:
             return other
         segments = tuple(knot - after for knot in self.segments if knot > after)
-        left, begin = tuple(constraint.ahead(after) for constraint in self.constraints), self.begin + after * self.dt
-        stage = self.stage_cost.ahead(after)
-        left_over = {"constraints": left, "stage_cost": stage, "segments": segments}
-        return other._with(steps=self.steps - after, begin=begin, **left_over)._bound_anew()
+        constraints, stage_cost = tuple(part.ahead(after) for part in self.constraints), self.stage_cost.ahead(after)
+        rest = {"steps": self.steps - after, "begin": self.begin + after * self.dt, "segments": segments}
+        return other._with(**rest, constraints=constraints, stage_cost=stage_cost)._bound_anew()
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
         """The problem with other costs, None for the present ones. It may begin inside an obstacle if this one does."""
@@ -522,7 +521,7 @@ class Problem(OneVersion):
         if self.control_rate is None:
             return
         others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
-        for feature, stated in (*others.items(), ("between_knots", self.between_knots or None)):
+        for feature, stated in (others | {"between_knots": self.between_knots or None}).items():
             if stated is not None:
                 raise InputError(f"control_rate: got {self.control_rate!r} with {feature}, want one of the two")
         keep(self, control_rate=self.control_rate._in(self.dynamics))

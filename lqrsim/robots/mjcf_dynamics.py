@@ -70,7 +70,7 @@ class MjcfPhysics:
 
     Attributes:
       model: MuJoCo's model. numbers: the numbers for the kernel, without a wrench and loads. team: the words that its
-        threads share. carriers: those of the MJCF.
+        threads share.
     """
 
     def __init__(
@@ -95,7 +95,6 @@ class MjcfPhysics:
         self.model.jnt_actfrclimited[list(unlimited[1])] = 0
         if softness > 0:
             _soften(self.model, softness)
-        self.carriers = mjcf.carriers
         # With loads, each slot has its own model, which may be large; filters need one slot.
         slots = 2 if loaded else 2 * processors()
         self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
@@ -112,7 +111,7 @@ class MjcfPhysics:
         self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
         addresses = [self._addresses(data, model, body) for data, model in zip(self._data, self._models, strict=True)]
         self._table = np.array(addresses, dtype=np.float64)
-        self.numbers = self._numbers(self.carriers if loaded else (), mjcf.turns_about)
+        self.numbers = self._numbers(mjcf.carriers if loaded else (), mjcf.turns_about)
 
     def address(self) -> int:
         """The address of the numbers, for kernels of places and distances.
@@ -290,7 +289,7 @@ class MjcfDynamics(Dynamics):
     @property
     def places(self) -> dict[str, int]:
         loads = int(self.physics.numbers[kernel.LOADS])
-        where = [*range(kernel.WRENCH, kernel.WRENCH + len(WRENCH)), *range(loads, loads + len(self.physics.carriers))]
+        where = [*range(kernel.WRENCH, kernel.WRENCH + len(WRENCH)), *range(loads, loads + len(self.mjcf.carriers))]
         return {name: where[i] for i, name in enumerate(self.parameters)}
 
     @property

@@ -275,8 +275,7 @@ class MjcfBalls(CollisionSpheres):
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.level, points, radii = "compiled", list[Array](), list[float]()
-        names, sites = list[str](), list[str | None]()
+        points, radii, names, sites = list[Array](), list[float](), list[str](), list[str | None]()
         for geom in mjcf_obstacles.solid_geoms(model).tolist():
             middle, name, radius = model.geom_pos[geom], model.geom(geom).name, float(model.geom_rbound[geom])
             centres = [middle]
@@ -294,10 +293,6 @@ class MjcfBalls(CollisionSpheres):
                 sites.append(None if number else name)
         self._points = np.array(points)  # of each ball the number of its body and its place in the body's axes
         self._set_balls(radii, names, sites)
-
-    @property
-    def name(self) -> str:
-        return "MuJoCo's kinematics"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
         if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):

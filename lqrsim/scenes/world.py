@@ -55,20 +55,18 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         check_text("obstacle: name", self.name, "a name", at_most=1000)
-        check_name(f"obstacle {self.name!r}: kind", self.kind, (*KINDS, *OTHER_KINDS))
-        keep(self, position=check_array(f"obstacle {self.name!r}: position", self.position, (3,)))
-        rotation = check_array(f"obstacle {self.name!r}: rotation", self.rotation, (3, 3))
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
-            raise InputError(f"obstacle {self.name!r}: rotation: got {rotation.tolist()}, want orthonormal axes")
-        keep(self, rotation=rotation)
-        size = check_array(f"obstacle {self.name!r}: size", self.size, (3,), infinite=True)
+        who = f"obstacle {self.name!r}"
+        check_name(f"{who}: kind", self.kind, (*KINDS, *OTHER_KINDS))
+        shapes = {"position": (3,), "rotation": (3, 3), "size": (3,), "velocity": (3,), "corners": (None, 3)}
+        for name, shape in shapes.items():
+            keep(self, **{name: check_array(f"{who}: {name}", getattr(self, name), shape, infinite=name == "size")})
+        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6):
+            raise InputError(f"{who}: rotation: got {self.rotation.tolist()}, want orthonormal axes")
         used = {"plane": 0, "sphere": 1, "capsule": 2, "cylinder": 2}.get(self.kind, 3)
-        if (size[:used] <= 0).any():
-            raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
-        keep(self, size=size, velocity=check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
-        keep(self, corners=check_array(f"obstacle {self.name!r}: corners", self.corners, (None, 3)))
+        if (self.size[:used] <= 0).any():
+            raise InputError(f"{who}: size: got {self.size[:used].tolist()}, want lengths above 0")
         if len(self.corners) and self.kind != "mesh":
-            raise InputError(f"obstacle {self.name!r}: corners: got {len(self.corners)}, want none for a {self.kind}")
+            raise InputError(f"{who}: corners: got {len(self.corners)}, want none for a {self.kind}")
 
     @classmethod
     def of_corners(cls, name: str, corners: npt.ArrayLike, *, velocity: npt.ArrayLike = (0.0, 0.0, 0.0)) -> "Obstacle":
