@@ -127,7 +127,7 @@ def with_last_command(problem: Problem) -> Problem:
     initial = problem.initial
     if isinstance(initial, FixedState):
         initial = FixedState(np.pad(initial.numbers, (0, m)))
-        begun = QuadraticCost(np.zeros(len(initial.numbers)), about=initial.numbers)
+        begun = initial._cost
     else:
         # A weight, which costs nothing: a cost-to-come needs one of each state.
         weight = np.diag(np.pad(np.ones(m), (len(dynamics.state_coordinates), 0)))

@@ -87,6 +87,11 @@ class FixedState:
             raise InputError("FixedState: got numbers by name, want the state from a Problem: problem.initial")
         return np.asarray(self.state)
 
+    @property
+    def _cost(self) -> QuadraticCost:
+        """A zero cost, with which fixed and soft starts share compiled code."""
+        return QuadraticCost(np.zeros(len(self.numbers)), about=self.numbers)
+
     def _in(self, dynamics: Dynamics) -> "FixedState":
         """The state with numbers by name in the order of a system. Raises InputError if it does not fit."""
         space = dynamics.state_coordinates
@@ -171,14 +176,9 @@ class Problem(OneVersion):
         for name in ("stage_cost", "final_cost", "initial"):
             part, fixed = getattr(self, name), name == "initial" and isinstance(self.initial, FixedState)
             keep(self, **{name: part._in(self.dynamics) if fixed else in_system(part, self.dynamics, name)})
-        costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
-        if isinstance(self.initial, FixedState):
-            # A zero cost, with which fixed and soft starts share compiled code.
-            state = self.initial.numbers
-            costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
-        else:
-            costs["initial"] = terms_of(self.initial, "initial")
-        bound = {name: self._bound(terms) for name, terms in costs.items()}
+        initial = self.initial._cost if isinstance(self.initial, FixedState) else self.initial
+        costs = {"stage_cost": self.stage_cost, "final_cost": self.final_cost, "initial": initial}
+        bound = {name: self._bound(terms_of(cost)) for name, cost in costs.items()}
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
@@ -237,7 +237,7 @@ class Problem(OneVersion):
         if isinstance(self.initial, FixedState):  # four times as fast as a new cost
             term = about_state(self._terms["initial"][0], here)
         else:
-            term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
+            term = start._cost.bind(self.dynamics)
         rate = self.control_rate
         if rate is None and previous is not None:
             raise InputError("previous: got a command for a problem without control_rate, want None")

@@ -35,8 +35,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes.mjcf_kinematics import axes_of
-
-_AXES = "xyz"
+from lqrsim.scenes.world import SPACE
 
 
 class _Pose:
@@ -61,11 +60,6 @@ class _Pose:
         turned = f" turned to {brief(self.orientation)}" if self.orientation is not None else ""
         return f"{self.site!r}{placed}{turned}"
 
-    @property
-    def rows(self) -> list[str]:
-        placed = [f"{self.site} at its {axis}" for axis in _AXES] if self.position is not None else []
-        return placed + ([f"{self.site} turned about {axis}" for axis in _AXES] if self.axes is not None else [])
-
     def bind(self, dynamics: Dynamics) -> Residual:
         """The errors, for a system. Raises InputError."""
         if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
@@ -73,12 +67,14 @@ class _Pose:
         model = mjcf_dynamics.physics.model
         names = [model.site(number).name for number in range(model.nsite)]
         number = names.index(check_name(f"{self.what}: site", self.site, [name for name in names if name]))
+        rows = [f"{self.site} at its {axis}" for axis in SPACE if self.position is not None]
+        rows += [f"{self.site} turned about {axis}" for axis in SPACE if self.axes is not None]
         position = np.zeros(3) if self.position is None else self.position
         wanted = np.eye(3) if self.axes is None else self.axes
         source = source_of(__name__, PLACED=int(self.position is not None), TURNED=int(self.axes is not None))
         axes = axes_of(model.site_quat[number]).ravel()
         data = np.concatenate([[model.site_bodyid[number]], model.site_pos[number], axes, position, wanted.ravel()])
-        return Residual(source, data, tuple(self.rows), model.nv, functions=(MjcfMemory.of(mjcf_dynamics),))
+        return Residual(source, data, tuple(rows), model.nv, functions=(MjcfMemory.of(mjcf_dynamics),))
 
 
 class SiteCost(Cost):
