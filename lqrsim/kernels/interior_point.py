@@ -33,7 +33,7 @@ from lqrsim.kernels.active_set import (
     prepare_step,
 )
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
-from lqrsim.kernels.linear_algebra import copy, copy_matrix
+from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
@@ -66,7 +66,7 @@ BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may ta
 LEVELS = 4  # largest number of reductions of the barrier parameter at once
 NEARLY = 10.0  # residuals of a barrier problem that is nearly solved, relative to the parameter
 # Factor by which the parameter then falls at least, and power of the parameter, if that is less.
-LOWER, POWER = 0.2, 1.5
+FALL, POWER = 0.2, 1.5
 HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
 LEAST = 0.1  # least barrier parameter, relative to the tolerance
 HALF = 0.5  # the same where there is no crossover: of all rows together
@@ -99,6 +99,10 @@ BARELY = 1e-3  # least first excess, relative to the least first slack
 WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
 CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
 NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its row's size and relative to the cost
+
+# The two slacks of a row, which belong to its multiplier's lower and upper bound, and their signs in `d = s - p`.
+LOWER, UPPER = 0, 1
+SIGNS = (1.0, -1.0)
 
 # Tasks of `interior_point`: to find typical sizes at a plan; to choose slacks and multipliers there; to take steps
 # without a barrier from there; to iterate; and to cross over, because no iteration follows.
@@ -157,17 +161,18 @@ def begin(begun, stages, work, mem):
     mem.pairs, mem.elastic = 0.0, 0.0
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
-            if has_slack(at, rows):
-                mem.pairs += 1
-            if has_excess(at, rows):
-                mem.pairs += 1
+            for side in range(2):
+                if has_slack(at, side, rows):
+                    mem.pairs += 1
+            if rows.prices[at] < inf:
                 mem.elastic = 1.0
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
     mem.highest, mem.part, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
     mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, inf, 0.0, begun.oldest
+    clear(now.slacks, rows.size * (steps + 1), 2)
     for at in range(rows.size * (steps + 1)):
-        now.slacks.slack[at], now.slacks.excess[at], rows.force[at] = 0.0, 0.0, 0.0
+        rows.force[at] = 0.0
         if rows.live[at] != 0:
             begin_row(at, begun, stages, work, mem)
     adjoint(stages, work.costates, work.other.changes.controls)
@@ -190,28 +195,23 @@ def begin_row(at, begun, stages, work, mem):
     if force > 0 and not equality:
         least = min(least, mem.parameter / force)
     slack = 0.0
-    if has_slack(at, rows):
+    if has_slack(at, LOWER, rows):
         slack = max(number, 0.0) + least if equality else max(number, least)
         middle = mem.parameter / slack
         if begun.informed and not equality:
             force = min(max(force, middle / AROUND), AROUND * middle)
         elif not begun.informed:
             force = 0.0 if equality else middle
-        work.now.slacks.slack[at] = slack
-    if has_excess(at, rows):
-        work.now.slacks.excess[at] = max(slack - number, BARELY * least)
+        work.now.slacks[at, LOWER] = slack
+    if has_slack(at, UPPER, rows):
+        work.now.slacks[at, UPPER] = max(slack - number, BARELY * least)
     far = WITHIN * price if price < inf else inf
     rows.force[at] = min(max(force, -far if equality else 0.0), far)
 
 
-def has_slack(at, rows):
-    """Whether a row has the slack of its lower side: all but equalities without a price."""
-    return rows.kinds[at] != EQUALITY or rows.prices[at] < inf
-
-
-def has_excess(at, rows):
-    """Whether a row has the slack of its upper side: rows with a price."""
-    return rows.prices[at] < inf
+def has_slack(at, side, rows):
+    """Whether a row has the slack of a side: rows with a price have both, other inequalities the lower one."""
+    return rows.prices[at] < inf or (side == LOWER and rows.kinds[at] != EQUALITY)
 
 
 def regularised(at, rows):
@@ -219,14 +219,11 @@ def regularised(at, rows):
     return rows.kinds[at] == EQUALITY and not rows.prices[at] < inf
 
 
-def above(at, rows):
-    """Distance of a row's multiplier from its lower bound."""
+def from_bound(at, side, rows):
+    """Distance of a row's multiplier from the bound of a side."""
+    if side == UPPER:
+        return rows.prices[at] - rows.force[at]
     return rows.force[at] + rows.prices[at] if rows.kinds[at] == EQUALITY else rows.force[at]
-
-
-def below(at, rows):
-    """Distance of a row's multiplier from its upper bound."""
-    return rows.prices[at] - rows.force[at]
 
 
 # The loop.
@@ -317,7 +314,7 @@ def iterate(done, tolerance, stages, work, mem):
     if stages.learns == 1:
         least = HALF * tolerance * mem.scale / max(mem.pairs, 1.0)
         if mem.unchanged >= FALLS and mem.parameter > least:
-            mem.parameter, mem.filtered, mem.unchanged = max(least, LOWER * LOWER * mem.parameter), 0.0, 0.0
+            mem.parameter, mem.filtered, mem.unchanged = max(least, FALL * FALL * mem.parameter), 0.0, 0.0
     lower_barrier(done, least, free, stages, work, mem)
     part = -1.0
     while True:
@@ -384,7 +381,7 @@ def lower_barrier(done, least, free, stages, work, mem):
         if residual > NEARLY * mem.parameter or mem.parameter <= least:
             break
         lower = mem.scale * (mem.parameter / mem.scale) ** POWER
-        mem.parameter, mem.filtered = max(least, min(LOWER * mem.parameter, lower)), 0.0
+        mem.parameter, mem.filtered = max(least, min(FALL * mem.parameter, lower)), 0.0
 
 
 @compact
@@ -392,11 +389,9 @@ def off_centre(stages, work, mem):
     """The largest difference of a product of slack and multiplier from the barrier parameter."""
     rows, slacks, largest = stages.rows, work.now.slacks, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            if has_slack(at, rows):
-                largest = max(largest, abs(slacks.slack[at] * above(at, rows) - mem.parameter))
-            if has_excess(at, rows):
-                largest = max(largest, abs(slacks.excess[at] * below(at, rows) - mem.parameter))
+        for side in range(2):
+            if rows.live[at] != 0 and has_slack(at, side, rows):
+                largest = max(largest, abs(slacks[at, side] * from_bound(at, side, rows) - mem.parameter))
     return largest
 
 
@@ -404,17 +399,17 @@ def off_centre(stages, work, mem):
 def models_with_barrier(stages, work, mem):
     """Give the models the barrier's curvature, and the least regularisation with which they have a minimum."""
     rows, slacks = stages.rows, work.now.slacks
+    clear(work.corrections, rows.size * (stages.steps + 1), 2)
     for at in range(rows.size * (stages.steps + 1)):
-        work.curves[at], work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0, 0.0
+        work.curves[at] = 0.0
         if rows.live[at] != 0:
             width = 0.0
             if regularised(at, rows):
                 size = rows.sizes[at]
                 width = mem.soft * SOFTNESS * size * size / mem.scale
-            else:
-                width = slacks.slack[at] / above(at, rows)
-                if has_excess(at, rows):
-                    width += slacks.excess[at] / below(at, rows)
+            for side in range(2):
+                if has_slack(at, side, rows):
+                    width += slacks[at, side] / from_bound(at, side, rows)
             work.curves[at] = 1 / width
     write_row_forces(False, work.corrections, stages, work, mem)
     rung = regularised_direction(stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
@@ -440,10 +435,9 @@ def write_row_forces(beyond, corrections, stages, work, mem):
 def residual_of(at, corrections, rows, work, mem):
     """Residual of a row in these equations: its value, minus slacks with the desired products."""
     residual = work.now.numbers[at]
-    if has_slack(at, rows):
-        residual -= (mem.parameter - corrections.slack[at]) / above(at, rows)
-    if has_excess(at, rows):
-        residual += (mem.parameter - corrections.excess[at]) / below(at, rows)
+    for side in range(2):
+        if has_slack(at, side, rows):
+            residual -= SIGNS[side] * (mem.parameter - corrections[at, side]) / from_bound(at, side, rows)
     return residual
 
 
@@ -460,10 +454,11 @@ def complete(beyond, corrections, out, stages, work, mem):
     rows, slacks = stages.rows, work.now.slacks
     copy_plan(stages.steps, stages.changes, out.changes)
     copy_matrix(stages.to_go.gradient, stages.steps + 1, N, out.costates)
+    clear(out.slacks, rows.size * (stages.steps + 1), 2)
     for t in range(stages.steps + 1):
         for row in range(rows.size):
             at = rows.size * t + row
-            out.force[at], out.slacks.slack[at], out.slacks.excess[at] = 0.0, 0.0, 0.0
+            out.force[at] = 0.0
             if rows.live[at] == 0:
                 continue
             ahead = row_change(t, row, stages) + residual_of(at, corrections, rows, work, mem)
@@ -471,12 +466,11 @@ def complete(beyond, corrections, out, stages, work, mem):
                 ahead += work.beyond[at]
             change = -work.curves[at] * ahead
             out.force[at] = change
-            if has_slack(at, rows):
-                wanted, dual, slack = mem.parameter - corrections.slack[at], above(at, rows), slacks.slack[at]
-                out.slacks.slack[at] = wanted / dual - slack - slack / dual * change
-            if has_excess(at, rows):
-                wanted, dual, excess = mem.parameter - corrections.excess[at], below(at, rows), slacks.excess[at]
-                out.slacks.excess[at] = wanted / dual - excess + excess / dual * change
+            for side in range(2):
+                if has_slack(at, side, rows):
+                    wanted, dual = mem.parameter - corrections[at, side], from_bound(at, side, rows)
+                    slack = slacks[at, side]
+                    out.slacks[at, side] = wanted / dual - slack - SIGNS[side] * slack / dual * change
 
 
 @compact
@@ -497,25 +491,21 @@ def predict(least, stages, work, mem):
     mem.parameter = 0.0
     solve(False, corrections, work.gaps, stages, work, mem)
     complete(False, corrections, step, stages, work, mem)
-    primal, dual = longest(1.0, work.now.slacks, step.slacks, stages), longest_dual(1.0, step.force, stages)
+    primal, dual = longest(1.0, slacks, step.slacks, stages), longest_dual(1.0, step.force, stages)
     average, after = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            if has_slack(at, rows):
-                distance = above(at, rows)
-                average += slacks.slack[at] * distance
-                after += (slacks.slack[at] + primal * step.slacks.slack[at]) * (distance + dual * step.force[at])
-            if has_excess(at, rows):
-                distance = below(at, rows)
-                average += slacks.excess[at] * distance
-                after += (slacks.excess[at] + primal * step.slacks.excess[at]) * (distance - dual * step.force[at])
+        for side in range(2):
+            if rows.live[at] != 0 and has_slack(at, side, rows):
+                distance, change = from_bound(at, side, rows), SIGNS[side] * step.force[at]
+                average += slacks[at, side] * distance
+                after += (slacks[at, side] + primal * step.slacks[at, side]) * (distance + dual * change)
     average, ratio = average / mem.pairs, after / average
     mem.parameter = max(least, min(HIGHER * mem.highest, ratio * ratio * ratio * average))
     mem.filtered = 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0 and primal > CENTRED:
-            corrections.slack[at] = step.slacks.slack[at] * step.force[at]
-            corrections.excess[at] = -step.slacks.excess[at] * step.force[at]
+        for side in range(2):
+            if rows.live[at] != 0 and primal > CENTRED:
+                corrections[at, side] = SIGNS[side] * step.slacks[at, side] * step.force[at]
 
 
 @compact
@@ -532,21 +522,18 @@ def centre(stages, work, mem):
         return
     ahead, dual_ahead = min(1.0, part + REACH), min(1.0, dual + REACH)
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            force = dual_ahead * step.force[at]
-            if has_slack(at, rows):
-                product = (slacks.slack[at] + ahead * step.slacks.slack[at]) * (above(at, rows) + force)
-                work.others.slack[at] = corrections.slack[at] - lacking(product, mem)
-            if has_excess(at, rows):
-                product = (slacks.excess[at] + ahead * step.slacks.excess[at]) * (below(at, rows) - force)
-                work.others.excess[at] = corrections.excess[at] - lacking(product, mem)
+        for side in range(2):
+            if rows.live[at] != 0 and has_slack(at, side, rows):
+                distance = from_bound(at, side, rows) + SIGNS[side] * dual_ahead * step.force[at]
+                product = (slacks[at, side] + ahead * step.slacks[at, side]) * distance
+                work.others[at, side] = corrections[at, side] - lacking(product, mem)
     if not solve(False, work.others, work.gaps, stages, work, mem):
         return
     complete(False, work.others, work.other, stages, work, mem)
     if longest(share, slacks, work.other.slacks, stages) >= part + FURTHER * REACH:
         count = rows.size * (stages.steps + 1)
-        copy_slacks(count, work.others, corrections)
-        copy_slacks(count, work.other.slacks, step.slacks)
+        copy_matrix(work.others, count, 2, corrections)
+        copy_matrix(work.other.slacks, count, 2, step.slacks)
         copy(work.other.force, count, step.force)
         copy_plan(stages.steps, work.other.changes, step.changes)
         copy_matrix(work.other.costates, stages.steps + 1, N, step.costates)
@@ -568,11 +555,9 @@ def longest(share, slacks, changes, stages):
     """The largest part of the changes of slacks, at most 1, by the fraction-to-the-boundary rule."""
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            if has_slack(at, rows) and changes.slack[at] < 0:
-                part = min(part, -share * slacks.slack[at] / changes.slack[at])
-            if has_excess(at, rows) and changes.excess[at] < 0:
-                part = min(part, -share * slacks.excess[at] / changes.excess[at])
+        for side in range(2):
+            if rows.live[at] != 0 and has_slack(at, side, rows) and changes[at, side] < 0:
+                part = min(part, -share * slacks[at, side] / changes[at, side])
     return part
 
 
@@ -581,12 +566,10 @@ def longest_dual(share, changes, stages):
     """The same for changes of the multipliers, and their bounds."""
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            change = changes[at]
-            if has_slack(at, rows) and change < 0:
-                part = min(part, -share * above(at, rows) / change)
-            if has_excess(at, rows) and change > 0:
-                part = min(part, share * below(at, rows) / change)
+        for side in range(2):
+            change = SIGNS[side] * changes[at]
+            if rows.live[at] != 0 and has_slack(at, side, rows) and change < 0:
+                part = min(part, -share * from_bound(at, side, rows) / change)
     return part
 
 
@@ -673,8 +656,9 @@ def close_residuals(part, stages, work, mem):
                 at = rows.size * t + row
                 if rows.live[at] != 0:
                     change = -work.curves[at] * (row_change(t, row, stages) + missed(at, tried))
-                    other.slacks.slack[at] = -slacks.slack[at] / above(at, rows) * change
-                    other.slacks.excess[at] = slacks.excess[at] / below(at, rows) * change
+                    for side in range(2):
+                        dual = from_bound(at, side, rows)
+                        other.slacks[at, side] = -SIGNS[side] * slacks[at, side] / dual * change
         far = longest(boundary(mem), tried.slacks, other.slacks, stages)
         cost = go(far, tried, stages.changes, other.slacks, work.closer, stages)
         if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:
@@ -691,11 +675,9 @@ def force_step(stages, work, mem):
 
     It is the step of the projected Hessian; or, if the filter rejects that, a small fraction of it, better or not.
     """
-    rows = stages.rows
     mem.forced += 1
     mem.share = 1.0
-    for at in range(rows.size * (stages.steps + 1)):
-        work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0
+    clear(work.corrections, stages.rows.size * (stages.steps + 1), 2)
     if mem.forced > FORCED or not solve(False, work.corrections, work.gaps, stages, work, mem):
         return -1.0
     mem.filtered = 0.0
@@ -723,7 +705,7 @@ def accept_step(part, stages, work, mem):
         if rows.live[at] != 0:
             rows.force[at] += (part if regularised(at, rows) else dual) * step.force[at]
             if is_hard(at, rows):  # its product stays within a factor of the barrier parameter
-                middle = mem.parameter / work.tried.slacks.slack[at]
+                middle = mem.parameter / work.tried.slacks[at, LOWER]
                 rows.force[at] = min(max(rows.force[at], middle / WIDE), WIDE * middle)
     for t in range(stages.steps + 1):
         for i in range(N):
@@ -756,10 +738,10 @@ def go(part, about, changes, slacks, out, stages):
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
             good = good and isfinite(out.numbers[at])
-            out.slacks.slack[at] = about.slacks.slack[at] + part * slacks.slack[at]
-            out.slacks.excess[at] = about.slacks.excess[at] + part * slacks.excess[at]
+            for side in range(2):
+                out.slacks[at, side] = about.slacks[at, side] + part * slacks[at, side]
             if is_hard(at, rows):
-                out.slacks.slack[at] = max(out.slacks.slack[at], out.numbers[at])
+                out.slacks[at, LOWER] = max(out.slacks[at, LOWER], out.numbers[at])
     return cost if good else nan
 
 
@@ -770,7 +752,7 @@ def is_hard(at, rows):
 
 def missed(at, point):
     """A row's value minus its slacks."""
-    return point.numbers[at] - (point.slacks.slack[at] - point.slacks.excess[at])
+    return point.numbers[at] - (point.slacks[at, LOWER] - point.slacks[at, UPPER])
 
 
 @compact
@@ -799,13 +781,12 @@ def merit_of(point, cost, stages, mem):
     rows, logarithms, paid = stages.rows, 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            if has_slack(at, rows):
-                logarithms += log(point.slacks.slack[at])
-            if has_excess(at, rows):
-                logarithms += log(point.slacks.excess[at])
-                both = rows.kinds[at] == EQUALITY
-                slack = point.slacks.slack[at] if both else 0.0
-                paid += rows.prices[at] * (point.slacks.excess[at] + slack)
+            for side in range(2):
+                if has_slack(at, side, rows):
+                    logarithms += log(point.slacks[at, side])
+            if rows.prices[at] < inf:
+                slack = point.slacks[at, LOWER] if rows.kinds[at] == EQUALITY else 0.0
+                paid += rows.prices[at] * (point.slacks[at, UPPER] + slack)
     return cost + paid - mem.parameter * logarithms
 
 
@@ -820,13 +801,10 @@ def slope_of_merit(stages, work, mem):
             for i in range(M):
                 slope += stages.models.gradient[t, N + i] * step.changes.controls[t, i]
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0:
-            price = rows.prices[at]
-            if has_slack(at, rows):
-                paid = price if rows.kinds[at] == EQUALITY else 0.0
-                slope += (paid - mem.parameter / slacks.slack[at]) * step.slacks.slack[at]
-            if has_excess(at, rows):
-                slope += (price - mem.parameter / slacks.excess[at]) * step.slacks.excess[at]
+        for side in range(2):
+            if rows.live[at] != 0 and has_slack(at, side, rows):
+                price = rows.prices[at] if side == UPPER or rows.kinds[at] == EQUALITY else 0.0
+                slope += (price - mem.parameter / slacks[at, side]) * step.slacks[at, side]
     return slope
 
 
@@ -849,12 +827,6 @@ def acceptable(part, point, cost, stages, work, mem):
 # Points, and the models about them.
 
 
-def copy_slacks(count, source, target):
-    """Copy the slacks of rows."""
-    copy(source.slack, count, target.slack)
-    copy(source.excess, count, target.excess)
-
-
 @compact
 def copy_point(source, target, stages):
     """Copy a point."""
@@ -862,7 +834,7 @@ def copy_point(source, target, stages):
     copy_plan(stages.steps, source.plan, target.plan)
     copy_matrix(source.arrived, stages.steps, N, target.arrived)
     copy(source.numbers, count, target.numbers)
-    copy_slacks(count, source.slacks, target.slacks)
+    copy_matrix(source.slacks, count, 2, target.slacks)
 
 
 @compact
@@ -914,10 +886,9 @@ def measure_iterate(stages, work, mem):
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
             mem.miss = larger(mem.miss, abs(missed(at, work.now)) / rows.sizes[at])
-            if has_slack(at, rows):
-                mem.product = larger(mem.product, slacks.slack[at] * above(at, rows))
-            if has_excess(at, rows):
-                mem.product = larger(mem.product, slacks.excess[at] * below(at, rows))
+            for side in range(2):
+                if has_slack(at, side, rows):
+                    mem.product = larger(mem.product, slacks[at, side] * from_bound(at, side, rows))
     # The product of margin and multiplier; for violated elastic rows, that of the other slack.
     mem.complementarity = (mem.product if mem.elastic != 0 else product) / mem.scale
 

@@ -276,30 +276,20 @@ class ActiveSetArrays(NamedTuple):
     chosen: Annotated[Arrays, "K"]  # those that convex models choose
 
 
-class Slacks(NamedTuple):
-    """The two slacks of each row d, or numbers that belong to these: `d = slack - excess`.
-
-    A row without a price has no excess, and an equality without a price has neither.
-    """
-
-    slack: Annotated[Arrays, "K"]
-    excess: Annotated[Arrays, "K"]
-
-
 class PlanPoint(NamedTuple):
     """A plan, the states at which its steps arrive, the values of its rows, and their slacks."""
 
     plan: Motion
     arrived: Annotated[Arrays, "T N"]
     numbers: Annotated[Arrays, "K"]
-    slacks: Slacks
+    slacks: Annotated[Arrays, "K 2"]  # s and p of each row; see `interior_point.py`
 
 
 class PlanStep(NamedTuple):
     """A step in plan, slacks and multipliers, and the costates after it."""
 
     changes: Motion
-    slacks: Slacks
+    slacks: Annotated[Arrays, "K 2"]
     force: Annotated[Arrays, "K"]
     costates: Annotated[Arrays, "T+1 N"]
 
@@ -330,8 +320,8 @@ class InteriorArrays(NamedTuple):
     other: PlanStep  # another that may take its place
     curves: Annotated[Arrays, "K"]  # this and the next: see `direction` of `stages.py`
     forces: Annotated[Arrays, "K"]
-    corrections: Slacks  # of the products of slacks and multipliers, for both steps
-    others: Slacks
+    corrections: Annotated[Arrays, "K 2"]  # of the products of slacks and multipliers, for both steps
+    others: Annotated[Arrays, "K 2"]
     beyond: Annotated[Arrays, "K"]  # further residuals of the rows
     wider: Annotated[Arrays, "T N"]  # further gaps
     last_step: Annotated[Arrays, "T+1 W"]  # the last step
