@@ -170,29 +170,26 @@ def hold(weight, price, stages, work):
 def predict_rows(scale, stages, work):
     """Write the multipliers after a step, and which rows are wrong there; return the number of wrong rows."""
     rows, count = stages.rows, 0
-    for t in range(stages.steps + 1):
-        for row in range(rows.size):
-            at = rows.size * t + row
-            work.pressing[at], work.wrong[at] = 0.0, 0.0
-            if rows.live[at] == 0:
-                continue
-            size, price, missed = rows.sizes[at], rows.prices[at], 0.0
-            change = row_change(t, row, stages)
-            if rows.held[at] == HELD:
-                force = work.forces[at] - work.curves[at] * change
-                work.pressing[at] = force
-                if rows.kinds[at] != EQUALITY:
-                    missed = min(missed, force * size / scale)
-                if price < inf:
-                    missed = min(missed, (price - abs(force)) * size / scale)
-            elif rows.held[at] == PAID:
-                work.pressing[at] = rows.force[at]
-                missed = -(rows.numbers[at] + change) * copysign(1.0, rows.force[at]) / size
-            else:
-                missed = (rows.numbers[at] - rows.targets[at] + change) / size
-            if missed < -ROUNDING:
-                work.wrong[at] = missed
-                count += 1
+    for at in range(rows.size * (stages.steps + 1)):
+        work.pressing[at], work.wrong[at] = 0.0, 0.0
+        if rows.live[at] == 0:
+            continue
+        size, price, missed, change = rows.sizes[at], rows.prices[at], 0.0, row_change(at, stages)
+        if rows.held[at] == HELD:
+            force = work.forces[at] - work.curves[at] * change
+            work.pressing[at] = force
+            if rows.kinds[at] != EQUALITY:
+                missed = min(missed, force * size / scale)
+            if price < inf:
+                missed = min(missed, (price - abs(force)) * size / scale)
+        elif rows.held[at] == PAID:
+            work.pressing[at] = rows.force[at]
+            missed = -(rows.numbers[at] + change) * copysign(1.0, rows.force[at]) / size
+        else:
+            missed = (rows.numbers[at] - rows.targets[at] + change) / size
+        if missed < -ROUNDING:
+            work.wrong[at] = missed
+            count += 1
     return count
 
 

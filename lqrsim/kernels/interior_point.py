@@ -455,22 +455,20 @@ def complete(beyond, corrections, out, stages, work, mem):
     copy_plan(stages.steps, stages.changes, out.changes)
     copy_matrix(stages.to_go.gradient, stages.steps + 1, N, out.costates)
     clear(out.slacks, rows.size * (stages.steps + 1), 2)
-    for t in range(stages.steps + 1):
-        for row in range(rows.size):
-            at = rows.size * t + row
-            out.force[at] = 0.0
-            if rows.live[at] == 0:
-                continue
-            ahead = row_change(t, row, stages) + residual_of(at, corrections, rows, work, mem)
-            if beyond:
-                ahead += work.beyond[at]
-            change = -work.curves[at] * ahead
-            out.force[at] = change
-            for side in range(2):
-                if has_slack(at, side, rows):
-                    wanted, dual = mem.parameter - corrections[at, side], from_bound(at, side, rows)
-                    slack = slacks[at, side]
-                    out.slacks[at, side] = wanted / dual - slack - SIGNS[side] * slack / dual * change
+    for at in range(rows.size * (stages.steps + 1)):
+        out.force[at] = 0.0
+        if rows.live[at] == 0:
+            continue
+        ahead = row_change(at, stages) + residual_of(at, corrections, rows, work, mem)
+        if beyond:
+            ahead += work.beyond[at]
+        change = -work.curves[at] * ahead
+        out.force[at] = change
+        for side in range(2):
+            if has_slack(at, side, rows):
+                wanted, dual = mem.parameter - corrections[at, side], from_bound(at, side, rows)
+                slack = slacks[at, side]
+                out.slacks[at, side] = wanted / dual - slack - SIGNS[side] * slack / dual * change
 
 
 @compact
@@ -651,14 +649,12 @@ def close_residuals(part, stages, work, mem):
                 work.wider[t, i] = tried.arrived[t, i] - tried.plan.states[t + 1, i]
         if direction(stages, work.now.plan, work.wider, mem.share, 0.0, 0.0, work.curves, work.forces) != -1:
             return
-        for t in range(stages.steps + 1):
-            for row in range(rows.size):
-                at = rows.size * t + row
-                if rows.live[at] != 0:
-                    change = -work.curves[at] * (row_change(t, row, stages) + missed(at, tried))
-                    for side in range(2):
-                        dual = from_bound(at, side, rows)
-                        other.slacks[at, side] = -SIGNS[side] * slacks[at, side] / dual * change
+        for at in range(rows.size * (stages.steps + 1)):
+            if rows.live[at] != 0:
+                change = -work.curves[at] * (row_change(at, stages) + missed(at, tried))
+                for side in range(2):
+                    dual = from_bound(at, side, rows)
+                    other.slacks[at, side] = -SIGNS[side] * slacks[at, side] / dual * change
         far = longest(boundary(mem), tried.slacks, other.slacks, stages)
         cost = go(far, tried, stages.changes, other.slacks, work.closer, stages)
         if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:

@@ -162,12 +162,10 @@ def descend(price, stages, work, mem):
                 mem.part = part
         if mem.part == 0:
             part /= 2
-    for t in range(steps + 1):
-        for row in range(rows.size):
-            at = rows.size * t + row
-            if rows.live[at] != 0:
-                work.aims[at] = rows.force[at] - work.curves[at] * row_change(t, row, stages)
-                work.duals[at] += part * (work.aims[at] - work.duals[at])
+    for at in range(rows.size * (steps + 1)):
+        if rows.live[at] != 0:
+            work.aims[at] = rows.force[at] - work.curves[at] * row_change(at, stages)
+            work.duals[at] += part * (work.aims[at] - work.duals[at])
     if part > LONG:
         mem.damping /= TIMES
     elif part < SHORT:
@@ -188,7 +186,7 @@ def slope_of_merit(stages):
         for row in range(rows.size):
             at = rows.size * t + row
             if rows.live[at] != 0:
-                slope -= rows.force[at] * row_change(t, row, stages)
+                slope -= rows.force[at] * row_change(at, stages)
     return slope
 
 

@@ -462,9 +462,9 @@ def add_rows(t, stages, curves, forces, stage, slope):
                     stage[i, j] += curve * entry * slopes[at, j]
 
 
-def row_change(t, row, stages):
+def row_change(at, stages):
     """The change of a row's value by the step in `stages.changes`."""
-    slope, changes, total = stages.models.slopes[stages.rows.size * t + row], stages.changes, 0.0
+    t, slope, changes, total = at // stages.rows.size, stages.models.slopes[at], stages.changes, 0.0
     for i in range(N):
         total += slope[i] * changes.states[t, i]
     if t < stages.steps:
