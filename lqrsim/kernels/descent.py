@@ -183,7 +183,7 @@ def newton_step(settings, model, work, memory):
     for t in range(settings.steps + 1):
         size = max(size, abs(second.constant[t]))
     memory.negligible, memory.decrease = settings.rounding * size, 2 * left
-    memory.promised = promised(failed, left, memory)
+    memory.promised = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
     return good
 
 
@@ -202,11 +202,6 @@ def pass_about_plan(settings, order, model, work, policy, to_go):
         for i in range(N):
             work.x_hat[i] += shift[i]
     return failed, good, left
-
-
-def promised(failed, left, memory):
-    """The decrease that a pass predicts, relative to the merit; infinite if it failed."""
-    return relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
 
 
 def update_plan_cost(steps, model, work, memory):
@@ -277,7 +272,8 @@ def judge(settings, cost_converged, ending, model, work, memory, row):
         failed, _, left = pass_about_plan(settings, order, model, work, work.policy, work.to_go)
         if NOISY and failed < 0:
             update_plan_cost(settings.steps, model, work, memory)
-        memory.failed, memory.promised = failed, promised(failed, left, memory)
+        memory.failed = failed
+        memory.promised = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
     elif memory.known == 0:
         newton_step(settings, model, work, memory)
     if memory.failed >= 0:
