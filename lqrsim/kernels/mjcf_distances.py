@@ -80,8 +80,7 @@ def places(x, data, out):
     p = at(data[0])
     slot = claim_slot(p)
     one = at(p[SLOTS] + 8 * SLOT * slot)
-    write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    move_bodies(x, p, one)
     origins, axes = at(one[XPOS]), at(one[XMAT])
     for k in range(int(data[1])):
         body = int(data[2 + 4 * k])
@@ -93,14 +92,19 @@ def places(x, data, out):
     store(p[FLAGS], slot, 0)
 
 
+def move_bodies(x, p, one):
+    """Move the bodies of an MjData to the positions of a state."""
+    write_positions(x, p, at(one[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+
+
 @outline
 def find(x, displaced, offset, data, first, out, which, segments):
     """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
     p = at(data[0])
     slot = claim_slot(p)
     one = at(p[SLOTS] + 8 * SLOT * slot)
-    write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    move_bodies(x, p, one)
     find_with_data(p, one, data, displaced, offset, first, out, which, segments)
     store(p[FLAGS], slot, 0)
 
@@ -114,8 +118,7 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     slot, nv = claim_slot(p), int(p[NV])
     one = at(p[SLOTS] + 8 * SLOT * slot)
     moves, others, normal, there, nowhere = stack(3 * N), stack(3 * N), stack(3), stack(3), stack(1)
-    write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    move_bodies(x, p, one)
     call(p[COMPOS], at(p[MODEL]), at(one[DATA]))
     find_with_data(p, one, data, nowhere, -1, first, out, which, segments)
     for row in range(int(data[1])):
