@@ -12,8 +12,8 @@ R^-1 r, the substitution u = w - F x - h eliminates the control: At = A - B F, Q
 from math import sqrt
 
 from lqrsim.kernels.declarations import M, N, inline, stack
-from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clamp, copy_matrix, step_offset
-from lqrsim.kernels.model_functions import step_jacobian
+from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clamp, copy_matrix
+from lqrsim.kernels.model_functions import linearize_forward as linearize  # noqa: F401  # fills the form
 from lqrsim.kernels.records import EliminatedControl
 
 
@@ -64,12 +64,6 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
         mean[i] = total
         constant += 0.5 * slope[i] * total
     return constant, True
-
-
-def linearize(x, u, model, arrived, step):
-    """Write the next state (N,), and the step linearised at (x, u): x_next = jacobian (x, u) + offset."""
-    step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-    step_offset(step.jacobian, x, u, arrived, step.offset)
 
 
 def forward_jacobian(x, u, model, arrived, step, spare):

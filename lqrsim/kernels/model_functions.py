@@ -5,7 +5,7 @@ Passes and iterations are therefore compiled once per size, and serve all proble
 """
 
 from lqrsim.kernels.declarations import HESSIANS, STATES, N, W, call, call_for_value, compact, stack
-from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill
+from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill, step_offset
 from lqrsim.kernels.records import NextStep
 
 VALUE, DERIVATIVES = 0, 1  # columns of `CostModel.functions`
@@ -43,6 +43,12 @@ def advance(x, u, model, h, out):
 def step_jacobian(x, u, model, h, out, jacobian):
     """Write the state after `h` seconds (N,), and its Jacobian [A B] (N, W)."""
     call(model.dynamics.step_jacobian, x, u, model.dynamics.parameters, h, out, jacobian)
+
+
+def linearize_forward(x, u, model, arrived, step):
+    """Write the next state (N,), and the step linearised at (x, u), Eq. (25): x_next = jacobian (x, u) + offset."""
+    step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
+    step_offset(step.jacobian, x, u, arrived, step.offset)
 
 
 def step_second_order(x, u, model, weights, out, jacobian, hessian):
@@ -160,30 +166,23 @@ def slope_of_constraint(which, row, x, u, t, constraints, gradient):
 
 
 def noise_value(x, u, t, noise, ahead):
-    """The expected cost of noise at (x, u); see `noise.py`. `ahead` is the rest of the problem after step t."""
-    hessian, gradient = stack(N, N), stack(N)
-    weigh_noise(t, noise, ahead, hessian, gradient)
+    """The expected cost of noise at (x, u); see `noise.py`.
+
+    The cost-to-go that weighs it is that of `ahead`, the rest of the problem after step t; or, with constraints, a
+    given one.
+    """
+    hessian = noise.hessian[t + 1] if noise.risk[2] > 0 else ahead.hessian
+    gradient = noise.gradient[t + 1] if noise.risk[2] > 0 else ahead.gradient
     weighed = NextStep(ahead.jacobian, ahead.arrived, hessian, gradient)
     return call_for_value(noise.value, x, u, noise.data, noise.risk, weighed)
 
 
 def noise_quadratic(x, u, t, noise, ahead, convex, stage):
-    """Add the quadratic model of the expected cost of noise to a stage; return its value."""
-    hessian, gradient = stack(N, N), stack(N)
-    weigh_noise(t, noise, ahead, hessian, gradient)
+    """Add the quadratic model of that cost to a stage; return its value."""
+    hessian = noise.hessian[t + 1] if noise.risk[2] > 0 else ahead.hessian
+    gradient = noise.gradient[t + 1] if noise.risk[2] > 0 else ahead.gradient
     weighed = NextStep(ahead.jacobian, ahead.arrived, hessian, gradient)
     return call_for_value(noise.quadratic, x, u, noise.data, noise.risk, weighed, convex, stage)
-
-
-def weigh_noise(t, noise, ahead, hessian, gradient):
-    """Write the cost-to-go that weighs the noise of step t, Hessian (N, N) and gradient (N,): that ahead, or a given
-    one.
-    """
-    copy_matrix(ahead.hessian, N, N, hessian)
-    copy(ahead.gradient, N, gradient)
-    if noise.risk[2] > 0:
-        copy_matrix(noise.hessian[t + 1], N, N, hessian)
-        copy(noise.gradient[t + 1], N, gradient)
 
 
 def costs_of(count, steps, plans, model, costs):

@@ -28,9 +28,8 @@ from lqrsim.kernels.linear_algebra import (
     copy,
     copy_matrix,
     finite,
-    step_offset,
 )
-from lqrsim.kernels.model_functions import advance, cost_quadratic, noise_quadratic, step_jacobian
+from lqrsim.kernels.model_functions import advance, cost_quadratic, linearize_forward, noise_quadratic
 from lqrsim.kernels.records import Linearization, LinearStep, NextStep, QuadraticStage
 
 
@@ -146,12 +145,6 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         copy(x, N, x_hat)
         minimize_cost_to_go(to_go.hessian[t], to_go.gradient[t], x_hat)
     return -1, True
-
-
-def linearize_forward(x, u, model, arrived, step):
-    """Write the next state (N,), and the step linearised at (x, u), Eq. (25): x_next = jacobian (x, u) + offset."""
-    step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-    step_offset(step.jacobian, x, u, arrived, step.offset)
 
 
 def stage_model(x, u, t, model, about, ahead, convex, stage):
