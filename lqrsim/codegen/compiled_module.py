@@ -100,16 +100,16 @@ class CompiledModule:
         self._made |= {(name, types[name]): entry for name, entry in entries.items()}
 
     def _make_entries(self, types: dict[str, tuple[Type, ...]]) -> dict[str, "Entry"]:
-        def write(program: Program, scope: Scope) -> list[Type | None]:
+        def write(program: Program, scope: Scope) -> list[list[Scalar]]:
             return [program.entry(scope.function(name), of, f"entry_{name}") for name, of in types.items()]
 
         label = f"{' and '.join(list(types)[:2])} for {self.what}"
         loaded, returns = self._load(label, repr(types), write, not types.keys().isdisjoint(LONG))
         pairs = zip(types.items(), returns, strict=True)
-        return {name: Entry(of, loaded.address(f"entry_{name}"), kind) for (name, of), kind in pairs}
+        return {name: Entry(of, loaded.address(f"entry_{name}"), kinds) for (name, of), kinds in pairs}
 
     def _make_functions(self, names: tuple[str, ...]) -> tuple[float, ...]:
-        def write(program: Program, scope: Scope) -> list[Type | None]:
+        def write(program: Program, scope: Scope) -> list[list[Scalar]]:
             for name in names:
                 program.export(scope.function(name), _signature(name, scope.sizes).members, name)
             return []
@@ -118,8 +118,8 @@ class CompiledModule:
         return tuple(float(loaded.address(name)) for name in names)
 
     def _load(
-        self, what: str, functions: str, write: Callable[[Program, Scope], list[Type | None]], long: bool
-    ) -> tuple[Loaded, list[Type | None]]:
+        self, what: str, functions: str, write: Callable[[Program, Scope], list[list[Scalar]]], long: bool
+    ) -> tuple[Loaded, list[list[Scalar]]]:
         """Machine code of some functions, from disk or newly compiled, and the types that entries among them return."""
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
@@ -135,7 +135,7 @@ class CompiledModule:
         code = object_code(program.text)
         loaded = Loaded(code)
         self._loaded.append(loaded)
-        disk.save(key, code, what, returns=[_encoded(kind) for kind in returns])
+        disk.save(key, code, what, returns=[[kind.name for kind in kinds] for kinds in returns])
         return loaded, returns
 
 
@@ -160,13 +160,13 @@ def _signature(name: str, sizes: Mapping[str, int]) -> Group:
 
 
 class Entry:
-    """A compiled function that Python calls, with the types of its arguments and of its result."""
+    """A compiled function that Python calls, with the types of its arguments and of the numbers that it returns."""
 
-    def __init__(self, types: tuple[Type, ...], address: int, returns: Type | None) -> None:
+    def __init__(self, types: tuple[Type, ...], address: int, returns: list[Scalar]) -> None:
         self.returns = returns
         self.run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(address)
         self.layout = _Layout(Group(types))
-        self.size = self.layout.size + (0 if returns is None else len(scalars(returns)))
+        self.size = self.layout.size + len(returns)
 
 
 class Call:
@@ -194,17 +194,11 @@ class Call:
                 raise
             self._arguments = arguments
         self._run(self._address)
-        returns, place = self._returns, self._layout.size
-        if returns is None:
-            return None
-        if isinstance(returns, Group):
-            return tuple(self._returned(kind, place + i) for i, kind in enumerate(returns.members))
-        return self._returned(returns, place)
-
-    def _returned(self, kind: Type, place: int) -> Any:
-        if kind is FLOAT:
-            return self._floats[place]
-        return bool(self._words[place]) if kind is BOOL else self._words[place]
+        numbers = tuple(
+            self._floats[place] if kind is FLOAT else bool(self._words[place]) if kind is BOOL else self._words[place]
+            for place, kind in enumerate(self._returns, start=self._layout.size)
+        )
+        return numbers if len(numbers) > 1 else numbers[0] if numbers else None
 
     def _lay_changes(self, layout: "_Layout", arguments: tuple[Any, ...], before: tuple[Any, ...], place: int) -> None:
         if len(arguments) != len(before):
@@ -279,26 +273,10 @@ def in_c_order(array: Array) -> Array:
     return np.require(array, np.float64, ["C", "W"])
 
 
-def _encoded(returns: Type | None) -> Any:
-    """The type of a result, for JSON."""
-    if returns is None:
-        return None
-    return [scalar.name for scalar in scalars(returns) if isinstance(scalar, Scalar)], isinstance(returns, Group)
-
-
-def _decoded(known: Any) -> Type | None:
-    """The type that `_encoded` encoded."""
-    if known is None:
-        return None
-    names, several = known
-    kinds = tuple({scalar.name: scalar for scalar in (FLOAT, INT, BOOL)}[name] for name in names)
-    return Group(kinds) if several else kinds[0]
-
-
-def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[Type | None]]:
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[list[Scalar]]]:
     """Load cached functions, with the types that they return."""
-    returns = [_decoded(kind) for kind in known["returns"]]
-    return Loaded(code), returns
+    kinds = {kind.name: kind for kind in (FLOAT, INT, BOOL)}
+    return Loaded(code), [[kinds[name] for name in names] for names in known["returns"]]
 
 
 @functools.cache

@@ -30,6 +30,7 @@ from lqrsim.codegen.language import (
     Group,
     Pointer,
     Pointers,
+    Scalar,
     SubsetError,
     Type,
     describe,
@@ -154,14 +155,15 @@ class Program:
             body = [f"  %n = {call}", f"  %r = {convert} {integer} %n to double", "  ret double %r"]
         self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(parameters)}) #0 {{", *body, "}"]))
 
-    def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> Type | None:
+    def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> list[Scalar]:
         """Add a C function of one address, at which there are 8 bytes for each number and address of the arguments.
 
-        It writes its result after them. Returns the type of the result.
+        It writes the numbers that it returns after them. Returns the types of these numbers.
         """
         kind, call, result = self._call_of(function, types)
-        returned = scalars(result) if result is not None else []
-        if not {FLOAT, INT, BOOL}.issuperset(returned):
+        parts = scalars(result) if result is not None else []
+        returned = [part for part in parts if isinstance(part, Scalar) and part is not INT32]
+        if len(returned) < len(parts):
             raise SubsetError(f"{where(function, function.node)}: got {describe(result)} returned, want numbers")
         lines, place = [], 0
         for i, member in enumerate(_passed(function, types)):
@@ -190,7 +192,7 @@ class Program:
                 f"  store {'i64' if member is BOOL else llvm_type(member)} {part}, ptr %q{i}",
             ]
         self._texts.append("\n".join([f"define void @{symbol}(ptr %words) #0 {{", *lines, "  ret void", "}"]))
-        return result
+        return returned
 
     def _call_of(self, function: ScopedFunction, types: tuple[Type, ...]) -> tuple[str, str, Type | None]:
         """LLVM's type of a function's result, a call with the arguments %a0, %a1, ..., and the type of the result."""
