@@ -171,8 +171,8 @@ DIVIDED = {
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
-    "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "follow_step", "judge",
-    "value_functions_at_plan", "convex_value_functions", "optimality", "roll_out_and_keep",
+    "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "follow_step",
+    "measure_optimality", "value_functions_at_plan", "convex_value_functions", "optimality", "roll_out_and_keep",
 )  # fmt: skip
 
 
@@ -513,9 +513,14 @@ class TestSolvers:
         replay(one.source, one.sizes, "ilqr", *with_rows(arguments))
 
     def test_what_is_done_after_failures(self) -> None:
-        for share, reach, weight in ((0.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 1e-4)):
+        for second_order, reach, weight in ((0.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 1e-4)):
             memory = np.zeros(1, MEMORY_ROW).view(np.recarray)
-            memory["share"], memory["reach"], memory["weight"], memory["ilqr_next"] = share, reach, weight, 2.0
+            memory["second_order"], memory["reach"], memory["weight"], memory["ilqr_next"] = (
+                second_order,
+                reach,
+                weight,
+                2.0,
+            )
             replay(source_of(descent), SIZES, "tighten", DAMPED_STEPS, memory[0])
         model = compiled.arguments(problem(noise=ls.Noise(0.1 * np.eye(3))))
         for good, risk in ((True, 0.0), (False, 0.0), (True, 1.0)):
@@ -1364,7 +1369,7 @@ class TestPlanMethods:
             rest = with_rows((begun, stages.about, work, memory, log))
             return replay(kernel, SIZES, "interior_point", task, first, last, 1e-6, 1e-6, *rest)
 
-        run(interior_point.SURVEY, 0, 0)
+        run(interior_point.SCALE, 0, 0)
         run(interior_point.BEGIN, 0, 0)
         assert memory["elastic"][0] == np.isfinite(price)
         for rung in (3.0, 0.0):  # with regularised models, and without
@@ -1380,9 +1385,9 @@ class TestPlanMethods:
         replay(kernel, SIZES, "predict", 1e-9, *state)
         memory["parameter"] = 0.1
         replay(kernel, SIZES, "off_centre", *state)
-        memory["age"], stages.about.keeps[0] = 1.0, 1.0
+        memory["age"], stages.about.reuses_derivatives[0] = 1.0, 1.0
         replay(kernel, SIZES, "renew", *state)
-        assert memory["age"][0] == stages.about.keeps[0] == 0
+        assert memory["age"][0] == stages.about.reuses_derivatives[0] == 0
         replay(kernel, SIZES, "largest_multiplier_step", *state[:2])
         run(interior_point.POLISH, 0, 0)
         memory["solved"] = 1.0
@@ -1415,7 +1420,7 @@ class TestPlanMethods:
             replay(source, SIZES, "remember", about, before, plan, costates, moves, turns)
             models.gradient[...] = np.einsum("tij,tj->ti", hessian, joined())
             replay(source, SIZES, "learn", about, costates, moves, turns, step == 2)
-        assert stages.about.slow[0] == 1.0
+        assert stages.about.uses_learned[0] == 1.0
         np.testing.assert_allclose(models.hessian, hessian, rtol=0, atol=1e-7)
         np.testing.assert_allclose(models.learned, 0.7 * hessian, rtol=0, atol=1e-7)
 
@@ -1462,18 +1467,18 @@ class TestPlanMethods:
         run(0, 0)
         for done in range(3):
             assert run(done, done + 1)[0] == done + 1
-        replay(source_of(restoration), SIZES, "share_price", price, stages.about, work)
+        replay(source_of(restoration), SIZES, "write_relative_multipliers", price, stages.about, work)
 
     def test_models_and_steps(self) -> None:
         """The entries that no method leads to; and models that have no minimum."""
         stages, plan = self.made()
         source, rng = source_of(entry_points), np.random.default_rng(0)
         costates, rows = rng.normal(size=(4, 3)), stages.live.size
-        assert replay(source, SIZES, "survey", stages.about, plan) > 0
+        assert replay(source, SIZES, "determine_scales", stages.about, plan) > 0
         stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)
         replay(source, SIZES, "write_models", stages.about, plan, costates, 0.0)
         replay(source, SIZES, "adjoint", stages.about, costates, np.zeros((3, 2)))
-        replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
+        replay(source, SIZES, "evaluate_plan", stages.about, plan, np.zeros((3, 3)))
         replay(source, SIZES, "read_rows", stages.about, plan, np.zeros(rows))
         held = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
         convex, kernel = stages.models.convex + np.eye(5), source_of(stage_kernels)
@@ -1503,7 +1508,7 @@ class TestPlanMethods:
         bent[2, 2, 2] -= 1e6
         assert direction(bent) == 2  # a jump without a least
         replay(source, SIZES, "write_models", stages.about, plan, costates, 0.0)
-        replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
+        replay(source, SIZES, "evaluate_plan", stages.about, plan, np.zeros((3, 3)))
 
 
 def test_no_kernel_is_left_out() -> None:

@@ -26,7 +26,7 @@ from lqrsim.kernels.stages import (
     closed_loop_rollout,
     cost_of_plan,
     direction,
-    measure,
+    plan_residuals,
     read_rows,
     regularised_direction,
     row_change,
@@ -44,7 +44,7 @@ ROUNDING = 1e-10  # allowed violation by a model, relative to a row's size
 CANCELLED = 1e-6  # least scale, relative to the typical cost of a change: the cost's terms may cancel
 # The phases of a step: fractions of the convex models, and largest numbers of pivots. The rows that are known; the rows
 # that convex models choose; and these with more and more convex models.
-SHARES = (0.0, 1.0, 0.0, 0.3, 1.0)
+CONVEX_FRACTIONS = (0.0, 1.0, 0.0, 0.3, 1.0)
 PIVOTS = (0, 15, 4, 4, 0)
 CHOOSING, LAST = 1, 4
 PATIENCE = 3  # pivots without fewer wrong rows before rows change one at a time
@@ -108,7 +108,7 @@ def measure_plan(violation, stages, work, mem):
     rows, priced = stages.rows, False
     least = CANCELLED * mem.typical
     mem.scale = max(abs(mem.cost), least) if isfinite(mem.cost) else nan
-    steepest, missed, unequal, widest, product = measure(stages, work.plan, rows.numbers, work.gaps)
+    steepest, missed, unequal, widest, product = plan_residuals(stages, work.plan, rows.numbers, work.gaps)
     for at in range(rows.size * (stages.steps + 1)):
         priced = priced or rows.prices[at] < inf
     mem.kept = 1.0 if priced or (missed <= 0 and unequal <= violation) else 0.0
@@ -131,7 +131,7 @@ def pivot(softness, stages, work, mem):
     """
     phase, count = int(mem.phase), stages.rows.size * (stages.steps + 1)
     hold(mem.scale / softness, mem.scale / softness, stages, work)
-    failed = direction(stages, work.plan, work.gaps, SHARES[phase], 0.0, 1.0, work.curves, work.forces)
+    failed = direction(stages, work.plan, work.gaps, CONVEX_FRACTIONS[phase], 0.0, 1.0, work.curves, work.forces)
     wrong = predict_rows(mem.scale, stages, work) if failed == -1 else -1
     if wrong > 0 and mem.pivots < PIVOTS[phase]:
         if wrong < mem.fewest:

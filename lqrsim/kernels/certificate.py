@@ -30,7 +30,7 @@ SQUARES = 1e-28
 OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-9, 1e-2
 
 
-def certify(settings, fresh, plan, policy, to_go, model, row):
+def certify(settings, of_policy, plan, policy, to_go, model, row):
     """Write cost, residuals and predicted decrease of a plan and its policy.
 
     The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
@@ -40,8 +40,8 @@ def certify(settings, fresh, plan, policy, to_go, model, row):
     decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
     Args:
-      fresh: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
-        them to `to_go`. The Hessians of a Riccati pass assume that clamped controls respond.
+      of_policy: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and
+        write them to `to_go`. The Hessians of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
       row: row of CERTIFICATE, written; before, `typical` may have the least typical cost where nothing is curved.
         scale: size of the curved part of the cost without cancellation; rounding errors are relative to it.
@@ -52,7 +52,7 @@ def certify(settings, fresh, plan, policy, to_go, model, row):
         beyond_limits: the largest violation of a control's limit.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
-    arrived, room = stack(N), Limits(stack(M), stack(M))
+    arrived, change_limits = stack(N), Limits(stack(M), stack(M))
     none, costate, size, residual, nowhere = zeros(M), stack(N), stack(N), zeros(N), zeros(N)
     states, steps, hessians, sizes = plan.states, settings.steps, to_go.hessian, stack(W)
     off_policy, limits, decrease, uncurved = 0.0, 0.0, 0.0, 0.0
@@ -75,7 +75,7 @@ def certify(settings, fresh, plan, policy, to_go, model, row):
     augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)
     copy(stage.gradient, N, costate)
-    if fresh:
+    if of_policy:
         copy_matrix(stage.hessian, N, N, hessians[steps])
     for t in range(steps - 1, -1, -1):
         x, u = states[t], plan.controls[t]
@@ -85,9 +85,10 @@ def certify(settings, fresh, plan, policy, to_go, model, row):
         augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # for this policy, the gradient of the cost-to-go is the costate
             given = model.noise.risk[2] > 0  # a cost-to-go about the origin
-            there, slope = nowhere if fresh and not given else arrived, costate if fresh else to_go.gradient[t + 1]
-            ahead = NextStep(step.jacobian, there, hessians[t + 1], slope)
-            cost += noise_quadratic(x, u, t, model.noise, ahead, False, stage)
+            there = nowhere if of_policy and not given else arrived
+            slope = costate if of_policy else to_go.gradient[t + 1]
+            next_step = NextStep(step.jacobian, there, hessians[t + 1], slope)
+            cost += noise_quadratic(x, u, t, model.noise, next_step, False, stage)
         terms = scale_of(x, u, stage)
         scale += terms
         for i in range(N):
@@ -95,17 +96,18 @@ def certify(settings, fresh, plan, policy, to_go, model, row):
             if not difference <= residual[i]:  # a NaN stays
                 residual[i] = difference
         for i in range(M):
-            room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
-            limits = max(limits, room.low[i], -room.high[i])
+            change_limits.low[i], change_limits.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
+            limits = max(limits, change_limits.low[i], -change_limits.high[i])
         off_policy = policy_residual(x, u, policy.gain[t], policy.offset[t], model.limits, off_policy)
         terms += curved_terms(states[t + 1], hessians[t + 1])
         predicted, slopes, largest = predicted_decrease(
-            step, stage, policy.gain[t], hessians[t + 1], room, sizes, largest, costate
+            step, stage, policy.gain[t], hessians[t + 1], change_limits, sizes, largest, costate
         )
         decrease += 0.0 if predicted <= SQUARES * terms else predicted
         uncurved += slopes
-        if fresh:
-            closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
+        if of_policy:
+            gain, S = policy.gain[t], hessians[t + 1]
+            closed_loop_hessian(step.jacobian, stage.hessian, gain, change_limits, S, hessians[t])
     if not settings.fixed:
         cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
         typical += cost_of_change(stage, sizes)
@@ -162,11 +164,11 @@ def policy_residual(x, u, gain, offset, limits, worst):
     return worst
 
 
-def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
-    """The decrease `1/2 e' E^-1 e` that the controls of a step predict, within the room that their limits leave.
+def predicted_decrease(step, stage, gain, S, change_limits, sizes, largest, costate):
+    """The decrease `1/2 e' E^-1 e` that the controls of a step predict, within their limits.
 
     Args:
-      step: LinearStep. stage: QuadraticStage at the plan. gain: (M, N). S: (N, N) at t + 1. room: Limits of changes.
+      step: LinearStep. stage: QuadraticStage at the plan. gain: (M, N). S: (N, N) at t + 1. change_limits: Limits.
       sizes: (W,) of states and controls. largest: the largest curvature of a control so far, for a change by its size.
       costate: (N,) at t + 1, overwritten by the costate at t; controls respond with the gain, but not at a limit.
 
@@ -194,7 +196,7 @@ def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
         for j in range(N):
             before[i] += jacobian[j, i] * costate[j]
     for i in range(M):
-        if room.low[i] < 0 < room.high[i]:
+        if change_limits.low[i] < 0 < change_limits.high[i]:
             for j in range(N):
                 before[j] += gain[i, j] * slope[i]
     copy(before, N, costate)
@@ -206,11 +208,11 @@ def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
         if not is_curved(factor, sizes, OF_BLOCK * own):
             for i in range(M):
                 factor[i, i] += 2 * OF_BLOCK * own / (sizes[N + i] * sizes[N + i])
-        return box_decrease(factor, slope, room.low, room.high, moved), 0.0, largest
+        return box_decrease(factor, slope, change_limits.low, change_limits.high, moved), 0.0, largest
     squares = 0.0
     for i in range(M):
-        far = min(sizes[N + i], -room.low[i] if slope[i] > 0 else room.high[i])
-        squares += far * far * slope[i] * slope[i]
+        size = min(sizes[N + i], -change_limits.low[i] if slope[i] > 0 else change_limits.high[i])
+        squares += size * size * slope[i] * slope[i]
     return 0.0, squares, largest
 
 
@@ -243,15 +245,15 @@ def start_decrease(stage, S, rounding, costate):
     return 0.0 if decrease <= rounding else decrease
 
 
-def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
-    """Write the Hessian (N, N) of the policy's cost-to-go at t, given that `ahead`, at t + 1.
+def closed_loop_hessian(jacobian, cost, gain, change_limits, next_hessian, out):
+    """Write the Hessian (N, N) of the policy's cost-to-go at t, given that `next_hessian`, at t + 1.
 
-    A control at a limit, without room on one side, does not respond.
+    A control at a limit does not respond.
     """
     closed, both, product = stack(N, N), stack(W, N), stack(W, N)
     for j in range(N):
         for i in range(M):
-            both[N + i, j] = gain[i, j] if room.low[i] < 0 < room.high[i] else 0.0
+            both[N + i, j] = gain[i, j] if change_limits.low[i] < 0 < change_limits.high[i] else 0.0
         for i in range(N):
             both[i, j] = 1.0 if i == j else 0.0
             closed[i, j] = jacobian[i, j]
@@ -271,7 +273,7 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
         for j in range(N):
             product[i, j] = 0.0
             for k in range(N):
-                product[i, j] += ahead[i, k] * closed[k, j]
+                product[i, j] += next_hessian[i, k] * closed[k, j]
     for i in range(N):
         for j in range(N):
             for k in range(N):

@@ -67,10 +67,10 @@ def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient):
         if last == 1 or not decrease >= 0:
             break
         affine(gain, feedforward, x, M, N, u)
-        beyond = False
+        violated = False
         for i in range(M):
-            beyond = beyond or u[i] < low[i] or u[i] > high[i]
-        if not beyond:
+            violated = violated or u[i] < low[i] or u[i] > high[i]
+        if not violated:
             break
         coordinate_descent(stage, x, limits, u)
         for i in range(M):  # all slopes first: a fixed control no longer affects the slopes of the others

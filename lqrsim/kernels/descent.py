@@ -4,8 +4,8 @@ Newton's method and damped smoothing are one loop, `descend`; a `Descent` says w
 
 Newton's steps are from the backward pass of differential dynamic programming about the plan. It does not project the
 Hessians of the costs, and adds the Hessians of the dynamics times the costate. If such a model has no minimum, the pass
-is repeated with a smaller share of these second-order terms, down to none, which is iLQR's pass, and then with growing
-weights on changes of the controls. Near an optimum with enough curvature, convergence is quadratic.
+is repeated with less of these second-order terms, down to none, which is iLQR's pass, and then with growing weights
+on changes of the controls. Near an optimum with enough curvature, convergence is quadratic.
 
 Damped smoothing is the safeguard, for when undamped smoothing fails. Rollouts on the way to an optimum can cost any
 multiple of the first, so a rising cost does not mean that the method will fail: it runs undamped until a pass fails or
@@ -42,7 +42,7 @@ from lqrsim.kernels.passes import backward_pass, forward_pass, smoothed_states
 from lqrsim.kernels.records import CostToGo, Descent, Linearization, ModelOrder
 from lqrsim.kernels.rollouts import (
     copy_plan,
-    differential_pass,
+    ddp_pass,
     dynamics_residual,
     initial_step,
     largest_gap,
@@ -57,8 +57,9 @@ from lqrsim.kernels.rollouts import (
 DAMPED_STEPS = Descent(DAMPED, changes=2, idle=12.0, reach=1.0, smallest=0.1, lightest=1e-3, factor=10.0, heaviest=1e12)
 # Weights are rarely needed, but then by unknown orders of magnitude: 8 span 21 of them.
 NEWTON_STEPS = Descent(
-    NEWTON, changes=0, share=1.0, smallest=1e-3, armijo=1e-4, weights=8, lightest=1e-10, factor=1e3, patient=False
-)
+    NEWTON, changes=0, second_order=1.0, smallest=1e-3, armijo=1e-4, weights=8, lightest=1e-10, factor=1e3,
+    patient=False,
+)  # fmt: skip
 # Smallest fraction of a step of a convex model about the plan. Such a model knows nothing of where a cost saturates, so
 # its steps may be too long by orders of magnitude.
 SHORTEST = 1e-8
@@ -89,9 +90,9 @@ def descend(first, last, settings, model, work, memory, log):
         good = find_step(settings, model, work, memory)
         if memory.failed >= 0 and not damped:
             return done, failure(good, model), True, int(memory.failed)
-        if not damped and not known and memory.promised < settings.tolerance:  # there is nothing to do
+        if not damped and not known and memory.relative_decrease < settings.tolerance:  # there is nothing to do
             write_row(log[done], memory.plan_cost, 0.0, 0.0, nan, nan, NEWTON)
-            if judge(settings, True, False, model, work, memory, log[done]) != RUNNING:
+            if measure_optimality(settings, True, False, model, work, memory, log[done]) != RUNNING:
                 return done + 1, CONVERGED, False, -1
         merit, cost, fraction = memory.merit, memory.plan_cost, 0.0
         if memory.failed < 0:
@@ -117,8 +118,9 @@ def descend(first, last, settings, model, work, memory, log):
             gap = nan if damped else 0.0
         write_row(log[done], memory.plan_cost, improvement, gap, nan, nan, method)
         if cost_converged or exhausted or full:
-            outcome = judge(settings, cost_converged or exhausted, exhausted or full, model, work, memory, log[done])
-            if outcome == RUNNING and (exhausted or full):
+            settled, ending = cost_converged or exhausted, exhausted or full
+            outcome = measure_optimality(settings, settled, ending, model, work, memory, log[done])
+            if outcome == RUNNING and ending:
                 outcome = STALLED if exhausted else MAX_ITERATIONS
             if outcome != RUNNING:
                 return done + 1, outcome, memory.failed >= 0, int(memory.failed)
@@ -157,7 +159,7 @@ def newton_step(settings, model, work, memory):
     The ladder has the shares of second-order terms, from the memory's down to none, and then the weights on changes of
     the controls. The second-order cost-to-go takes the place of the cost-to-come.
     """
-    how, failed, good, left, share, size = settings.descent, -1, True, nan, 0.0, 0.0
+    how, failed, good, left, second_order, size = settings.descent, -1, True, nan, 0.0, 0.0
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
     if NOISY:  # the cost of noise is weighed with the cost-to-go of smoothing
         order = ModelOrder(0.0, 0.0, work.to_go)
@@ -169,36 +171,37 @@ def newton_step(settings, model, work, memory):
     damping, lightest = 0.0, how.lightest * max(abs(memory.merit), how.lightest)
     for k in range(len(MIXES) + how.weights):
         if k < len(MIXES):
-            share = 1 - MIXES[k]
+            second_order = 1 - MIXES[k]
         else:
             damping = max(how.factor * damping, lightest)
-        if share <= memory.share:
-            order = ModelOrder(damping, share, work.to_go)
+        if second_order <= memory.second_order:
+            order = ModelOrder(damping, second_order, work.to_go)
             failed, good, left = pass_about_plan(settings, order, model, work, work.policy, second)
             if failed < 0 and isnan(left) and not settings.fixed:  # the start has no minimum
                 failed = 0
             if failed < 0 or not good:
                 break
-    memory.failed, memory.share, memory.damping, memory.known = failed, share, damping, 1.0 if failed < 0 else 0.0
+    memory.failed, memory.known = failed, 1.0 if failed < 0 else 0.0
+    memory.second_order, memory.damping = second_order, damping
     for t in range(settings.steps + 1):
         size = max(size, abs(second.constant[t]))
     memory.negligible, memory.decrease = settings.rounding * size, 2 * left
-    memory.promised = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
+    memory.relative_decrease = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
     return good
 
 
 def pass_about_plan(settings, order, model, work, policy, to_go):
-    """`differential_pass` about the plan, and the step of a soft start, which is written to `x_hat`.
+    """`ddp_pass` about the plan, and the step of a soft start, which is written to `x_hat`.
 
     Returns:
       The step at which it failed, or -1; whether all numbers were finite; and the decrease of cost that it predicts,
       NaN if the start has no minimum.
     """
     plan, shift = work.best, stack(N)
-    failed, good, left = differential_pass(settings.steps, plan, model, order, 1, policy, to_go)
+    failed, good, left = ddp_pass(settings.steps, plan, model, order, 1, policy, to_go)
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     if failed < 0 and not settings.fixed:
-        left += initial_step(plan.states[0], model, order.share, to_go, shift)
+        left += initial_step(plan.states[0], model, order.second_order, to_go, shift)
         for i in range(N):
             work.x_hat[i] += shift[i]
     return failed, good, left
@@ -215,7 +218,7 @@ def follow_step(settings, model, work, memory):
     how, shift, bound = settings.descent, stack(N), memory.merit + RISE * abs(memory.merit)
     for i in range(N):
         shift[i] = work.x_hat[i] - work.best.states[0, i]
-    if memory.reach == 0 and memory.share == 0 and how.patient:
+    if memory.reach == 0 and memory.second_order == 0 and how.patient:
         return line_search(settings.steps, shift, work, model, bound, 0.0, SHORTEST, work.last)
     slope = how.armijo * memory.decrease
     return line_search(settings.steps, shift, work, model, bound, slope, how.smallest, work.last)
@@ -223,7 +226,7 @@ def follow_step(settings, model, work, memory):
 
 def relax(how, memory, fraction):
     """Regularise less after an iteration that lowered the merit with that fraction of its step."""
-    memory.share, memory.known = how.share, 0.0
+    memory.second_order, memory.known = how.second_order, 0.0
     if memory.weight > 0:
         memory.weight = FADE * memory.weight if memory.weight > FORGOTTEN else 0.0
     elif memory.reach > 0:
@@ -240,8 +243,8 @@ def relax(how, memory, fraction):
 def tighten(how, memory):
     """Regularise more after an iteration that did not lower the merit; return whether there is nothing left to try."""
     memory.known = 0.0
-    if memory.share > 0:
-        memory.share = 0.0
+    if memory.second_order > 0:
+        memory.second_order = 0.0
     elif memory.reach > NEAR:
         memory.reach = NEAR
     elif memory.reach > 0:
@@ -258,7 +261,7 @@ def turn_to_ilqr(memory):
     memory.ilqr_next *= 2
 
 
-def judge(settings, cost_converged, ending, model, work, memory, row):
+def measure_optimality(settings, cost_converged, ending, model, work, memory, row):
     """Measure the plan's optimality; compute policy and value functions about it. CONVERGED if optimal, else RUNNING.
 
     Newton's pass that measures it is the next step's, and value functions are computed at its end alone: as in
@@ -273,13 +276,13 @@ def judge(settings, cost_converged, ending, model, work, memory, row):
         if NOISY and failed < 0:
             update_plan_cost(settings.steps, model, work, memory)
         memory.failed = failed
-        memory.promised = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
+        memory.relative_decrease = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
     elif memory.known == 0:
         newton_step(settings, model, work, memory)
     if memory.failed >= 0:
         return RUNNING
-    row.cost, row.optimality = memory.plan_cost, memory.promised
-    optimal = cost_converged and memory.promised < settings.tolerance
+    row.cost, row.optimality = memory.plan_cost, memory.relative_decrease
+    optimal = cost_converged and memory.relative_decrease < settings.tolerance
     if how.method == DAMPED:
         value_functions_at_plan(settings, model, work, memory, row)
     elif optimal or ending:
@@ -325,7 +328,7 @@ def convex_value_functions(settings, model, work, memory, row):
     policy, controls = work.policy, work.best.controls
     if not NOISY:
         order = ModelOrder(memory.damping, 0.0, work.to_go)
-        differential_pass(settings.steps, work.best, model, order, 1, work.last_policy, work.to_go)
+        ddp_pass(settings.steps, work.best, model, order, 1, work.last_policy, work.to_go)
     value_functions_at_plan(settings, model, work, memory, row)
     for t in range(settings.steps):
         for i in range(M):

@@ -133,16 +133,16 @@ def curvature_from_jacobians(x, u, p, h, weights, out, jacobian, hessian):
     copy(u, M, v)
     for j in range(W):
         z = entry(x, u, j)
-        far = FIRST * max(1.0, abs(z))
+        width = FIRST * max(1.0, abs(z))
         for side in range(2):
-            set_entry(y, v, j, z + far if side == 0 else z - far)
+            set_entry(y, v, j, z + width if side == 0 else z - width)
             step_jacobian(y, v, p, h, out, jacobian)
-            share = 0.25 / far if side == 0 else -0.25 / far  # halved, because it is added to both triangles
+            factor = 0.25 / width if side == 0 else -0.25 / width  # halved, because it is added to both triangles
             for k in range(W):
                 total = 0.0
                 for i in range(N):
                     total += weights[i] * jacobian[i, k]
-                hessian[j, k] += share * total
-                hessian[k, j] += share * total
+                hessian[j, k] += factor * total
+                hessian[k, j] += factor * total
         set_entry(y, v, j, z)
     step_jacobian(x, u, p, h, out, jacobian)

@@ -24,7 +24,7 @@ from lqrsim.kernels.declarations import (
     stack,
     zeros,
 )
-from lqrsim.kernels.descent import descend, judge
+from lqrsim.kernels.descent import descend, measure_optimality
 from lqrsim.kernels.interior_point import interior_point as interior_point
 from lqrsim.kernels.iterations import ilqr_iterations, relative_optimality, smoother_iterations
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
@@ -34,10 +34,10 @@ from lqrsim.kernels.restoration import restoration as restoration
 from lqrsim.kernels.rollouts import ilqr_pass
 from lqrsim.kernels.rollouts import rollout as rollout
 from lqrsim.kernels.stages import adjoint as adjoint
+from lqrsim.kernels.stages import determine_scales as determine_scales
+from lqrsim.kernels.stages import evaluate_plan as evaluate_plan
 from lqrsim.kernels.stages import least_curvatures as least_curvatures
 from lqrsim.kernels.stages import read_rows as read_rows
-from lqrsim.kernels.stages import survey as survey
-from lqrsim.kernels.stages import trial as trial
 from lqrsim.kernels.stages import write_models as write_models
 
 
@@ -57,7 +57,7 @@ def smoother(task, first, last, settings, model, work, memory, log):
         certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == LINEARIZE:
-        judge(settings, False, False, model, work, memory[0], log[0])
+        measure_optimality(settings, False, False, model, work, memory[0], log[0])
         return 0, RUNNING, memory[0].failed >= 0, int(memory[0].failed)
     if task == DESCEND:
         return descend(first, last, settings, model, work, memory[0], log)

@@ -52,34 +52,34 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
         q[k] = p[k]
 
 
-def correct(count, measured, near, gain, limit, wider, sensor, angular, estimates, innovations):
+def correct(count, measured, nominal, gain, limit, wider, sensor, angular, estimates, innovations):
     """Update estimates (count, Z) with measurements, except where these were lost.
 
     Args:
       measured: Measurements; its states are replaced by the representatives nearest to the estimates.
-      near: (N,) a state; the estimates are first replaced by the representatives nearest to it. gain: (Z, Y).
+      nominal: (N,) a state; the estimates are first replaced by the representatives nearest to it. gain: (Z, Y).
       limit: (D,) largest corrections of the unknowns' states; if one is exceeded, all of these are scaled down.
       wider: (count,) factors of the limit. They double where it is exceeded, and are 1 again where it is not.
       innovations: (count, Y) measurements minus expectations, written; NaN where the measurement was lost.
     """
     for k in range(count):
         shown, lost, z = measured.shown[k], measured.lost[k], estimates[k]
-        share = correct_one(shown, lost, near, gain, limit, wider[k], sensor, angular, z, innovations[k])
-        if share < 1.0:
+        fraction = correct_one(shown, lost, nominal, gain, limit, wider[k], sensor, angular, z, innovations[k])
+        if fraction < 1.0:
             wider[k] *= 2.0
         elif lost == 0.0:
             wider[k] = 1.0
 
 
 @outline
-def correct_one(shown, lost, near, gain, limit, wider, sensor, angular, z, innovation):
-    """Update the estimate z (Z,) of one trial. Returns the share of the unknowns' correction that was made."""
+def correct_one(shown, lost, nominal, gain, limit, wider, sensor, angular, z, innovation):
+    """Update the estimate z (Z,) of one trial. Returns the fraction of the unknowns' correction that was made."""
     x, seen, expected, corrected = stack(N), stack(Y), stack(Y), stack(Z)
-    share = 1.0
-    to_nearest(z, near, angular)
+    fraction = 1.0
+    to_nearest(z, nominal, angular)
     if lost != 0.0:
         fill(innovation, Y, nan)
-        return share
+        return fraction
     copy(shown, N, x)
     to_nearest(x, z, angular)
     call(sensor.measure, x, sensor.data, seen)
@@ -93,14 +93,14 @@ def correct_one(shown, lost, near, gain, limit, wider, sensor, angular, z, innov
         corrected[i] = total
     for i in range(D):
         change = abs(corrected[N + LAG + i] - z[N + LAG + i])
-        if change * share > wider * limit[i]:
-            share = wider * limit[i] / change
+        if change * fraction > wider * limit[i]:
+            fraction = wider * limit[i] / change
     for i in range(Z):
-        if share < 1.0 and i >= N + LAG:
-            z[i] += share * (corrected[i] - z[i])
+        if fraction < 1.0 and i >= N + LAG:
+            z[i] += fraction * (corrected[i] - z[i])
         else:
             z[i] = corrected[i]
-    return share
+    return fraction
 
 
 def predict(count, controls, predictor, estimates):
@@ -113,7 +113,7 @@ def predict(count, controls, predictor, estimates):
 def predict_one(control, predictor, z):
     """Predict the estimate z (Z,) of one trial."""
     p, places, lag = predictor.dynamics.parameters, predictor.places, predictor.lag
-    q, v, after, value, fresh = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
+    q, v, after, value, next_states = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
     for i in range(V):
         total = 0.0
         for j in range(D):
@@ -135,23 +135,23 @@ def predict_one(control, predictor, z):
         total = 0.0
         for j in range(D):
             total += predictor.transition[i, j] * z[N + LAG + j]
-        fresh[i] = total
-    copy_part(fresh, 0, z, N + LAG, D)
+        next_states[i] = total
+    copy_part(next_states, 0, z, N + LAG, D)
 
 
-def command(count, estimates, near, policy, limits, angular, out):
+def command(count, estimates, nominal, policy, limits, angular, out):
     """Write the controls (count, M), within their limits, of a policy with gains (M, Z) on the estimates (count, Z).
 
-    The estimates' angles are replaced by the representatives nearest to `near` (N,).
+    The estimates' angles are replaced by the representatives nearest to `nominal` (N,).
     """
     for k in range(count):
-        command_one(estimates[k], near, policy, limits, angular, out[k])
+        command_one(estimates[k], nominal, policy, limits, angular, out[k])
 
 
 @outline
-def command_one(z, near, policy, limits, angular, u):
+def command_one(z, nominal, policy, limits, angular, u):
     """Write the control u (M,) of one trial's estimate z (Z,)."""
-    to_nearest(z, near, angular)
+    to_nearest(z, nominal, angular)
     affine(policy.gain, policy.offset, z, M, Z, u)
     for j in range(M):
         u[j] = min(max(u[j], limits.low[j]), limits.high[j])

@@ -230,23 +230,23 @@ def add_face(points, i, j, k, prism, faces, normals, depths, total):
 @compact
 def add_point(points, new, face, prism, within, faces, normals, depths, total):
     """Add a point beyond a face: it replaces the faces that it sees. Return the number of faces."""
-    seen, end = stack(FACES), total
+    visible, count = stack(FACES), total
     for k in range(total):
-        seen[k] = 1.0 if k == face or dot(normals[k], points[new]) > depths[k] - within else 0.0
+        visible[k] = 1.0 if k == face or dot(normals[k], points[new]) > depths[k] - within else 0.0
     for k in range(total):
-        if seen[k] == 1:
+        if visible[k] == 1:
             for side in range(1 if prism else 0, 3):
                 one, two = faces[k, side], faces[k, (side + 1) % 3]
-                if not has_side(faces, seen, total, two, one) and end < FACES:
+                if not has_side(faces, visible, total, two, one) and count < FACES:
                     if prism and one == 3:
-                        end = add_face(points, int(two), new, 3, prism, faces, normals, depths, end)
+                        count = add_face(points, int(two), new, 3, prism, faces, normals, depths, count)
                     elif prism:
-                        end = add_face(points, new, int(one), 3, prism, faces, normals, depths, end)
+                        count = add_face(points, new, int(one), 3, prism, faces, normals, depths, count)
                     else:
-                        end = add_face(points, int(one), int(two), new, prism, faces, normals, depths, end)
+                        count = add_face(points, int(one), int(two), new, prism, faces, normals, depths, count)
     left = 0
-    for k in range(end):
-        if k >= total or seen[k] == 0:
+    for k in range(count):
+        if k >= total or visible[k] == 0:
             for i in range(3):
                 faces[left, i], normals[left, i] = faces[k, i], normals[k, i]
             depths[left] = depths[k]
@@ -255,10 +255,10 @@ def add_point(points, new, face, prism, within, faces, normals, depths, total):
 
 
 @compact
-def has_side(faces, seen, total, one, two):
-    """Whether a face that is seen has the side from a point to another."""
+def has_side(faces, visible, total, one, two):
+    """Whether a visible face has the side from a point to another."""
     for k in range(total):
-        if seen[k] == 1:
+        if visible[k] == 1:
             for side in range(3):
                 if faces[k, side] == one and faces[k, (side + 1) % 3] == two:
                     return True

@@ -40,14 +40,14 @@ from lqrsim.kernels.stages import (
     EQUALITY,
     LIMIT,
     adjoint,
+    convex_fraction_at,
+    determine_scales,
     direction,
-    measure,
+    evaluate_plan,
+    plan_residuals,
     read_rows,
     regularised_direction,
     row_change,
-    share_of,
-    survey,
-    trial,
     write_models,
     write_models_and_costates,
 )
@@ -106,7 +106,7 @@ SIGNS = (1.0, -1.0)
 
 # Tasks of `interior_point`: to find typical sizes at a plan; to choose slacks and multipliers there; to take steps
 # without a barrier from there; to iterate; and to cross over, because no iteration follows.
-SURVEY, BEGIN, POLISH, ITERATE, CLOSE = 0, 1, 2, 3, 4
+SCALE, BEGIN, POLISH, ITERATE, CLOSE = 0, 1, 2, 3, 4
 
 
 @compact
@@ -116,7 +116,7 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     All code that a solve can need is compiled together, before it begins.
 
     Args:
-      task: one of SURVEY, BEGIN, POLISH, ITERATE and CLOSE.
+      task: one of SCALE, BEGIN, POLISH, ITERATE and CLOSE.
       tolerance: tolerance of stationarity, gaps and complementarity. violation: of constraints, in their units.
       begun: PlanBeginning. stages: PlanStages. work: InteriorArrays. memory: (1,) row of INTERIOR.
       log: rows of MEASURES, written.
@@ -125,7 +125,7 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
       The number of iterations so far; and CONVERGED if the crossover succeeded, STALLED if nothing helps any more,
       otherwise RUNNING. `memory.solved` says whether the measures were within tolerance.
     """
-    if task == SURVEY:
+    if task == SCALE:
         find_sizes(begun, stages, work, memory[0])
         return 0, RUNNING
     if task == BEGIN:
@@ -146,15 +146,15 @@ def find_sizes(begun, stages, work, mem):
         edge = EDGE * (high - low) if high - low < inf else 0.0
         for t in range(steps):
             now.plan.controls[t, i] = min(max(now.plan.controls[t, i], low + edge), high - edge)
-    stages.keeps[0] = 0.0
-    mem.typical = survey(stages, now.plan)
+    stages.reuses_derivatives[0] = 0.0
+    mem.typical = determine_scales(stages, now.plan)
 
 
 @compact
 def begin(begun, stages, work, mem):
     """Begin from that plan: compute slacks, multipliers and measures."""
     rows, now, steps = stages.rows, work.now, stages.steps
-    mem.cost = trial(stages, now.plan, now.arrived)
+    mem.cost = evaluate_plan(stages, now.plan, now.arrived)
     read_rows(stages, now.plan, now.numbers)
     # A cost near zero, as when standing still, says nothing about the scale of the problem.
     mem.scale = max(mem.cost, NOTHING * mem.typical) if mem.cost < inf else FAR * mem.typical
@@ -167,7 +167,7 @@ def begin(begun, stages, work, mem):
             if rows.prices[at] < inf:
                 mem.elastic = 1.0
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
-    mem.highest, mem.part, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
+    mem.highest, mem.fraction, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
     mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, inf, 0.0, begun.oldest
     clear(now.slacks, rows.size * (steps + 1), 2)
@@ -189,24 +189,24 @@ def begin_row(at, begun, stages, work, mem):
     """Choose the first slacks and the multiplier of a row."""
     rows = stages.rows
     equality, size, price = rows.kinds[at] == EQUALITY, rows.sizes[at], rows.prices[at]
-    number, force, least = work.now.numbers[at], 0.0, begun.room * size
-    if begun.informed:
-        force = begun.known[at]
+    number, force, least = work.now.numbers[at], 0.0, begun.least_slack * size
+    if begun.has_multipliers:
+        force = begun.multipliers[at]
     if force > 0 and not equality:
         least = min(least, mem.parameter / force)
     slack = 0.0
     if has_slack(at, LOWER, rows):
         slack = max(number, 0.0) + least if equality else max(number, least)
         middle = mem.parameter / slack
-        if begun.informed and not equality:
+        if begun.has_multipliers and not equality:
             force = min(max(force, middle / AROUND), AROUND * middle)
-        elif not begun.informed:
+        elif not begun.has_multipliers:
             force = 0.0 if equality else middle
         work.now.slacks[at, LOWER] = slack
     if has_slack(at, UPPER, rows):
         work.now.slacks[at, UPPER] = max(slack - number, BARELY * least)
-    far = WITHIN * price if price < inf else inf
-    rows.force[at] = min(max(force, -far if equality else 0.0), far)
+    highest = WITHIN * price if price < inf else inf
+    rows.force[at] = min(max(force, -highest if equality else 0.0), highest)
 
 
 def has_slack(at, side, rows):
@@ -278,7 +278,7 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
 def creeping(violation, mem):
     """Whether the steps are short, and have been for long."""
     falls = mem.violation <= violation and mem.cost < mem.before - SLOW * abs(mem.before)
-    if mem.part >= CREEP or falls or mem.solved != 0:
+    if mem.fraction >= CREEP or falls or mem.solved != 0:
         mem.short, mem.before = 0.0, mem.cost
     else:
         mem.short += 1
@@ -316,24 +316,24 @@ def iterate(done, tolerance, stages, work, mem):
         if mem.unchanged >= FALLS and mem.parameter > least:
             mem.parameter, mem.filtered, mem.unchanged = max(least, FALL * FALL * mem.parameter), 0.0, 0.0
     lower_barrier(done, least, free, stages, work, mem)
-    part = -1.0
+    fraction = -1.0
     while True:
         if not models_with_barrier(stages, work, mem):
             return False
         find_step(least, free, stages, work, mem)
-        part = search(True, stages, work, mem)
-        if part < min(LONG, mem.whole) and mem.age > 0:
+        fraction = search(True, stages, work, mem)
+        if fraction < min(LONG, mem.whole) and mem.age > 0:
             renew(stages, work, mem)
             continue
         # Far away, linearised equalities may be absurd; softened equalities demand only a part.
-        if part >= STUCK or largest_multiplier_step(stages, work) < ABSURD * mem.scale or mem.soft >= SOFTEST:
+        if fraction >= STUCK or largest_multiplier_step(stages, work) < ABSURD * mem.scale or mem.soft >= SOFTEST:
             break
         mem.soft *= SOFTER
-    if part < 0:
-        part = force_step(stages, work, mem)
-    if part < 0:
+    if fraction < 0:
+        fraction = force_step(stages, work, mem)
+    if fraction < 0:
         return False
-    accept_step(part, stages, work, mem)
+    accept_step(fraction, stages, work, mem)
     return True
 
 
@@ -373,7 +373,7 @@ def lower_barrier(done, least, free, stages, work, mem):
     mem.highest = min(mem.highest, mem.barrier * mem.scale / max(mem.pairs, 1.0))
     if mem.parameter > mem.highest and done > 0:
         mem.parameter, mem.filtered = mem.highest, 0.0
-    if free and mem.rung == 0 and mem.part >= LONG:
+    if free and mem.rung == 0 and mem.fraction >= LONG:
         return
     for _ in range(LEVELS):
         residual = max(mem.stationarity * mem.scale, max(mem.miss, mem.gap) * mem.scale)
@@ -415,19 +415,19 @@ def models_with_barrier(stages, work, mem):
     rung = regularised_direction(stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
     if rung < 0:
         return False
-    mem.rung, mem.share = float(rung), share_of(rung)
+    mem.rung, mem.convex_fraction = float(rung), convex_fraction_at(rung)
     return True
 
 
 @compact
-def write_row_forces(beyond, corrections, stages, work, mem):
-    """Write the forces of the rows in the condensed equations of a step; `beyond` adds further residuals."""
+def write_row_forces(extra_residuals, corrections, stages, work, mem):
+    """Write the forces of the rows in the condensed equations of a step; `extra_residuals` adds further residuals."""
     rows = stages.rows
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
             residual = residual_of(at, corrections, rows, work, mem)
-            if beyond:
-                residual += work.beyond[at]
+            if extra_residuals:
+                residual += work.extra_residuals[at]
             work.forces[at] = rows.force[at] - work.curves[at] * residual
 
 
@@ -442,14 +442,14 @@ def residual_of(at, corrections, rows, work, mem):
 
 
 @compact
-def solve(beyond, corrections, gaps, stages, work, mem):
+def solve(extra_residuals, corrections, gaps, stages, work, mem):
     """Compute another step with the same models, but without weights on changes; return whether there is one."""
-    write_row_forces(beyond, corrections, stages, work, mem)
-    return direction(stages, work.now.plan, gaps, mem.share, 0.0, 1.0, work.curves, work.forces) == -1
+    write_row_forces(extra_residuals, corrections, stages, work, mem)
+    return direction(stages, work.now.plan, gaps, mem.convex_fraction, 0.0, 1.0, work.curves, work.forces) == -1
 
 
 @compact
-def complete(beyond, corrections, out, stages, work, mem):
+def complete(extra_residuals, corrections, out, stages, work, mem):
     """Complete the step in `stages` by slacks and multipliers, (PlanStep)."""
     rows, slacks = stages.rows, work.now.slacks
     copy_plan(stages.steps, stages.changes, out.changes)
@@ -459,10 +459,10 @@ def complete(beyond, corrections, out, stages, work, mem):
         out.force[at] = 0.0
         if rows.live[at] == 0:
             continue
-        ahead = row_change(at, stages) + residual_of(at, corrections, rows, work, mem)
-        if beyond:
-            ahead += work.beyond[at]
-        change = -work.curves[at] * ahead
+        residual = row_change(at, stages) + residual_of(at, corrections, rows, work, mem)
+        if extra_residuals:
+            residual += work.extra_residuals[at]
+        change = -work.curves[at] * residual
         out.force[at] = change
         for side in range(2):
             if has_slack(at, side, rows):
@@ -474,7 +474,7 @@ def complete(beyond, corrections, out, stages, work, mem):
 @compact
 def find_step(least, free, stages, work, mem):
     """Find the step of an iteration, with corrections if its models have a minimum without regularisation."""
-    if mem.rung == 0 and free and mem.part >= LONG and mem.pairs > 0:
+    if mem.rung == 0 and free and mem.fraction >= LONG and mem.pairs > 0:
         predict(least, stages, work, mem)
         solve(False, work.corrections, work.gaps, stages, work, mem)
     complete(False, work.corrections, work.step, stages, work, mem)
@@ -514,21 +514,21 @@ def centre(stages, work, mem):
     a factor of `OUTLIER` of the barrier parameter (Gondzio, 1996).
     """
     rows, slacks, step, corrections = stages.rows, work.now.slacks, work.step, work.corrections
-    share = boundary(mem)
-    part, dual = longest(share, slacks, step.slacks, stages), longest_dual(share, step.force, stages)
-    if part >= LONG:
+    tau = boundary(mem)
+    fraction, dual = longest(tau, slacks, step.slacks, stages), longest_dual(tau, step.force, stages)
+    if fraction >= LONG:
         return
-    ahead, dual_ahead = min(1.0, part + REACH), min(1.0, dual + REACH)
+    longer, dual_longer = min(1.0, fraction + REACH), min(1.0, dual + REACH)
     for at in range(rows.size * (stages.steps + 1)):
         for side in range(2):
             if rows.live[at] != 0 and has_slack(at, side, rows):
-                distance = from_bound(at, side, rows) + SIGNS[side] * dual_ahead * step.force[at]
-                product = (slacks[at, side] + ahead * step.slacks[at, side]) * distance
+                distance = from_bound(at, side, rows) + SIGNS[side] * dual_longer * step.force[at]
+                product = (slacks[at, side] + longer * step.slacks[at, side]) * distance
                 work.others[at, side] = corrections[at, side] - lacking(product, mem)
     if not solve(False, work.others, work.gaps, stages, work, mem):
         return
     complete(False, work.others, work.other, stages, work, mem)
-    if longest(share, slacks, work.other.slacks, stages) >= part + FURTHER * REACH:
+    if longest(tau, slacks, work.other.slacks, stages) >= fraction + FURTHER * REACH:
         count = rows.size * (stages.steps + 1)
         copy_matrix(work.others, count, 2, corrections)
         copy_matrix(work.other.slacks, count, 2, step.slacks)
@@ -544,31 +544,31 @@ def lacking(product, mem):
 
 
 def boundary(mem):
-    """The share of the distance to a zero slack that a step may take."""
+    """The fraction of the distance to a zero slack that a step may take."""
     return max(BOUNDARY, 1 - mem.parameter / mem.scale)
 
 
 @compact
-def longest(share, slacks, changes, stages):
-    """The largest part of the changes of slacks, at most 1, by the fraction-to-the-boundary rule."""
-    rows, part = stages.rows, 1.0
+def longest(tau, slacks, changes, stages):
+    """The largest fraction of the changes of slacks, at most 1, by the fraction-to-the-boundary rule with `tau`."""
+    rows, fraction = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
         for side in range(2):
             if rows.live[at] != 0 and has_slack(at, side, rows) and changes[at, side] < 0:
-                part = min(part, -share * slacks[at, side] / changes[at, side])
-    return part
+                fraction = min(fraction, -tau * slacks[at, side] / changes[at, side])
+    return fraction
 
 
 @compact
-def longest_dual(share, changes, stages):
+def longest_dual(tau, changes, stages):
     """The same for changes of the multipliers, and their bounds."""
-    rows, part = stages.rows, 1.0
+    rows, fraction = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
         for side in range(2):
             change = SIGNS[side] * changes[at]
             if rows.live[at] != 0 and has_slack(at, side, rows) and change < 0:
-                part = min(part, -share * from_bound(at, side, rows) / change)
-    return part
+                fraction = min(fraction, -tau * from_bound(at, side, rows) / change)
+    return fraction
 
 
 # The line search.
@@ -588,24 +588,24 @@ def search(corrected, stages, work, mem):
     step, now = work.step, work.now
     mem.slope, mem.violated = slope_of_merit(stages, work, mem), off(now, stages)
     mem.merit = merit_of(now, mem.cost, stages, mem)
-    part, first = longest(boundary(mem), now.slacks, step.slacks, stages), True
-    mem.whole = part
-    while part > SHORTEST:
-        mem.tried = go(part, now, step.changes, step.slacks, work.tried, stages)
-        if isfinite(mem.tried) and acceptable(part, work.tried, mem.tried, stages, work, mem):
-            if corrected and part >= LONG and mem.oldest == 0:
-                close_residuals(part, stages, work, mem)
-            return part
-        if first and isfinite(mem.tried) and corrected and correct(part, stages, work, mem):
-            close_residuals(part, stages, work, mem)
-            return part
+    fraction, first = longest(boundary(mem), now.slacks, step.slacks, stages), True
+    mem.whole = fraction
+    while fraction > SHORTEST:
+        mem.tried = go(fraction, now, step.changes, step.slacks, work.tried, stages)
+        if isfinite(mem.tried) and acceptable(fraction, work.tried, mem.tried, stages, work, mem):
+            if corrected and fraction >= LONG and mem.oldest == 0:
+                close_residuals(fraction, stages, work, mem)
+            return fraction
+        if first and isfinite(mem.tried) and corrected and correct(fraction, stages, work, mem):
+            close_residuals(fraction, stages, work, mem)
+            return fraction
         first = False
-        part /= 2
+        fraction /= 2
     return -1.0
 
 
 @compact
-def correct(part, stages, work, mem):
+def correct(fraction, stages, work, mem):
     """Try a step that also reduces the residuals at a trial, if these have not fallen; return whether it is accepted.
 
     Multipliers and costates come from the uncorrected step.
@@ -616,16 +616,16 @@ def correct(part, stages, work, mem):
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
             before = missed(at, now)
-            work.beyond[at] = part * before + missed(at, tried) - before
+            work.extra_residuals[at] = fraction * before + missed(at, tried) - before
     for t in range(stages.steps):
         for i in range(N):
-            work.wider[t, i] = part * work.gaps[t, i] + tried.arrived[t, i] - tried.plan.states[t + 1, i]
-    if not solve(True, work.corrections, work.wider, stages, work, mem):
+            work.extra_gaps[t, i] = fraction * work.gaps[t, i] + tried.arrived[t, i] - tried.plan.states[t + 1, i]
+    if not solve(True, work.corrections, work.extra_gaps, stages, work, mem):
         return False
     complete(True, work.corrections, work.other, stages, work, mem)
-    far = longest(boundary(mem), now.slacks, work.other.slacks, stages)
-    cost = go(far, now, work.other.changes, work.other.slacks, work.closer, stages)
-    if not isfinite(cost) or not acceptable(part, work.closer, cost, stages, work, mem):
+    longest_fraction = longest(boundary(mem), now.slacks, work.other.slacks, stages)
+    cost = go(longest_fraction, now, work.other.changes, work.other.slacks, work.closer, stages)
+    if not isfinite(cost) or not acceptable(fraction, work.closer, cost, stages, work, mem):
         return False
     copy_point(work.closer, work.tried, stages)
     mem.tried = cost
@@ -633,7 +633,7 @@ def correct(part, stages, work, mem):
 
 
 @compact
-def close_residuals(part, stages, work, mem):
+def close_residuals(fraction, stages, work, mem):
     """Move the trial towards feasibility by the smallest changes, as far as the filter accepts them.
 
     The changes use the models of the step, so each change costs a Riccati pass and an evaluation of the steps. A good
@@ -646,8 +646,9 @@ def close_residuals(part, stages, work, mem):
             work.forces[at] = -work.curves[at] * missed(at, tried) if rows.live[at] != 0 else 0.0
         for t in range(stages.steps):
             for i in range(N):
-                work.wider[t, i] = tried.arrived[t, i] - tried.plan.states[t + 1, i]
-        if direction(stages, work.now.plan, work.wider, mem.share, 0.0, 0.0, work.curves, work.forces) != -1:
+                work.extra_gaps[t, i] = tried.arrived[t, i] - tried.plan.states[t + 1, i]
+        convex, plan = mem.convex_fraction, work.now.plan
+        if direction(stages, plan, work.extra_gaps, convex, 0.0, 0.0, work.curves, work.forces) != -1:
             return
         for at in range(rows.size * (stages.steps + 1)):
             if rows.live[at] != 0:
@@ -655,11 +656,11 @@ def close_residuals(part, stages, work, mem):
                 for side in range(2):
                     dual = from_bound(at, side, rows)
                     other.slacks[at, side] = -SIGNS[side] * slacks[at, side] / dual * change
-        far = longest(boundary(mem), tried.slacks, other.slacks, stages)
-        cost = go(far, tried, stages.changes, other.slacks, work.closer, stages)
+        longest_fraction = longest(boundary(mem), tried.slacks, other.slacks, stages)
+        cost = go(longest_fraction, tried, stages.changes, other.slacks, work.closer, stages)
         if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:
             return
-        if not acceptable(part, work.closer, cost, stages, work, mem):
+        if not acceptable(fraction, work.closer, cost, stages, work, mem):
             return
         copy_point(work.closer, tried, stages)
         mem.tried = cost
@@ -672,61 +673,61 @@ def force_step(stages, work, mem):
     It is the step of the projected Hessian; or, if the filter rejects that, a small fraction of it, better or not.
     """
     mem.forced += 1
-    mem.share = 1.0
+    mem.convex_fraction = 1.0
     clear(work.corrections, stages.rows.size * (stages.steps + 1), 2)
     if mem.forced > FORCED or not solve(False, work.corrections, work.gaps, stages, work, mem):
         return -1.0
     mem.filtered = 0.0
     complete(False, work.corrections, work.step, stages, work, mem)
-    part = search(False, stages, work, mem)
-    if part >= 0:
-        return part
-    part = SOME * longest(boundary(mem), work.now.slacks, work.step.slacks, stages)
-    mem.tried = go(part, work.now, work.step.changes, work.step.slacks, work.tried, stages)
-    return part if isfinite(mem.tried) else -1.0
+    fraction = search(False, stages, work, mem)
+    if fraction >= 0:
+        return fraction
+    fraction = SOME * longest(boundary(mem), work.now.slacks, work.step.slacks, stages)
+    mem.tried = go(fraction, work.now, work.step.changes, work.step.slacks, work.tried, stages)
+    return fraction if isfinite(mem.tried) else -1.0
 
 
 @compact
-def accept_step(part, stages, work, mem):
+def accept_step(fraction, stages, work, mem):
     """Go to the trial, with that fraction of the step in multipliers and costates."""
     rows, step, count = stages.rows, work.step, int(mem.filtered)
     work.filter[count, 0] = (1 - MARGIN) * mem.violated
     work.filter[count, 1] = merit_of(work.now, mem.cost, stages, mem) - MARGIN * mem.violated
     mem.filtered += 1
-    mem.part = part
-    if part >= LONG:
+    mem.fraction = fraction
+    if fraction >= LONG:
         mem.soft = max(1.0, mem.soft / SOFTER)
     dual = longest_dual(boundary(mem), step.force, stages)
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            rows.force[at] += (part if regularised(at, rows) else dual) * step.force[at]
+            rows.force[at] += (fraction if regularised(at, rows) else dual) * step.force[at]
             if is_hard(at, rows):  # its product stays within a factor of the barrier parameter
                 middle = mem.parameter / work.tried.slacks[at, LOWER]
                 rows.force[at] = min(max(rows.force[at], middle / WIDE), WIDE * middle)
     for t in range(stages.steps + 1):
         for i in range(N):
-            work.costates[t, i] += part * (step.costates[t, i] - work.costates[t, i])
+            work.costates[t, i] += fraction * (step.costates[t, i] - work.costates[t, i])
     before, new, learns = mem.stationarity, work.tried.plan, stages.learns == 1 and mem.oldest == 0
     mem.age = mem.age + 1 if mem.age < mem.oldest else 0.0
-    stages.keeps[0] = 1.0 if mem.age > 0 else 0.0
+    stages.reuses_derivatives[0] = 1.0 if mem.age > 0 else 0.0
     if learns:
         remember(stages, work.now.plan, new, work.costates, work.last_step, work.turns)
     go_to(work.tried, mem.tried, NEGLIGIBLE * mem.scale, stages, work, mem)
     if learns:
-        learn(stages, work.costates, work.last_step, work.turns, part >= LONG and mem.stationarity > CRAWL * before)
+        learn(stages, work.costates, work.last_step, work.turns, fraction >= LONG and mem.stationarity > CRAWL * before)
 
 
 @compact
-def go(part, about, changes, slacks, out, stages):
+def go(fraction, about, changes, slacks, out, stages):
     """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
     rows, steps, good = stages.rows, stages.steps, True
     for t in range(steps + 1):
         for i in range(N):
-            out.plan.states[t, i] = about.plan.states[t, i] + part * changes.states[t, i]
+            out.plan.states[t, i] = about.plan.states[t, i] + fraction * changes.states[t, i]
         if t < steps:
             for i in range(M):
-                out.plan.controls[t, i] = about.plan.controls[t, i] + part * changes.controls[t, i]
-    cost = trial(stages, out.plan, out.arrived)
+                out.plan.controls[t, i] = about.plan.controls[t, i] + fraction * changes.controls[t, i]
+    cost = evaluate_plan(stages, out.plan, out.arrived)
     for t in range(steps):
         for i in range(N):
             good = good and isfinite(out.arrived[t, i])
@@ -735,7 +736,7 @@ def go(part, about, changes, slacks, out, stages):
         if rows.live[at] != 0:
             good = good and isfinite(out.numbers[at])
             for side in range(2):
-                out.slacks[at, side] = about.slacks[at, side] + part * slacks[at, side]
+                out.slacks[at, side] = about.slacks[at, side] + fraction * slacks[at, side]
             if is_hard(at, rows):
                 out.slacks[at, LOWER] = max(out.slacks[at, LOWER], out.numbers[at])
     return cost if good else nan
@@ -805,7 +806,7 @@ def slope_of_merit(stages, work, mem):
 
 
 @compact
-def acceptable(part, point, cost, stages, work, mem):
+def acceptable(fraction, point, cost, stages, work, mem):
     """Whether the filter accepts a trial."""
     violated, merit, before, slope = off(point, stages), merit_of(point, cost, stages, mem), mem.violated, mem.slope
     if not isfinite(merit) or violated > mem.farthest or gap_of(point, stages) > mem.farthest_gap:
@@ -814,8 +815,8 @@ def acceptable(part, point, cost, stages, work, mem):
         if violated > work.filter[k, 0] and merit > work.filter[k, 1]:
             return False
     small = SMALL * max(1.0, PER_GAP * stages.steps * N)
-    if before < small and slope < 0 and min(-part * slope, HUGE) ** SWITCH > before**SWITCHED:
-        return merit <= mem.merit + ARMIJO * part * slope + ROUNDING * abs(mem.merit)
+    if before < small and slope < 0 and min(-fraction * slope, HUGE) ** SWITCH > before**SWITCHED:
+        return merit <= mem.merit + ARMIJO * fraction * slope + ROUNDING * abs(mem.merit)
     at_rest = violated < AT_REST and merit <= mem.merit + RESTING * abs(mem.merit)
     return violated <= (1 - MARGIN) * before or merit <= mem.merit - MARGIN * before or at_rest
 
@@ -846,7 +847,7 @@ def go_to(point, cost, least, stages, work, mem):
 @compact
 def renew(stages, work, mem):
     """Compute the derivatives of the dynamics anew, about the iterate."""
-    stages.keeps[0], mem.age = 0.0, 0.0
+    stages.reuses_derivatives[0], mem.age = 0.0, 0.0
     write_models(stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
     measure_iterate(stages, work, mem)
 
@@ -854,7 +855,7 @@ def renew(stages, work, mem):
 @compact
 def go_back(stages, work, mem):
     """Go back to the point that was kept."""
-    stages.keeps[0], mem.age = 0.0, 0.0
+    stages.reuses_derivatives[0], mem.age = 0.0, 0.0
     copy(work.kept_force, stages.rows.size * (stages.steps + 1), stages.rows.force)
     copy_matrix(work.kept_costates, stages.steps + 1, N, work.costates)
     go_to(work.kept, mem.kept, NEGLIGIBLE * mem.kept_scale, stages, work, mem)
@@ -873,7 +874,7 @@ def keep_point(stages, work, mem):
 def measure_iterate(stages, work, mem):
     """Compute the measures of the iterate, about which the models are."""
     rows, slacks = stages.rows, work.now.slacks
-    steepest, missing, unequal, widest, product = measure(stages, work.now.plan, work.now.numbers, work.gaps)
+    steepest, missing, unequal, widest, product = plan_residuals(stages, work.now.plan, work.now.numbers, work.gaps)
     # Measures are relative to the cost, or to a fraction of its typical size if its terms cancel.
     least = CANCELLED * mem.typical
     mem.scale = max(abs(mem.cost), least) if isfinite(mem.cost) else least
@@ -898,13 +899,13 @@ def polish(tolerance, violation, begun, stages, work, mem):
     rows, plan = stages.rows, work.active.plan
     keep_point(stages, work, mem)
     copy_plan(stages.steps, begun.plan, plan)
-    cost = trial(stages, plan, work.tried.arrived)
+    cost = evaluate_plan(stages, plan, work.tried.arrived)
     read_rows(stages, plan, rows.numbers)
     for at in range(rows.size * (stages.steps + 1)):
         rows.force[at] = 0.0
         if rows.live[at] != 0:
             size, price = rows.sizes[at], rows.prices[at]
-            rows.force[at] = min(max(begun.known[at], -price), price)
+            rows.force[at] = min(max(begun.multipliers[at], -price), price)
             if rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * size:
                 rows.force[at] = AT_LIMIT * mem.scale / size
     if isfinite(cost):
@@ -956,8 +957,8 @@ def polish_rows(tolerance, violation, stages, work, mem):
         apply_step(violation, stages, active, memory)
         if not isfinite(memory.cost):
             return False
-        far = farthest_from_target(rows, stages.steps)
-        if max(memory.stationarity, memory.gap) < POLISHED * tolerance and far < POLISHED * violation:
+        farthest = farthest_from_target(rows, stages.steps)
+        if max(memory.stationarity, memory.gap) < POLISHED * tolerance and farthest < POLISHED * violation:
             break
     kept = mem.elastic != 0 or memory.violation <= violation
     if not kept or not max(memory.stationarity, memory.gap) < tolerance:

@@ -40,7 +40,7 @@ from lqrsim.kernels.records import CostToGo, Linearization, ModelOrder, Policy, 
 from lqrsim.kernels.rollouts import (
     copy_plan,
     copy_policy,
-    differential_pass,
+    ddp_pass,
     dynamics_residual,
     ilqr_pass,
     initial_step,
@@ -208,7 +208,7 @@ def optimality(settings, plan, model, cost, negligible):
     """The decrease that iLQR's model about a trajectory predicts, relative to its cost; infinite if its pass fails."""
     policy, to_go = Policy(stack(1, M, N), stack(1, M)), CostToGo(stack(1, N, N), stack(1, N), stack(1))
     shift = stack(N)
-    failed, _, left = differential_pass(settings.steps, plan, model, ModelOrder(0.0, 0.0, to_go), 0, policy, to_go)
+    failed, _, left = ddp_pass(settings.steps, plan, model, ModelOrder(0.0, 0.0, to_go), 0, policy, to_go)
     if not settings.fixed:
         left += initial_step(plan.states[0], model, 0.0, to_go, shift)
     return relative_optimality(failed, left, cost, negligible)

@@ -79,9 +79,9 @@ def places(x, data, out):
     """Write the coordinates of the balls, ball by ball."""
     p = at(data[0])
     slot = claim_slot(p)
-    one = at(p[SLOTS] + 8 * SLOT * slot)
-    move_bodies(x, p, one)
-    origins, axes = at(one[XPOS]), at(one[XMAT])
+    addresses = at(p[SLOTS] + 8 * SLOT * slot)
+    move_bodies(x, p, addresses)
+    origins, axes = at(addresses[XPOS]), at(addresses[XMAT])
     for k in range(int(data[1])):
         body = int(data[2 + 4 * k])
         for i in range(3):
@@ -92,10 +92,10 @@ def places(x, data, out):
     store(p[FLAGS], slot, 0)
 
 
-def move_bodies(x, p, one):
+def move_bodies(x, p, addresses):
     """Move the bodies of an MjData to the positions of a state."""
-    write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    write_positions(x, p, at(addresses[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(addresses[DATA]))
 
 
 @outline
@@ -103,9 +103,9 @@ def find(x, displaced, offset, data, first, out, which, segments):
     """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
     p = at(data[0])
     slot = claim_slot(p)
-    one = at(p[SLOTS] + 8 * SLOT * slot)
-    move_bodies(x, p, one)
-    find_with_data(p, one, data, displaced, offset, first, out, which, segments)
+    addresses = at(p[SLOTS] + 8 * SLOT * slot)
+    move_bodies(x, p, addresses)
+    find_with_data(p, addresses, data, displaced, offset, first, out, which, segments)
     store(p[FLAGS], slot, 0)
 
 
@@ -116,19 +116,19 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     """
     p = at(data[0])
     slot, nv = claim_slot(p), int(p[NV])
-    one = at(p[SLOTS] + 8 * SLOT * slot)
+    addresses = at(p[SLOTS] + 8 * SLOT * slot)
     moves, others, normal, there, nowhere = stack(3 * N), stack(3 * N), stack(3), stack(3), stack(1)
-    move_bodies(x, p, one)
-    call(p[COMPOS], at(p[MODEL]), at(one[DATA]))
-    find_with_data(p, one, data, nowhere, -1, first, out, which, segments)
+    move_bodies(x, p, addresses)
+    call(p[COMPOS], at(p[MODEL]), at(addresses[DATA]))
+    find_with_data(p, addresses, data, nowhere, -1, first, out, which, segments)
     for row in range(int(data[1])):
         if which[row] >= 0:
             pair = PAIRS + PAIR * int(which[row])
-            write_normal(one, int(data[pair + 1]), int(data[pair + 3]), out[first + row], segments[row], normal)
-            call(p[JAC], at(p[MODEL]), at(one[DATA]), moves, 0, segments[row], int32(int(data[pair + 2])))
+            write_normal(addresses, int(data[pair + 1]), int(data[pair + 3]), out[first + row], segments[row], normal)
+            call(p[JAC], at(p[MODEL]), at(addresses[DATA]), moves, 0, segments[row], int32(int(data[pair + 2])))
             if data[pair + 6] > 0:
                 copy_part(segments[row], 3, there, 0, 3)
-                call(p[JAC], at(p[MODEL]), at(one[DATA]), others, 0, there, int32(int(data[pair + 6])))
+                call(p[JAC], at(p[MODEL]), at(addresses[DATA]), others, 0, there, int32(int(data[pair + 6])))
                 for j in range(3 * nv):
                     moves[j] -= others[j]
             for j in range(nv):
@@ -138,12 +138,12 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     store(p[FLAGS], slot, 0)
 
 
-def find_with_data(p, one, data, displaced, offset, first, out, which, segments):
+def find_with_data(p, addresses, data, displaced, offset, first, out, which, segments):
     """As `find`, of an MjData that has its positions.
 
     If `offset` is not negative, obstacles are displaced by the three numbers from displaced[offset + 3 row] on.
     """
-    middles, axes, segment = at(one[GEOM_XPOS]), at(one[GEOM_XMAT]), stack(6)
+    middles, axes, segment = at(addresses[GEOM_XPOS]), at(addresses[GEOM_XMAT]), stack(6)
     for row in range(int(data[1])):
         out[first + row], which[row] = data[LARGEST], -1.0
     for k in range(int(data[2])):
@@ -162,15 +162,16 @@ def find_with_data(p, one, data, displaced, offset, first, out, which, segments)
         least = out[first + row]
         if not apart - data[pair + 4] >= least:
             distance = call_for_value(
-                p[DISTANCE], at(p[DISTANCE_MODEL]), at(one[DATA]), int32(own // 3), int32(other // 3), least, segment
-            )
+                p[DISTANCE], at(p[DISTANCE_MODEL]), at(addresses[DATA]), int32(own // 3), int32(other // 3),
+                least, segment,
+            )  # fmt: skip
             if not distance >= least:
                 out[first + row], which[row] = distance, float(k)
                 copy(segment, 6, segments[row])
         middles[other], middles[other + 1], middles[other + 2] = before_x, before_y, before_z
 
 
-def write_normal(one, own, other, distance, segment, normal):
+def write_normal(addresses, own, other, distance, segment, normal):
     """Write the direction from the robot's nearest point to the obstacle's; if both coincide, from centre to centre."""
     length = 0.0
     for i in range(3):
@@ -178,7 +179,7 @@ def write_normal(one, own, other, distance, segment, normal):
         length += normal[i] * normal[i]
     sign = 1.0 if distance >= 0 else -1.0
     if length < TOUCHING * TOUCHING:
-        middles = at(one[GEOM_XPOS])
+        middles = at(addresses[GEOM_XPOS])
         sign, length = 1.0, 0.0
         for i in range(3):
             normal[i] = middles[3 * other + i] - middles[3 * own + i]

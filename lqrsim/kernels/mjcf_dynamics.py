@@ -94,15 +94,15 @@ def step_jacobian(x, u, p, h, out, jacobian):
         return
     team, slot = p[TEAM], claim_slot(p)
     together = team != 0 and load(team, HELPERS) > 0 and claim(team, BUSY) == 1
-    one, before, accelerations, arrived = at(p[SLOTS] + 8 * SLOT * slot), zeros(N), zeros(N), stack(N)
+    addresses, before, accelerations, arrived = at(p[SLOTS] + 8 * SLOT * slot), zeros(N), zeros(N), stack(N)
     columns, other_side = stack(N, W), stack(N, W)
-    run(z, p, substeps, one, out)
+    run(z, p, substeps, addresses, out)
     for k in range(substeps):
         # Errors of one-sided differences change their sign with the side: those of neighbouring steps nearly cancel.
         side = 1.0 if k % 2 == 0 else -1.0
-        difference(z, p, side, together, one, before, accelerations, arrived, columns)
-        if curved(z, p, side, one, accelerations, arrived, columns):
-            difference(z, p, -side, together, one, before, accelerations, arrived, other_side)
+        difference(z, p, side, together, addresses, before, accelerations, arrived, columns)
+        if curved(z, p, side, addresses, accelerations, arrived, columns):
+            difference(z, p, -side, together, addresses, before, accelerations, arrived, other_side)
             for i in range(N):
                 for j in range(W):
                     columns[i, j] = 0.5 * (columns[i, j] + other_side[i, j])
@@ -117,26 +117,27 @@ def step_jacobian(x, u, p, h, out, jacobian):
     store(p[FLAGS], slot, 0)
 
 
-def difference(z, p, side, together, one, before, accelerations, arrived, columns):
+def difference(z, p, side, together, addresses, before, accelerations, arrived, columns):
     """Write the Jacobian of a physics step by differences to one side, with the helpers if there is a team.
 
     Args:
-      side: 1 or -1. one: a slot. before: (N,) accelerations of the step before, at which MuJoCo's solver begins.
-      accelerations, arrived: (N,) those of this step and the state after it, written.
+      side: 1 or -1. addresses: of a slot.
+      before: (N,) accelerations of the step before, at which MuJoCo's solver begins. accelerations, arrived: (N,) those
+        of this step and the state after it, written.
     """
     if together:
         publish(z, p, side, before)
-    linearize_here(z, p, p, one, before, accelerations, arrived)
+    linearize_here(z, p, p, addresses, before, accelerations, arrived)
     if together:
-        share_columns(z, p, side, one, accelerations, arrived, columns)
+        share_columns(z, p, side, addresses, accelerations, arrived, columns)
     else:
         for k in range(W):
-            column(k, z, p, side, one, accelerations, arrived, columns)
+            column(k, z, p, side, addresses, accelerations, arrived, columns)
 
 
 @outline
 @exact
-def curved(z, p, side, one, accelerations, arrived, columns):
+def curved(z, p, side, addresses, accelerations, arrived, columns):
     """Whether one-sided differences of a physics step are too inexact.
 
     A change of everything at once, to the other side, then leads elsewhere than the columns say.
@@ -144,7 +145,7 @@ def curved(z, p, side, one, accelerations, arrived, columns):
     moved, reached, off, largest = stack(W), stack(N), 0.0, 0.0
     for j in range(W):
         moved[j] = z[j] - side * WIDTH * max(1.0, abs(z[j]))
-    step_from(moved, z, p, one, accelerations, 0, reached)
+    step_from(moved, z, p, addresses, accelerations, 0, reached)
     for i in range(N):
         expected = arrived[i]
         for j in range(W):
@@ -179,12 +180,12 @@ def publish(z, p, side, before):
     store(team, TICKET, JOBS * (load(team, TICKET) // JOBS + 1))
 
 
-def share_columns(z, p, side, one, accelerations, arrived, columns):
+def share_columns(z, p, side, addresses, accelerations, arrived, columns):
     """Compute columns of the job that helpers also have, and write all."""
     team, shared, patience = p[TEAM], job_columns(p), 0
     k = fetch_add(team, TICKET, 1) % JOBS
     while k < W:
-        column(k, z, p, side, one, accelerations, arrived, shared)
+        column(k, z, p, side, addresses, accelerations, arrived, shared)
         fetch_add(team, DONE, 1)
         k = fetch_add(team, TICKET, 1) % JOBS
     while load(team, DONE) < W:  # a helper still has work to do, once it gets to run
@@ -200,7 +201,7 @@ def help_out(p):
     A thread takes a column first, and reads its job afterwards. Until the column is done, no other job is written.
     """
     team, slot, known, patience = p[TEAM], claim_slot(p), -1, 0
-    one, job, columns = at(p[SLOTS] + 8 * SLOT * slot), at(p[JOB]), job_columns(p)
+    addresses, job, columns = at(p[SLOTS] + 8 * SLOT * slot), at(p[JOB]), job_columns(p)
     z, wrench, before, accelerations, arrived = stack(W), stack(6), stack(N), zeros(N), stack(N)
     while load(team, STOP) == 0:
         if load(team, TICKET) % JOBS >= W:
@@ -216,8 +217,8 @@ def help_out(p):
             copy_part(job, 1, z, 0, W)
             copy_part(job, 1 + W, before, 0, N)
             copy_part(job, 1 + W + N, wrench, 0, 6)
-            linearize_here(z, p, wrench, one, before, accelerations, arrived)
-        column(ticket % JOBS, z, p, job[0], one, accelerations, arrived, columns)
+            linearize_here(z, p, wrench, addresses, before, accelerations, arrived)
+        column(ticket % JOBS, z, p, job[0], addresses, accelerations, arrived, columns)
         fetch_add(team, DONE, 1)
     store(p[FLAGS], slot, 0)
 
@@ -227,30 +228,30 @@ def job_columns(p):
     return rows_at(p[JOB] + 8 * (1 + W + N + 6), W)
 
 
-def run(z, p, substeps, one, out):
+def run(z, p, substeps, addresses, out):
     """Write the state after this number of physics steps."""
     none = zeros(N)
-    write_loads(p, one)
-    write_to(z, p, one)
-    push(p, one)
-    start_from(p, one, none)  # so that it is independent of earlier steps
+    write_loads(p, addresses)
+    write_to(z, p, addresses)
+    push(p, addresses)
+    start_from(p, addresses, none)  # so that it is independent of earlier steps
     for _ in range(substeps):
-        call(p[STEP], at(one[OWN_MODEL]), at(one[DATA]))
-    read_from(z, p, one, out)
+        call(p[STEP], at(addresses[OWN_MODEL]), at(addresses[DATA]))
+    read_from(z, p, addresses, out)
 
 
-def linearize_here(z, p, wrench, one, before, accelerations, arrived):
+def linearize_here(z, p, wrench, addresses, before, accelerations, arrived):
     """Bring the MjData of a slot to the stages of a physics step, from which columns keep what does not change."""
-    write_loads(p, one)
-    push(wrench, one)
-    step_from(z, z, p, one, before, 0, arrived)
-    copy(at(one[QACC]), int(p[NV]), accelerations)
-    step_from(z, z, p, one, accelerations, 2, arrived)
+    write_loads(p, addresses)
+    push(wrench, addresses)
+    step_from(z, z, p, addresses, before, 0, arrived)
+    copy(at(addresses[QACC]), int(p[NV]), accelerations)
+    step_from(z, z, p, addresses, accelerations, 2, arrived)
 
 
 @outline
 @exact
-def column(k, z, p, side, one, accelerations, arrived, jacobian):
+def column(k, z, p, side, addresses, accelerations, arrived, jacobian):
     """Write the k-th column of a physics step's Jacobian, after `linearize_here`.
 
     Controls come first, then actuators' states, velocities and positions, each of which changes an earlier stage of a
@@ -261,7 +262,7 @@ def column(k, z, p, side, one, accelerations, arrived, jacobian):
     copy(z, W, moved)
     j = k + N if k < M else W - 1 - k
     moved[j] += side * WIDTH * max(1.0, abs(z[j]))
-    step_from(moved, z, p, one, accelerations, 2 if j >= 2 * nv else 1 if j >= nv else 0, reached)
+    step_from(moved, z, p, addresses, accelerations, 2 if j >= 2 * nv else 1 if j >= nv else 0, reached)
     for i in range(N):
         jacobian[i, j] = (reached[i] - arrived[i]) / (moved[j] - z[j])
 
@@ -288,13 +289,13 @@ def claim_slot(p):
     return slot
 
 
-def write_to(z, p, one):
+def write_to(z, p, addresses):
     """Write a state and a control into an MjData."""
     nv = int(p[NV])
-    write_positions(z, p, at(one[QPOS]))
-    copy_part(z, nv, at(one[QVEL]), 0, nv)
-    copy_part(z, 2 * nv, at(one[ACT]), 0, int(p[NA]))
-    copy_part(z, N, at(one[CTRL]), 0, M)
+    write_positions(z, p, at(addresses[QPOS]))
+    copy_part(z, nv, at(addresses[QVEL]), 0, nv)
+    copy_part(z, 2 * nv, at(addresses[ACT]), 0, int(p[NA]))
+    copy_part(z, N, at(addresses[CTRL]), 0, M)
 
 
 def write_positions(x, p, qpos):
@@ -310,51 +311,51 @@ def write_positions(x, p, qpos):
             qpos[q] = x[d]
 
 
-def push(wrench, one):
+def push(wrench, addresses):
     """Apply the wrench to the body."""
-    copy_part(wrench, WRENCH, at(one[PUSH]), 0, 6)
+    copy_part(wrench, WRENCH, at(addresses[PUSH]), 0, 6)
 
 
-def write_loads(p, one):
+def write_loads(p, addresses):
     """Add the loads to the bodies, at their centres of mass, in the model of the slot. Changes the MjData's positions.
 
     MuJoCo's constants follow the masses: inertias of bodies that float freely, and the inverse inertias by which the
     softness of contacts, limits, friction and equality constraints is scaled.
     """
-    count, first, masses = int(p[LOADED]), int(p[LOADS]), at(one[MASSES])
+    count, first, masses = int(p[LOADED]), int(p[LOADS]), at(addresses[MASSES])
     changed = False
     for k in range(count):
         body, mass = int(p[first + count + k]), p[first + 2 * count + k] + p[first + k]
         changed = changed or masses[body] != mass
         masses[body] = mass
     if changed:
-        call(p[CONSTANTS], at(one[OWN_MODEL]), at(one[DATA]))
+        call(p[CONSTANTS], at(addresses[OWN_MODEL]), at(addresses[DATA]))
 
 
-def start_from(p, one, guess):
+def start_from(p, addresses, guess):
     """Let the solver of the next step begin at these accelerations."""
-    copy(guess, int(p[NV]), at(one[WARM]))
+    copy(guess, int(p[NV]), at(addresses[WARM]))
 
 
-def step_from(z, near, p, one, guess, stages, out):
+def step_from(z, reference, p, addresses, guess, stages, out):
     """Write the state after a physics step, which keeps that number of stages of the MjData if it can."""
-    write_to(z, p, one)
-    start_from(p, one, guess)
-    call(p[STEP_SKIP], at(one[OWN_MODEL]), at(one[DATA]), int32(stages if p[KEEPS] != 0 else 0), int32(1))
-    read_from(near, p, one, out)
+    write_to(z, p, addresses)
+    start_from(p, addresses, guess)
+    call(p[STEP_SKIP], at(addresses[OWN_MODEL]), at(addresses[DATA]), int32(stages if p[KEEPS] != 0 else 0), int32(1))
+    read_from(reference, p, addresses, out)
 
 
-def read_from(near, p, one, out):
-    """Write the state of an MjData, with the rotations nearest to those in `near`; NaN if invalid."""
+def read_from(reference, p, addresses, out):
+    """Write the state of an MjData, with the rotations nearest to those in `reference`; NaN if invalid."""
     nv, na = int(p[NV]), int(p[NA])
-    qpos, qvel, act = at(one[QPOS]), at(one[QVEL]), at(one[ACT])
+    qpos, qvel, act = at(addresses[QPOS]), at(addresses[QVEL]), at(addresses[ACT])
     for k in range(int(p[JOINTS])):
         kind, q, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1]), int(p[TABLE + 3 * k + 2])
         if kind == FREE:
             copy_part(qpos, q, out, d, 3)
-            rotation_near(qpos, q + 3, p, near, d + 3, out)
+            rotation_near(qpos, q + 3, p, reference, d + 3, out)
         elif kind == BALL:
-            rotation_near(qpos, q, p, near, d, out)
+            rotation_near(qpos, q, p, reference, d, out)
         else:
             out[d] = qpos[q]
     copy_part(qvel, 0, out, nv, nv)
@@ -363,7 +364,7 @@ def read_from(near, p, one, out):
     for i in range(N):
         good = good and abs(out[i]) < LARGEST
     if not good:
-        call(p[RESET], at(one[OWN_MODEL]), at(one[DATA]))  # removes all traces of the invalid state
+        call(p[RESET], at(addresses[OWN_MODEL]), at(addresses[DATA]))  # removes all traces of the invalid state
         fill(out, N, nan)
 
 
@@ -387,12 +388,12 @@ def write_quaternion(x, first, p, qpos, q):
 
 @outline
 @exact
-def rotation_near(qpos, q, p, near, first, out):
-    """Write a quaternion's rotation to out[first], that nearest to the rotation in `near`: in its turn and its tilt."""
+def rotation_near(qpos, q, p, reference, first, out):
+    """Write a quaternion's rotation, nearest to that in `reference` in its turn and its tilt, to out[first]."""
     along, turn = 0.0, 0.0
     for i in range(3):
         along += p[AXIS + i] * qpos[q + 1 + i]
-        turn += p[AXIS + i] * near[first + i]
+        turn += p[AXIS + i] * reference[first + i]
     turned = 2 * atan2(along, qpos[q])
     turned += 2 * pi * nearest_whole((turn - turned) / (2 * pi))
     # The quaternion without its turn is (scalar, tilt); the sign is such that the scalar is not negative.
@@ -403,13 +404,13 @@ def rotation_near(qpos, q, p, near, first, out):
         j, k = (i + 1) % 3, (i + 2) % 3
         across = p[AXIS + j] * qpos[q + 1 + k] - p[AXIS + k] * qpos[q + 1 + j]
         tilt[i] = (1.0 - p[AXIS + i]) * (cosine * qpos[q + 1 + i] - sine * across)
-        goal[i] = (1.0 - p[AXIS + i]) * near[first + i]
+        goal[i] = (1.0 - p[AXIS + i]) * reference[first + i]
         square += tilt[i] * tilt[i]
         inner += tilt[i] * goal[i]
         length += goal[i] * goal[i]
     size, length = sqrt(square), sqrt(length)
     if size < 1e-150:
-        # The identity has any axis; use the axis of `near`.
+        # The identity has any axis; use the axis of `reference`.
         turns = 2 * pi * nearest_whole(length / (2 * pi))
         scale = turns / length if turns > 0 else 0.0
         for i in range(3):

@@ -26,8 +26,8 @@ SIGNATURES = {
     "augmentation": "x u t:int data multipliers",
     "constraint_values": "x u t:int acts:int data multipliers values",
     "add_slope": "x u t:int row:int data gradient",
-    "noise_value": "x u data risk ahead:NextStep",
-    "noise_quadratic": "x u data risk ahead:NextStep convex:int stage:QuadraticStage",
+    "noise_value": "x u data risk next_step:NextStep",
+    "noise_quadratic": "x u data risk next_step:NextStep convex:int stage:QuadraticStage",
     "measure": "x data out",
     "measure_slope": "x data out:N",
     "NextStep": "jacobian:W arrived hessian:N gradient",
@@ -108,17 +108,17 @@ def cost_quadratic(x, u, t, cost, hessian, gradient):
     return cost_of_order(x, u, t, cost, 0.0, hessian, gradient)
 
 
-def cost_of_order(x, u, t, cost, share, hessian, gradient):
+def cost_of_order(x, u, t, cost, second_order, hessian, gradient):
     """Write the quadratic model of a cost and its augmented Lagrangian at (x, u); return the value.
 
-    The Hessian (W, W) is a mixture: `share` of the true one, and 1 - `share` of that with the sum of the terms that may
-    be indefinite projected to the nearest positive-semidefinite matrix.
+    The Hessian (W, W) is a mixture: a fraction `second_order` of the true one, and the rest of that with the sum of the
+    terms that may be indefinite projected to the nearest positive-semidefinite matrix.
     """
-    own = cost_alone(x, u, t, cost, share, hessian, gradient)
+    own = cost_alone(x, u, t, cost, second_order, hessian, gradient)
     return own + augment_cost(x, u, t, cost, hessian, gradient)
 
 
-def cost_alone(x, u, t, cost, share, hessian, gradient):
+def cost_alone(x, u, t, cost, second_order, hessian, gradient):
     """As `cost_of_order`, without the augmented Lagrangian."""
     total, projected = 0.0, stack(W, W)
     clear(hessian, W, W)
@@ -126,14 +126,14 @@ def cost_alone(x, u, t, cost, share, hessian, gradient):
     for k in range(cost.size):
         total += call_for_value(cost.functions[k, DERIVATIVES], x, u, t, cost.data[k], hessian, gradient)
         if k + 1 == cost.indefinite and cost.project != 0:
-            if share == 0:
+            if second_order == 0:
                 call(cost.project, hessian)
-            elif share < 1:
+            elif second_order < 1:
                 copy_matrix(hessian, W, W, projected)
                 call(cost.project, projected)
                 for i in range(W):
                     for j in range(W):
-                        hessian[i, j] = share * hessian[i, j] + (1 - share) * projected[i, j]
+                        hessian[i, j] = second_order * hessian[i, j] + (1 - second_order) * projected[i, j]
     return total
 
 
@@ -165,23 +165,23 @@ def slope_of_constraint(which, row, x, u, t, constraints, gradient):
     call(constraints.functions[which, SLOPE], x, u, t, row, constraints.data[which], gradient)
 
 
-def noise_value(x, u, t, noise, ahead):
+def noise_value(x, u, t, noise, next_step):
     """The expected cost of noise at (x, u); see `noise.py`.
 
-    The cost-to-go that weighs it is that of `ahead`, the rest of the problem after step t; or, with constraints, a
+    The cost-to-go that weighs it is that of `next_step`, the rest of the problem after step t; or, with constraints, a
     given one.
     """
-    hessian = noise.hessian[t + 1] if noise.risk[2] > 0 else ahead.hessian
-    gradient = noise.gradient[t + 1] if noise.risk[2] > 0 else ahead.gradient
-    weighed = NextStep(ahead.jacobian, ahead.arrived, hessian, gradient)
+    hessian = noise.hessian[t + 1] if noise.risk[2] > 0 else next_step.hessian
+    gradient = noise.gradient[t + 1] if noise.risk[2] > 0 else next_step.gradient
+    weighed = NextStep(next_step.jacobian, next_step.arrived, hessian, gradient)
     return call_for_value(noise.value, x, u, noise.data, noise.risk, weighed)
 
 
-def noise_quadratic(x, u, t, noise, ahead, convex, stage):
+def noise_quadratic(x, u, t, noise, next_step, convex, stage):
     """Add the quadratic model of that cost to a stage; return its value."""
-    hessian = noise.hessian[t + 1] if noise.risk[2] > 0 else ahead.hessian
-    gradient = noise.gradient[t + 1] if noise.risk[2] > 0 else ahead.gradient
-    weighed = NextStep(ahead.jacobian, ahead.arrived, hessian, gradient)
+    hessian = noise.hessian[t + 1] if noise.risk[2] > 0 else next_step.hessian
+    gradient = noise.gradient[t + 1] if noise.risk[2] > 0 else next_step.gradient
+    weighed = NextStep(next_step.jacobian, next_step.arrived, hessian, gradient)
     return call_for_value(noise.quadratic, x, u, noise.data, noise.risk, weighed, convex, stage)
 
 

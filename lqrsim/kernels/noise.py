@@ -61,13 +61,13 @@ def matrix_at(x, u, data, out):
     noise_values(x, u, data, out)
 
 
-def noise_value(x, u, data, risk, ahead):
+def noise_value(x, u, data, risk, next_step):
     """The expected cost of noise at (x, u); infinite if the risk, of which theta is the first number, is too high."""
     values, mixed, slope = stack(COUNT, SIZE), stack(COUNT, SIZE), stack(COUNT)
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
     S = stack(COUNT, COUNT)
     noise_values(x, u, data, values)
-    noisy_block(ahead.hessian, S)
+    noisy_block(next_step.hessian, S)
     times_hessian(S, values, weighed)
     theta = risk[0]
     if theta == 0:
@@ -76,11 +76,11 @@ def noise_value(x, u, data, risk, ahead):
     if not good:
         return inf
     risk_columns(theta, factor, root, values, mixed)
-    next_slope(ahead, slope)
+    next_slope(next_step, slope)
     return total + 0.5 * theta * square_along(mixed, slope)
 
 
-def noise_quadratic(x, u, data, risk, ahead, convex, stage):
+def noise_quadratic(x, u, data, risk, next_step, convex, stage):
     """Add the quadratic model of the expected cost to a stage at (x, u), and return its value.
 
     Args:
@@ -92,7 +92,7 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)
     S = stack(COUNT, COUNT)
     noise_slopes(x, u, data, values, slopes)
-    noisy_block(ahead.hessian, S)
+    noisy_block(next_step.hessian, S)
     times_hessian(S, values, weighed)
     theta = risk[0]
     if theta == 0:
@@ -110,26 +110,26 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
         times_hessian(S, mixed, weighed)
         risk_column_slopes(theta, factor, root, slopes)
         add_trace_model(S, weighed, slopes, stage)
-    next_slope(ahead, slope)
-    add_risk(theta, ahead, mixed, slopes, slope, convex, stage)
+    next_slope(next_step, slope)
+    add_risk(theta, next_step, mixed, slopes, slope, convex, stage)
     return total + 0.5 * theta * square_along(mixed, slope)
 
 
 def noisy_costs(count, steps, start, policy, model, draws, costs):
     """Write the costs (count,) of rollouts of a policy with the given noise: draws (count steps, SIZE), run by run."""
-    x, u, ahead, values = stack(N), stack(M), stack(N), stack(COUNT, SIZE)
+    x, u, arrived, values = stack(N), stack(M), stack(N), stack(COUNT, SIZE)
     for run in range(count):
         copy(start, N, x)
         total = cost_value(x, u, 0, model.initial)
         for t in range(steps):
             limited_control(policy.gain[t], policy.offset[t], x, model.limits, u)
             total += cost_value(x, u, t, model.stage)
-            advance(x, u, model, model.dt, ahead)
+            advance(x, u, model, model.dt, arrived)
             noise_values(x, u, model.noise.data, values)
             for i in range(COUNT):
                 for k in range(SIZE):
-                    ahead[i if CONTIGUOUS else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
-            copy(ahead, N, x)
+                    arrived[i if CONTIGUOUS else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
+            copy(arrived, N, x)
         costs[run] = total + cost_value(x, u, steps, model.final)
 
 
@@ -238,13 +238,13 @@ def risk_column_slopes(theta, factor, root, slopes):
                 slopes[k, i, a] *= root[k]
 
 
-def next_slope(ahead, slope):
+def next_slope(next_step, slope):
     """Write the gradient (COUNT,) of the cost-to-go at the next state, in the states that noise acts on."""
     for i in range(COUNT):
         row = i if CONTIGUOUS else ROWS[i]
-        total = ahead.gradient[row]
+        total = next_step.gradient[row]
         for j in range(N):
-            total += ahead.hessian[row, j] * ahead.arrived[j]
+            total += next_step.hessian[row, j] * next_step.arrived[j]
         slope[i] = total
 
 
@@ -259,13 +259,13 @@ def square_along(mixed, slope):
     return total
 
 
-def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
+def add_risk(theta, next_step, mixed, slopes, slope, convex, stage):
     """Add the model of theta/2 d'M W M'd: its gradient, and theta D'D of its Hessian, D the Jacobian of V'M'd.
 
     D is evaluated at the worst noise y, for both M and d. With a negative risk it is the Jacobian for d alone, so that
     the sum with the cost-to-go's Hessian stays positive semidefinite.
     """
-    S, jacobian, slopes_along, line = ahead.hessian, ahead.jacobian, stack(SIZE, W), stack(W)
+    S, jacobian, slopes_along, line = next_step.hessian, next_step.jacobian, stack(SIZE, W), stack(W)
     pulled, steered, along, compact = stack(COUNT), stack(N), stack(SIZE), stack(COUNT, COUNT)
     for k in range(SIZE):
         total = 0.0

@@ -57,8 +57,8 @@ def forward_pass(settings, model, about, work):
             limited_control(work.policy.gain[t], work.policy.offset[t], x_hat, model.limits, u)
         linearize(x_hat, u, model, arrived, step)
         jacobian = forward_jacobian(x_hat, u, model, arrived, step, spare)
-        ahead = NextStep(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
-        constant = stage_model(x_hat, u, t, model, about, ahead, True, stage)
+        next_step = NextStep(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        constant = stage_model(x_hat, u, t, model, about, next_step, True, stage)
         constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
         if not riccati_forward(t, step, stage, constant, to_come, work.smoothing):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
@@ -100,8 +100,8 @@ def backward_pass(settings, model, about, work):
             towards(x, about.reach, about.plan.states[t], N)
             towards(u, about.reach, about.plan.controls[t], M)
         linearize_forward(x, u, model, arrived, step)
-        ahead = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
-        constant = stage_model(x, u, t, model, about, ahead, False, stage)
+        next_step = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        constant = stage_model(x, u, t, model, about, next_step, False, stage)
         size += abs(constant)
         good = riccati_backward(t, step, stage, constant, x, model.limits, work.policy, to_go)
         if not good or not smoothed_state(t, to_go, to_come, costate, x_hat):
@@ -138,8 +138,8 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         else:
             advance(x_hat, u, model, -model.dt, x)
         linearize_forward(x, u, model, arrived, step)
-        ahead = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
-        constant = stage_model(x, u, t, model, about, ahead, False, stage)
+        next_step = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        constant = stage_model(x, u, t, model, about, next_step, False, stage)
         if not riccati_backward(t, step, stage, constant, x, model.limits, policy, to_go):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
         copy(x, N, x_hat)
@@ -147,7 +147,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
     return -1, True
 
 
-def stage_model(x, u, t, model, about, ahead, convex, stage):
+def stage_model(x, u, t, model, about, next_step, convex, stage):
     """Write the stage cost, quadratised at (x, u), about the origin, Eqs. (26)-(27); return its constant.
 
     It includes the expected cost of noise; the prior, which is no part of the cost, but keeps the linearisations
@@ -156,7 +156,7 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
     value = cost_quadratic(x, u, t, model.stage, hessian, gradient)
     if NOISY:
-        value += noise_quadratic(x, u, t, model.noise, ahead, convex, stage)
+        value += noise_quadratic(x, u, t, model.noise, next_step, convex, stage)
     if t > 0:
         for i in range(N):
             value += add_square(i, prior.weight[i], x[i] - prior.about[t, i], hessian, gradient)

@@ -43,20 +43,20 @@ def nearest_rotation(x, nominal, first, turn):
     """Replace the rotation vector at x[first] by the nearest to the nominal among (angle + 2 pi k) axis, which are all
     the same rotation; without its entry `turn`, 0 to 2, if that is an angle. See coordinates.py.
     """
-    axis, near, square, length, along = stack(3), stack(3), 0.0, 0.0, 0.0
+    axis, reference, square, length, along = stack(3), stack(3), 0.0, 0.0, 0.0
     for i in range(3):
-        axis[i], near[i] = 0.0, 0.0
+        axis[i], reference[i] = 0.0, 0.0
         if i != turn:
-            axis[i], near[i] = x[first + i], nominal[first + i]
+            axis[i], reference[i] = x[first + i], nominal[first + i]
         square += axis[i] * axis[i]
-        length += near[i] * near[i]
+        length += reference[i] * reference[i]
     angle, distance = sqrt(square), sqrt(length)
     for i in range(3):
         if angle < 1e-12:  # the identity has every axis
-            axis[i] = near[i] / distance if distance > 0.0 else 0.0
+            axis[i] = reference[i] / distance if distance > 0.0 else 0.0
         else:
             axis[i] /= angle
-        along += axis[i] * near[i]
+        along += axis[i] * reference[i]
     turns = floor((along - angle) / (2.0 * pi) + 0.5)
     if turns != 0:
         for i in range(3):

@@ -164,13 +164,13 @@ class Linearization(NamedTuple):
 class ModelOrder(NamedTuple):
     """The models of a pass about a plan.
 
-    The share of second-order terms is 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
+    The fraction of second-order terms is 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
     Newton's, with true Hessians of the costs, and Hessians of the dynamics times the costate.
     """
 
     damping: float  # weight on changes of the controls
-    share: float
-    known: CostToGo  # that which weighs noise, if `share` is above 0
+    second_order: float
+    known: CostToGo  # that which weighs noise, if `second_order` is above 0
 
 
 class LinearStep(NamedTuple):
@@ -248,9 +248,9 @@ class PlanStages(NamedTuple):
     state_size: Annotated[Arrays, "N"]  # typical sizes
     control_size: Annotated[Arrays, "M"]
     projected: Annotated[Arrays, "1"]  # 1 if the projected Hessians are those of the last plan
-    keeps: Annotated[Arrays, "1"]  # 1 if models of a plan keep the derivatives of the dynamics that are there
+    reuses_derivatives: Annotated[Arrays, "1"]  # 1 if models of a plan keep the derivatives of the dynamics
     learns: int  # 1 if the dynamics have no second derivatives
-    slow: Annotated[Arrays, "1"]  # 1 if the Hessians have what is learned of these
+    uses_learned: Annotated[Arrays, "1"]  # 1 if the Hessians have what is learned of these
     model: ProblemModel
     values: Any  # a vector for each constraint
     rows: StageRows
@@ -298,10 +298,10 @@ class PlanBeginning(NamedTuple):
     """What an interior point begins with."""
 
     plan: Motion  # within the limits of its controls
-    known: Arrays  # (K,) multipliers
-    informed: bool  # whether these are known
+    multipliers: Arrays  # (K,)
+    has_multipliers: bool  # whether these are known
     barrier: float  # the first barrier parameter of each row, as a fraction of the cost divided by the number of rows
-    room: float  # the least first slack, relative to a row's size
+    least_slack: float  # the least first slack, relative to a row's size
     oldest: float  # most further steps for which derivatives of the dynamics serve
 
 
@@ -322,8 +322,8 @@ class InteriorArrays(NamedTuple):
     forces: Annotated[Arrays, "K"]
     corrections: Annotated[Arrays, "K 2"]  # of the products of slacks and multipliers, for both steps
     others: Annotated[Arrays, "K 2"]
-    beyond: Annotated[Arrays, "K"]  # further residuals of the rows
-    wider: Annotated[Arrays, "T N"]  # further gaps
+    extra_residuals: Annotated[Arrays, "K"]  # further residuals of the rows
+    extra_gaps: Annotated[Arrays, "T N"]
     last_step: Annotated[Arrays, "T+1 W"]  # the last step
     turns: Annotated[Arrays, "T+1 W"]  # the change of the Lagrangian's gradients by it
     active: ActiveSetArrays  # of the crossover
@@ -344,8 +344,8 @@ class RestorationArrays(NamedTuple):
     numbers: Annotated[Arrays, "K"]
     curves: Annotated[Arrays, "K"]  # see `direction` of `stages.py`
     duals: Annotated[Arrays, "K"]  # multipliers
-    aims: Annotated[Arrays, "K"]  # those after the whole step
-    shares: Annotated[Arrays, "K"]  # relative to the price
+    full_step_duals: Annotated[Arrays, "K"]  # those after the whole step
+    relative_multipliers: Annotated[Arrays, "K"]  # to the price
 
 
 class EliminatedControl(NamedTuple):
@@ -367,7 +367,7 @@ class Descent(NamedTuple):
     method: int  # DAMPED or NEWTON
     changes: int  # number of small changes of cost in a row after which the plan is judged; 0 to judge each plan
     idle: float = inf  # number of steps in a row that improve by rounding which ends the descent
-    share: float = 0.0  # fraction of second-order terms in the first models of a plan
+    second_order: float = 0.0  # fraction of second-order terms in the first models of a plan
     reach: float = 0.0  # that of the first step
     # The smallest fraction of a step that the line search tries, and the fraction of the predicted decrease that a step
     # must achieve; of models at reach 0 without second-order terms SHORTEST and 0, if `patient`.
@@ -609,13 +609,13 @@ def _row(*names: str) -> np.dtype[np.void]:
 # cost to which an optimality is relative. final_gap: gap between smoothed states and plan at the end.
 # Of damped steps: reach of the next; weight on changes of the controls, which iLQR has, too; for steps at reach 0,
 # iLQR's, how many remain, how many there will be the next time, and how many others there were since.
-# Of passes about the plan: known: 1 if the next step's was made; its fraction of second-order terms (share), weight on
-# changes of the controls (damping), predicted slope of the merit (decrease) and predicted decrease, relative to the
-# merit (promised). more: number of steps that followed an optimal plan.
+# Of passes about the plan: known: 1 if the next step's was made; its fraction of second_order terms, weight on changes
+# of the controls (damping), predicted slope of the merit (decrease) and predicted decrease, relative to the merit
+# (relative_decrease). more: number of steps that followed an optimal plan.
 MEMORY = _row(
     "plan_cost", "merit", "started", "watched", "small_changes", "idle", "failed", "negligible", "least", "final_gap",
-    "reach", "weight", "ilqr_left", "ilqr_next", "since_ilqr", "known", "share", "damping", "decrease", "promised",
-    "more",
+    "reach", "weight", "ilqr_left", "ilqr_next", "since_ilqr", "known", "second_order", "damping", "decrease",
+    "relative_decrease", "more",
 )  # fmt: skip
 
 # The state of an interior point between calls. cost, stationarity, violation, gap, complementarity: the measures of the
@@ -623,8 +623,8 @@ MEMORY = _row(
 # relative to the row's size. product: largest product of a slack and its multiplier. scale: the cost to which measures
 # are relative. typical: the typical cost of a change. parameter, highest, barrier: the barrier parameter; its largest
 # value; and that as a fraction of the cost of a row. pairs: number of slacks. elastic: 1 if a row has a price. rung:
-# that of the step's models on the ladder of regularisation. share: fraction of the projected Hessian in these. soft:
-# softness of equalities. part: the fraction of the last step that was taken. forced: number of steps that were taken
+# that of the step's models on the ladder of regularisation. convex_fraction: that of the projected Hessian in
+# these. soft: softness of equalities. fraction: that of the last step that was taken. forced: number of steps taken
 # although the filter rejected them. filtered, failed: numbers of rows of the filter and of the last errors. farthest,
 # farthest_gap: largest violations. violated, merit, slope: of the iterate, for the line search. tried: the cost of its
 # trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier falls. since:
@@ -635,9 +635,9 @@ MEMORY = _row(
 # largest value.
 INTERIOR = _row(
     "cost", "stationarity", "violation", "gap", "complementarity", "miss", "product", "scale", "typical", "parameter",
-    "highest", "barrier", "pairs", "elastic", "rung", "share", "soft", "part", "forced", "filtered", "failed",
-    "farthest", "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short", "before",
-    "unchanged", "level", "kept", "kept_scale", "whole", "age", "oldest",
+    "highest", "barrier", "pairs", "elastic", "rung", "convex_fraction", "soft", "fraction", "forced", "filtered",
+    "failed", "farthest", "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short",
+    "before", "unchanged", "level", "kept", "kept_scale", "whole", "age", "oldest",
 )  # fmt: skip
 
 # The state of an active set between calls. cost, stationarity, violation, gap, complementarity, scale, typical: as
@@ -653,17 +653,17 @@ MEASURES = _row("cost", "stationarity", "violation", "gap", "complementarity")
 
 # The state of a restoration between calls. rows: number of rows that act. parameter, least: the barrier parameter, and
 # its least value. damping: of the steps. level: the predicted decrease that is negligible. cost, merit, decrease: of
-# the iterate, and the predicted slope of its merit. promised: its predicted decrease, relative to the merit. part: the
-# fraction of the step that was accepted; 0 for none. violation, near: of the iterate, and whether it is nearly
-# feasible. close: number of times in a row that it was, and its cost `before` hardly different. informed: 1 once
-# multipliers are known. looking: 1 if the last iteration is not yet completed.
+# the iterate, and the predicted slope of its merit. relative_decrease: its predicted decrease, relative to the merit.
+# fraction: that of the step that was accepted; 0 for none. violation, nearly_feasible: of the iterate, and if it is
+# nearly feasible. close: number of times in a row that it was, and its cost `before` hardly different. has_duals: 1
+# once multipliers are known. unfinished: 1 if the last iteration is not yet completed.
 RESTORATION = _row(
-    "rows", "parameter", "least", "damping", "level", "cost", "merit", "decrease", "promised", "part", "violation",
-    "near", "close", "before", "informed", "looking",
+    "rows", "parameter", "least", "damping", "level", "cost", "merit", "decrease", "relative_decrease", "fraction",
+    "violation", "nearly_feasible", "close", "before", "has_duals", "unfinished",
 )  # fmt: skip
 
 # An iteration of a restoration.
-RESTORED = _row("cost", "violation", "promised")
+RESTORED = _row("cost", "violation", "relative_decrease")
 
 # A row of the log; NaN where something was not computed.
 LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")

@@ -20,10 +20,10 @@ from lqrsim.kernels.stages import (
     EQUALITY,
     LIMIT,
     closed_loop_rollout,
+    evaluate_plan,
     read_rows,
     regularised_direction,
     row_change,
-    trial,
     write_models,
 )
 
@@ -58,7 +58,7 @@ def restoration(first, last, price, stages, work, memory, log):
     Returns:
       The number of iterations so far; and RUNNING, STALLED if no step helps or none is needed, NOT_FINITE if no step
       can be computed; or NO_PROGRESS if the caller is to test whether the violation of the plan is stationary, with the
-      multipliers relative to the price in `work.shares`. If it is not, the next call continues.
+      multipliers relative to the price in `work.relative_multipliers`. If it is not, the next call continues.
     """
     mem = memory[0]
     if last == 0:
@@ -66,25 +66,25 @@ def restoration(first, last, price, stages, work, memory, log):
         return 0, RUNNING
     done, ended = first, False
     while True:
-        if mem.looking != 0:  # the last iteration is to be completed
-            mem.looking = 0.0
-            if mem.part == 0 or (mem.parameter <= mem.least and mem.decrease < LAST * mem.parameter):
+        if mem.unfinished != 0:  # the last iteration is to be completed
+            mem.unfinished = 0.0
+            if mem.fraction == 0 or (mem.parameter <= mem.least and mem.decrease < LAST * mem.parameter):
                 return done, STALLED
             copy_plan(stages.steps, work.trial, work.plan)
         if done >= last:
             return done, RUNNING
         if not descend(price, stages, work, mem):
             return done, NOT_FINITE
-        ended = judge(stages, work, mem)
+        ended = measure_violation(stages, work, mem)
         row = log[done]
-        row.cost, row.violation, row.promised = mem.cost, mem.violation, mem.promised
+        row.cost, row.violation, row.relative_decrease = mem.cost, mem.violation, mem.relative_decrease
         done += 1
         if ended:
             return done, STALLED
-        mem.looking = 1.0
-        if mem.near == 0 and 2 * mem.promised < mem.level and mem.damping < 1:
+        mem.unfinished = 1.0
+        if mem.nearly_feasible == 0 and 2 * mem.relative_decrease < mem.level and mem.damping < 1:
             mem.level *= FINER
-            share_price(price, stages, work)
+            write_relative_multipliers(price, stages, work)
             return done, NO_PROGRESS
 
 
@@ -108,7 +108,7 @@ def begin_restoration(price, stages, work, mem):
         if rows.live[at] != 0:
             mem.rows += 1
     mem.parameter, mem.least = FIRST * price / max(mem.rows, 1.0), LEAST * price / max(mem.rows, 1.0)
-    mem.damping, mem.level, mem.close, mem.before, mem.looking, mem.informed = 1.0, LEVEL, 0.0, inf, 0.0, 0.0
+    mem.damping, mem.level, mem.close, mem.before, mem.unfinished, mem.has_duals = 1.0, LEVEL, 0.0, inf, 0.0, 0.0
     for t in range(steps + 1):
         fill(work.costates[t], N, 0.0)
 
@@ -128,7 +128,7 @@ def confine(stages, work):
 def descend(price, stages, work, mem):
     """Find a step and try fractions of it, into `work.trial`; return whether there is a step."""
     rows, steps = stages.rows, stages.steps
-    mem.cost = trial(stages, work.plan, stages.models.arrived)
+    mem.cost = evaluate_plan(stages, work.plan, stages.models.arrived)
     read_rows(stages, work.plan, rows.numbers)
     good = isfinite(mem.cost)
     for at in range(rows.size * (steps + 1)):
@@ -151,24 +151,24 @@ def descend(price, stages, work, mem):
     copy_matrix(stages.to_go.gradient, steps + 1, N, work.costates)
     mem.merit = penalized(mem.cost, rows.numbers, price, stages, mem)
     confine(stages, work)
-    mem.part, part = 0.0, 1.0
-    while part > SHORTEST and mem.part == 0:
-        closed_loop_rollout(steps, part, work.plan, stages.policy, work.limits, stages.model, work.trial)
+    mem.fraction, fraction = 0.0, 1.0
+    while fraction > SHORTEST and mem.fraction == 0:
+        closed_loop_rollout(steps, fraction, work.plan, stages.policy, work.limits, stages.model, work.trial)
         if finite(work.trial.states, steps + 1, N):
-            cost = trial(stages, work.trial, work.arrived)
+            cost = evaluate_plan(stages, work.trial, work.arrived)
             read_rows(stages, work.trial, work.numbers)
             merit = penalized(cost, work.numbers, price, stages, mem)
-            if merit <= mem.merit - ARMIJO * part * mem.decrease + ROUNDING * abs(mem.merit):
-                mem.part = part
-        if mem.part == 0:
-            part /= 2
+            if merit <= mem.merit - ARMIJO * fraction * mem.decrease + ROUNDING * abs(mem.merit):
+                mem.fraction = fraction
+        if mem.fraction == 0:
+            fraction /= 2
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
-            work.aims[at] = rows.force[at] - work.curves[at] * row_change(at, stages)
-            work.duals[at] += part * (work.aims[at] - work.duals[at])
-    if part > LONG:
+            work.full_step_duals[at] = rows.force[at] - work.curves[at] * row_change(at, stages)
+            work.duals[at] += fraction * (work.full_step_duals[at] - work.duals[at])
+    if fraction > LONG:
         mem.damping /= TIMES
-    elif part < SHORT:
+    elif fraction < SHORT:
         mem.damping = min(max(TIMES * mem.damping, LIGHT), HEAVY)
     return True
 
@@ -202,21 +202,21 @@ def model_penalties(price, stages, work, mem):
         limit, highest = rows.kinds[at] == LIMIT, price / rows.sizes[at]
         lowest = -highest if rows.kinds[at] == EQUALITY else 0.0
         slack, excess = slacks_of(at, number, price, parameter, rows)
-        room = number if limit else slack
-        rows.force[at] = lowest + parameter / room
-        if mem.informed == 0:
+        lower_slack = number if limit else slack
+        rows.force[at] = lowest + parameter / lower_slack
+        if mem.has_duals == 0:
             work.duals[at] = rows.force[at]
-        middle = parameter / room
+        middle = parameter / lower_slack
         low = min(max(work.duals[at] - lowest, middle / WIDE), middle * WIDE)
         if limit:
-            work.curves[at] = low / room
+            work.curves[at] = low / lower_slack
             continue
         middle = parameter / excess
         high = min(max(highest - work.duals[at], middle / WIDE), middle * WIDE)
-        own = 1 / (room / low + excess / high)
+        own = 1 / (lower_slack / low + excess / high)
         both = 2 * excess if rows.kinds[at] == EQUALITY else slack + excess
         work.curves[at] = own + min(mem.damping, 1.0) * max(parameter / (slack * both) - own, 0.0)
-    mem.informed = 1.0
+    mem.has_duals = 1.0
 
 
 def slacks_of(at, number, price, parameter, rows):
@@ -249,7 +249,7 @@ def penalized(cost, numbers, price, stages, mem):
 
 
 @compact
-def judge(stages, work, mem):
+def measure_violation(stages, work, mem):
     """Compute the violation of the plan before the step; return whether the descent ends."""
     rows, relative = stages.rows, 0.0
     mem.violation = 0.0
@@ -257,19 +257,19 @@ def judge(stages, work, mem):
         if rows.live[at] != 0 and rows.kinds[at] != LIMIT:
             missed = abs(rows.numbers[at]) if rows.kinds[at] == EQUALITY else -rows.numbers[at]
             mem.violation, relative = larger(mem.violation, missed), larger(relative, missed / rows.sizes[at])
-    mem.near = 1.0 if relative < CLOSE else 0.0
+    mem.nearly_feasible = 1.0 if relative < CLOSE else 0.0
     still = relative < CLOSE and abs(mem.before - mem.cost) < SLOW * abs(mem.cost)
     mem.close = mem.close + 1 if still else 0.0
-    mem.before, mem.promised = mem.cost, 0.5 * mem.decrease / max(abs(mem.merit), 1e-300)
+    mem.before, mem.relative_decrease = mem.cost, 0.5 * mem.decrease / max(abs(mem.merit), 1e-300)
     return mem.close >= PATIENCE
 
 
 @compact
-def share_price(price, stages, work):
+def write_relative_multipliers(price, stages, work):
     """Write the multipliers after the step relative to the price, from -1 to 1; 0 for limits."""
     rows = stages.rows
     for at in range(rows.size * (stages.steps + 1)):
-        work.shares[at] = 0.0
+        work.relative_multipliers[at] = 0.0
         if rows.live[at] != 0 and rows.kinds[at] != LIMIT:
             lowest = -1.0 if rows.kinds[at] == EQUALITY else 0.0
-            work.shares[at] = min(max(work.aims[at] * rows.sizes[at] / price, lowest), 1.0)
+            work.relative_multipliers[at] = min(max(work.full_step_duals[at] * rows.sizes[at] / price, lowest), 1.0)

@@ -42,8 +42,8 @@ def noise_cost(steps, plan, model, to_go):
     """The expected cost of noise along a trajectory, given the cost-to-go of the policy that makes it."""
     total, none = 0.0, stack(N, W)
     for t in range(steps):
-        ahead = NextStep(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
-        total += noise_value(plan.states[t], plan.controls[t], t, model.noise, ahead)
+        next_step = NextStep(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
+        total += noise_value(plan.states[t], plan.controls[t], t, model.noise, next_step)
     return total
 
 
@@ -59,7 +59,7 @@ def plan_cost(steps, plan, model, to_go):
     return cost + noise_cost(steps, plan, model, to_go), added
 
 
-def differential_pass(steps, plan, model, order, keep, policy, to_go):
+def ddp_pass(steps, plan, model, order, keep, policy, to_go):
     """The backward pass of iLQR or DDP about a trajectory.
 
     Args:
@@ -69,42 +69,44 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
 
     The decrease of cost that the model predicts is returned, too: 0 if it is only rounding, as at an optimal cost of 0.
     """
-    share, stage, arrived, weights = order.share, QuadraticStage(stack(W, W), stack(W)), stack(N), stack(N)
-    jacobian, none, no_change = stack(N, W), zeros(M), zeros(N)
+    second_order, stage = order.second_order, QuadraticStage(stack(W, W), stack(W))
+    jacobian, arrived, weights, none, no_change = stack(N, W), stack(N), stack(N), zeros(M), zeros(N)
     slope, curve = stack(N), stack(N, N)
-    hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
+    hessian, gradient, change_limits = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
     states, controls, S, s, k = plan.states, plan.controls, to_go.hessian, to_go.gradient, to_go.constant
-    value = cost_of_order(states[steps], none, steps, model.final, share, hessian, gradient)
-    predicted, ahead = 0.0, value
+    value = cost_of_order(states[steps], none, steps, model.final, second_order, hessian, gradient)
+    predicted, cost_ahead = 0.0, value
     copy(gradient, N, slope)
     copy_matrix(hessian, N, N, curve)
     last = steps * keep
     k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
         at, x, u = t * keep, states[t], controls[t]
-        ahead += cost_of_order(x, u, t, model.stage, share, hessian, gradient)
-        if share > 0:
+        cost_ahead += cost_of_order(x, u, t, model.stage, second_order, hessian, gradient)
+        if second_order > 0:
             for i in range(N):
-                weights[i] = share * slope[i]
+                weights[i] = second_order * slope[i]
             step_second_order(x, u, model, weights, arrived, jacobian, hessian)
         else:
             step_jacobian(x, u, model, model.dt, arrived, jacobian)
         if NOISY:
-            beyond = NextStep(jacobian, arrived, curve, s[(t + 1) * keep])
-            if share > 0:
-                beyond = NextStep(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
-            ahead += noise_quadratic(x, u, t, model.noise, beyond, False, stage)
-        squares = squares_at(arrived, N, 0, curve) + squares_at(x, N, 0, hessian) + squares_at(u, M, N, hessian)
+            next_step = NextStep(jacobian, arrived, curve, s[(t + 1) * keep])
+            if second_order > 0:
+                next_step = NextStep(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
+            cost_ahead += noise_quadratic(x, u, t, model.noise, next_step, False, stage)
+        terms = diagonal_terms(arrived, N, 0, curve) + diagonal_terms(x, N, 0, hessian)
+        terms += diagonal_terms(u, M, N, hessian)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += order.damping
-            room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
-        decrease, good = minimize_within(stage, no_change, room, policy.gain[at], policy.offset[at], curve, slope)
+            change_limits.low[i], change_limits.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
+        gain, offset = policy.gain[at], policy.offset[at]
+        decrease, good = minimize_within(stage, no_change, change_limits, gain, offset, curve, slope)
         if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W), predicted
-        if not decrease <= SQUARES * squares:  # a NaN stays
+        if not decrease <= SQUARES * terms:  # a NaN stays
             predicted += decrease
-        constant = ahead - predicted
+        constant = cost_ahead - predicted
         for i in range(N):
             gradient_at_origin = slope[i]
             for j in range(N):
@@ -118,16 +120,16 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
 
 @inline
 def ilqr_pass(steps, plan, model, damping, policy, to_go):
-    """`differential_pass` of iLQR, with that damping."""
-    return differential_pass(steps, plan, model, ModelOrder(damping, 0.0, to_go), 1, policy, to_go)
+    """`ddp_pass` of iLQR, with that damping."""
+    return ddp_pass(steps, plan, model, ModelOrder(damping, 0.0, to_go), 1, policy, to_go)
 
 
-def initial_step(x0, model, share, to_go, direction):
+def initial_step(x0, model, second_order, to_go, direction):
     """Write the best change (N,) of a start x0 that has a cost, given the cost-to-go; return its predicted decrease."""
     S, s = to_go.hessian[0], to_go.gradient[0]
     hessian, gradient, none = stack(W, W), stack(W), zeros(M)
     total, slope = stack(N, N), stack(N)
-    cost_of_order(x0, none, 0, model.initial, share, hessian, gradient)
+    cost_of_order(x0, none, 0, model.initial, second_order, hessian, gradient)
     for i in range(N):
         slope[i] = gradient[i] + s[i]
         for j in range(N):
@@ -142,10 +144,10 @@ def initial_step(x0, model, share, to_go, direction):
     decrease = 0.0
     for i in range(N):
         decrease -= 0.5 * slope[i] * direction[i]
-    return 0.0 if decrease <= SQUARES * (squares_at(x0, N, 0, hessian) + squares_at(x0, N, 0, S)) else decrease
+    return 0.0 if decrease <= SQUARES * (diagonal_terms(x0, N, 0, hessian) + diagonal_terms(x0, N, 0, S)) else decrease
 
 
-def squares_at(z, size, first, hessian):
+def diagonal_terms(z, size, first, hessian):
     """The sum of |H_ii| z_i^2 / 2 for z (size,), from an index of H on: the size of terms that may cancel."""
     total = 0.0
     for i in range(size):

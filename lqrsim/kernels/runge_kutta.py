@@ -17,11 +17,11 @@ def advance(x, u, p, h, out):
         out[i] = z[i] = x[i]
     for stage in range(4):
         weight = h / 6 if stage == 0 or stage == 3 else h / 3
-        ahead = 0.5 * h if stage < 2 else h
+        delta = 0.5 * h if stage < 2 else h
         rate(z, u, p, k)
         for i in range(N):
             out[i] += weight * k[i]
-            z[i] = x[i] + ahead * k[i]
+            z[i] = x[i] + delta * k[i]
 
 
 def chain(fx, fu, previous, a, out):
@@ -141,13 +141,13 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
     add_curvature(z4, u, p, w4, h, slope3, hessian)
 
 
-def back(fx, after, ahead, share, weights, before):
+def back(fx, after, delta, weight, weights, before):
     """Write the weights (N,) of a stage's rates, given the next stage's weights."""
     for j in range(N):
         total = 0.0
         for i in range(N):
             total += fx[i, j] * after[i]
-        before[j] = share * weights[j] + ahead * total
+        before[j] = weight * weights[j] + delta * total
 
 
 def full_curvature(x, u, p, w, curve):
@@ -158,14 +158,14 @@ def full_curvature(x, u, p, w, curve):
             curve[b, a] = curve[a, b]
 
 
-def add_curvature(z, u, p, weights, ahead, slope, total):
-    """Add the Hessian (W, W) of the weighted rates at a stage with state `x + ahead k`; `slope` (N, W) is k's."""
+def add_curvature(z, u, p, weights, delta, slope, total):
+    """Add the Hessian (W, W) of the weighted rates at a stage with state `x + delta k`; `slope` (N, W) is k's."""
     curve, rows, product = zeros(K, K), stack(STATES + 1, W), stack(K, W)
     line = stack(W)  # a local array, not a row of a matrix, stays in registers
     full_curvature(z, u, p, weights, curve)
     for a in range(STATES):
         for j in range(W):
-            rows[a, j] = ahead * slope[SUPPORT[a], j]
+            rows[a, j] = delta * slope[SUPPORT[a], j]
         rows[a, SUPPORT[a]] += 1
     for a in range(K):
         for j in range(W):

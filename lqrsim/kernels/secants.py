@@ -15,7 +15,7 @@ NOTHING = 1e-8  # least part of a residual along its step from which curvature i
 @compact
 def forget(stages):
     """Begin with nothing learned."""
-    stages.slow[0] = 0.0
+    stages.uses_learned[0] = 0.0
     for t in range(stages.steps + 1):
         for i in range(W):
             fill(stages.models.learned[t, i], W, 0.0)
@@ -37,29 +37,29 @@ def remember(stages, before, after, costates, last_step, turns):
 
 @compact
 def learn(stages, costates, last_step, turns, slow):
-    """Update what is learned, with the models at the end of the step; from when `slow` on, add it to the Hessians."""
+    """Update what is learned, with the models at the end of the step; after a `slow` step, add it to the Hessians."""
     models, slope, lacks = stages.models, stack(W), stack(W)
     for t in range(stages.steps + 1):
         lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
-        along, far, wide = 0.0, 0.0, 0.0
+        along, moved, wide = 0.0, 0.0, 0.0
         for i in range(W):
             lacks[i] = slope[i] - turns[t, i]
             for j in range(W):
                 known = models.hessian[t, i, j]
-                if stages.slow[0] == 0:
+                if stages.uses_learned[0] == 0:
                     known += models.learned[t, i, j]
                 lacks[i] -= known * last_step[t, j]
             along += lacks[i] * last_step[t, i]
-            far += last_step[t, i] * last_step[t, i]
+            moved += last_step[t, i] * last_step[t, i]
             wide += lacks[i] * lacks[i]
-        if along * along > NOTHING * NOTHING * far * wide:
+        if along * along > NOTHING * NOTHING * moved * wide:
             for i in range(W):
                 for j in range(W):
                     change = lacks[i] * lacks[j] / along
                     models.learned[t, i, j] += change
-                    if stages.slow[0] != 0:
+                    if stages.uses_learned[0] != 0:
                         models.hessian[t, i, j] += change
-    if slow and stages.slow[0] == 0:
-        stages.slow[0] = 1.0
+    if slow and stages.uses_learned[0] == 0:
+        stages.uses_learned[0] = 1.0
         for t in range(stages.steps + 1):
             add_matrix(models.learned[t], W, models.hessian[t])

@@ -39,7 +39,9 @@ from lqrsim.kernels.rollouts import larger
 
 TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
 STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: the cube root of the precision
-ASIDE = 1e-3  # distance from a plan at which gradients are evaluated, too: at the plan itself entries may vanish
+PROBE_DISTANCE = (
+    1e-3  # distance from a plan at which gradients are evaluated, too: at the plan itself entries may vanish
+)
 SMALLEST = 1e-3  # a state that moves less has a typical size of 1
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
@@ -47,7 +49,7 @@ SLOWEST = 1e-6  # least effect of a control without limits, relative to the stat
 # the projected Hessians gives the models a minimum.
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
 
-CONTROL, SIGN, SIDE, RANGE, STRAIGHT = 0, 1, 2, 3, 4  # columns of `StageRows.limits`
+CONTROL, SIGN, SIDE, RANGE, LINEAR = 0, 1, 2, 3, 4  # columns of `StageRows.limits`
 INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
@@ -61,7 +63,7 @@ def write_models(stages, plan, costates, least):
     total, out = 0.0, stages.models
     for t in range(stages.steps, -1, -1):
         total += cost_model(t, stages, plan)
-    if stages.keeps[0] == 0:
+    if stages.reuses_derivatives[0] == 0:
         all_steps_second_order(stages.steps, plan, stages.model, costates, out.arrived, out.jacobian, out.hessian)
         cut_at_jumps(stages, plan, out.arrived, out.jacobian)
     for t in range(stages.steps, -1, -1):
@@ -78,7 +80,7 @@ def write_models_and_costates(stages, plan, costates):
     total, slope, out = 0.0, stack(W), stages.models
     for t in range(stages.steps, -1, -1):
         total += cost_model(t, stages, plan)
-        if t < stages.steps and stages.keeps[0] == 0:
+        if t < stages.steps and stages.reuses_derivatives[0] == 0:
             x, u = plan.states[t], plan.controls[t]
             step_second_order(x, u, stages.model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
             cut_at_jump(t, stages, plan, out.arrived, out.jacobian[t])
@@ -103,7 +105,7 @@ def add_curvatures(t, stages, plan, least):
     """Add the Hessians of the constraints at t, after `constraint_slopes`, and what is learned of the step's."""
     out, u = stages.models, plan.controls[min(t, stages.steps - 1)]
     subtract_curvatures(plan.states[t], u, t, stages, least, out.hessian[t])
-    if stages.slow[0] != 0:
+    if stages.uses_learned[0] != 0:
         add_matrix(out.learned[t], W, out.hessian[t])
 
 
@@ -169,8 +171,8 @@ def subtract_curvatures(x, u, t, stages, least, hessian):
             continue
         for row in range(int(constraints.multipliers[k][ROWS])):
             at = rows.size * t + int(rows.first[k]) + row
-            straight = rows.limits[int(rows.first[k]) + row, STRAIGHT] != 0
-            if not straight and abs(rows.force[at]) * rows.sizes[at] > least:
+            linear = rows.limits[int(rows.first[k]) + row, LINEAR] != 0
+            if not linear and abs(rows.force[at]) * rows.sizes[at] > least:
                 subtract_curvature(k, row, x, u, t, constraints, rows, hessian)
 
 
@@ -185,21 +187,21 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
         if rows.support[place, j] == 0:
             continue
         z = entry(x, u, j)
-        far = STEP * max(1.0, abs(z))
+        h = STEP * max(1.0, abs(z))
         fill(above, W, 0.0)
         fill(below, W, 0.0)
-        set_entry(y, v, j, z + far)
+        set_entry(y, v, j, z + h)
         slope_of_constraint(k, row, y, v, t, constraints, above)
-        set_entry(y, v, j, z - far)
+        set_entry(y, v, j, z - h)
         slope_of_constraint(k, row, y, v, t, constraints, below)
         set_entry(y, v, j, z)
         for i in range(W):
-            half = 0.5 * weight * (above[i] - below[i]) / (2 * far)
+            half = 0.5 * weight * (above[i] - below[i]) / (2 * h)
             hessian[i, j] -= half
             hessian[j, i] -= half
 
 
-def trial(stages, plan, arrived):
+def evaluate_plan(stages, plan, arrived):
     """Write the state after each step of a plan, (T, N), and return the plan's cost."""
     advance_all(stages.steps, plan, stages.model, arrived)
     cut_at_jumps(stages, plan, arrived, stages.models.jacobian)
@@ -246,12 +248,12 @@ def read_rows(stages, plan, numbers):
                 numbers[at] = rows.limits[row, SIGN] * number
 
 
-def survey(stages, plan):
+def determine_scales(stages, plan):
     """Determine which rows act, and typical sizes, from a plan and the models about it; return the typical cost.
 
     Which entries a row depends on is determined from slopes at the plan and near it.
     """
-    rows, beside = stages.rows, stages.changes
+    rows, probed = stages.rows, stages.changes
     read_rows(stages, plan, rows.numbers)
     for at in range(rows.size * (stages.steps + 1)):
         # Infinity means that the constraint does not act at that step.
@@ -259,12 +261,12 @@ def survey(stages, plan):
         rows.force[at] = 0.0
     for t in range(stages.steps + 1):
         for i in range(N):
-            beside.states[t, i] = plan.states[t, i] + ASIDE * sin(1.0 + i)
+            probed.states[t, i] = plan.states[t, i] + PROBE_DISTANCE * sin(1.0 + i)
         if t < stages.steps:
             for i in range(M):
-                beside.controls[t, i] = plan.controls[t, i] + ASIDE * sin(1.0 + N + i)
+                probed.controls[t, i] = plan.controls[t, i] + PROBE_DISTANCE * sin(1.0 + N + i)
         fill(stages.to_go.gradient[t], N, 0.0)
-    constraint_slopes(stages, beside)
+    constraint_slopes(stages, probed)
     write_models(stages, plan, stages.to_go.gradient, inf)
     project(stages, plan)
     return typical_sizes(stages, plan, stages.models.convex)
@@ -280,8 +282,8 @@ def typical_sizes(stages, plan, hessian):
         least, most = plan.states[0, i], plan.states[0, i]
         for t in range(1, steps + 1):
             least, most = min(least, plan.states[t, i]), max(most, plan.states[t, i])
-        far = max(most - least, stages.reach[i])
-        stages.state_size[i] = far if far > SMALLEST else 1.0
+        span = max(most - least, stages.reach[i])
+        stages.state_size[i] = span if span > SMALLEST else 1.0
     for j in range(M):
         stages.control_size[j] = stages.model.limits.high[j] - stages.model.limits.low[j]
         if stages.control_size[j] < inf:
@@ -301,8 +303,8 @@ def typical_sizes(stages, plan, hessian):
             at = rows.size * t + row
             count += rows.live[at]
             for i in range(W):
-                far = models.slopes[at, i] * size_of(i, stages)
-                total += far * far
+                span = models.slopes[at, i] * size_of(i, stages)
+                total += span * span
         size = sqrt(total / max(count, 1.0)) if total > 0 else 1.0
         size = min(size, rows.limits[row, RANGE])
         for t in range(steps + 1):
@@ -344,7 +346,7 @@ def adjoint(stages, costates, slopes):
             copy_part(slope, N, slopes[t], 0, M)
 
 
-def measure(stages, plan, numbers, gaps):
+def plan_residuals(stages, plan, numbers, gaps):
     """Measure the optimality of the plan of the models, whose rows have these values; write its gaps (T, N).
 
     Returns:
@@ -381,14 +383,14 @@ def measure(stages, plan, numbers, gaps):
     return steepest, missed, unequal, widest, product
 
 
-def direction(stages, plan, gaps, share, weight, base, curves, forces):
+def direction(stages, plan, gaps, convex_fraction, weight, base, curves, forces):
     """The step to the minimum of the stages' models, with weights on their rows.
 
     The change of the plan is written to `stages.changes`, the policy relative to the plan to `stages.policy`, and the
     costates after the step to the gradient of `stages.to_go`.
 
     Args:
-      plan: that of the models. gaps: (T, N), to be closed. share: fraction of the projected Hessian of the cost.
+      plan: that of the models. gaps: (T, N), to be closed. convex_fraction: that of the projected Hessian of the cost.
       weight: twice the cost of a change of a control by its typical size. base: 1, or 0 to leave out the gradient of
         the cost.
       curves, forces: ((T+1) size,) for each row d that acts, `1/2 curve d^2 - force d` is added; zero for others.
@@ -397,12 +399,12 @@ def direction(stages, plan, gaps, share, weight, base, curves, forces):
       The step whose control block is not positive definite; T + 1 for the start, -1 if there is a minimum.
     """
     stage, slope, steps, models, to_go = stack(W, W), stack(W), stages.steps, stages.models, stages.to_go
-    if share > 0:
+    if convex_fraction > 0:
         project(stages, plan)
     for t in range(steps, -1, -1):
         for i in range(W):
             slope[i] = base * models.gradient[t, i]
-        blend(share, models.hessian[t], models.convex[t], stage)
+        blend(convex_fraction, models.hessian[t], models.convex[t], stage)
         for i in range(M):
             size = stages.control_size[i]
             stage[N + i, N + i] += weight / (size * size)
@@ -424,26 +426,26 @@ def regularised_direction(stages, plan, gaps, weight, scale, curves, forces):
     """
     for rung in range(len(MIXES) + len(WEIGHTS)):
         more = weight + (WEIGHTS[rung - len(MIXES)] if rung >= len(MIXES) else 0.0) * scale
-        if direction(stages, plan, gaps, share_of(rung), more, 1.0, curves, forces) == -1:
+        if direction(stages, plan, gaps, convex_fraction_at(rung), more, 1.0, curves, forces) == -1:
             return rung
     return -1
 
 
-def share_of(rung):
+def convex_fraction_at(rung):
     """The fraction of the projected Hessian at a rung of the ladder."""
     return MIXES[rung] if rung < len(MIXES) else 1.0
 
 
-def blend(share, one, other, out):
-    """Write (1 - share) one + share other, (W, W)."""
+def blend(convex_fraction, one, other, out):
+    """Write (1 - f) one + f other, (W, W), with f the convex fraction."""
     for i in range(W):
         for j in range(W):
-            if share == 0:
+            if convex_fraction == 0:
                 out[i, j] = one[i, j]
-            elif share == 1:
+            elif convex_fraction == 1:
                 out[i, j] = other[i, j]
             else:
-                out[i, j] = (1 - share) * one[i, j] + share * other[i, j]
+                out[i, j] = (1 - convex_fraction) * one[i, j] + convex_fraction * other[i, j]
 
 
 def add_rows(t, stages, curves, forces, stage, slope):
@@ -556,17 +558,17 @@ def start_change(free, to_go, change):
     return good
 
 
-def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
+def closed_loop_rollout(steps, fraction, plan, policy, limits, model, out):
     """Roll out a fraction of a step from a trajectory, with its gains closing the loop.
 
     Args:
-      part: the fraction. plan: a Motion that satisfies the dynamics. policy: as `riccati_step` writes it.
+      fraction: how much of it. plan: a Motion that satisfies the dynamics. policy: as `riccati_step` writes it.
       limits: limits of the controls at each step, (T, M) each. out: Motion, written.
     """
     copy(plan.states[0], N, out.states[0])
     for t in range(steps):
         for i in range(M):
-            total = plan.controls[t, i] + part * policy.offset[t, i]
+            total = plan.controls[t, i] + fraction * policy.offset[t, i]
             for j in range(N):
                 total += policy.gain[t, i, j] * (out.states[t, j] - plan.states[t, j])
             out.controls[t, i] = min(max(total, limits.low[t, i]), limits.high[t, i])

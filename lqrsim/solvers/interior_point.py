@@ -11,7 +11,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
-from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SURVEY
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SCALE
 from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
@@ -92,7 +92,7 @@ class InteriorPoint:
         self._arrays, self._memory = stages.interior
         self._log = np.zeros(0, MEASURES)
         self._tolerances = np.nan, np.nan
-        self._call(SURVEY, 0)
+        self._call(SCALE, 0)
         self.sizes = stages.sized(float(self._memory["typical"][0]))
         stages.state(price=price(self.sizes) if callable(price) else price)
         self._call(BEGIN, 0)

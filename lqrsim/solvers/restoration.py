@@ -64,7 +64,7 @@ def restore(
         if error := interrupt_of(functions):
             raise error
         if outcome == NO_PROGRESS and not ended:
-            shares = work.shares.reshape(stages.live.shape)
+            shares = work.relative_multipliers.reshape(stages.live.shape)
             terms = range(len(stages.problem.constraint_terms))
             at_minimum = ended = stationary(
                 Motion(*map(np.copy, work.plan)), [shares[:, stages.owners == k].copy() for k in terms]
@@ -73,4 +73,4 @@ def restore(
             bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
     if outcome == NOT_FINITE:
         return None
-    return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["near"][0]))
+    return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["nearly_feasible"][0]))

@@ -33,7 +33,7 @@ from lqrsim.kernels.records import (
     StructuredArray,
     zeros_of,
 )
-from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, RANGE, SIDE, SIGN, STRAIGHT
+from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, LINEAR, RANGE, SIDE, SIGN
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
@@ -107,7 +107,7 @@ class Stages:
         self.about = self.about._replace(
             steps=steps, soft=0 if fixed else 1, learns=int(problem.dynamics.by_mujoco), model=model
         )
-        self.about.slow[...], self.about.keeps[...] = 0.0, 0.0
+        self.about.uses_learned[...], self.about.reuses_derivatives[...] = 0.0, 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         self.about.jumps[...] = 0.0
         if problem.goal is not None and problem.start is not None:
@@ -117,7 +117,7 @@ class Stages:
         self._sizes[...], self._prices[...] = 1.0, np.inf
         for k, term in enumerate(terms):
             self.about.rows.limits[self.owners == k, RANGE] = np.inf if term.ranges is None else term.ranges
-            self.about.rows.limits[self.owners == k, STRAIGHT] = term.linear
+            self.about.rows.limits[self.owners == k, LINEAR] = term.linear
         for row, (sign, i, side) in zip(np.flatnonzero(limit), self.limits, strict=True):
             self.about.rows.limits[row, [CONTROL, SIGN, SIDE]] = i, sign, side
 
@@ -167,8 +167,9 @@ class Stages:
         costates, slopes = about.to_go.gradient, plan.controls
         self._module.prepare(
             interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, MEASURES)),
-            survey=(about, plan), write_models=(about, plan, costates, 0.0), adjoint=(about, costates, slopes),
-            trial=(about, plan, about.models.arrived), read_rows=(about, plan, about.rows.numbers),
+            determine_scales=(about, plan), write_models=(about, plan, costates, 0.0),
+            adjoint=(about, costates, slopes), evaluate_plan=(about, plan, about.models.arrived),
+            read_rows=(about, plan, about.rows.numbers),
             least_curvatures=(about, about.rows.force, slopes, slopes[0]),
         )  # fmt: skip
 
@@ -188,7 +189,7 @@ class Stages:
     def trial(self, plan: Motion) -> tuple[float, Array]:
         """The cost of a plan, and the states at the ends of its steps, (T, n)."""
         arrived = np.empty((self.steps, self.n))
-        return self.call("trial", self.about, _ordered(plan), arrived), arrived
+        return self.call("evaluate_plan", self.about, _ordered(plan), arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
         """Compute the models about a plan, with costates (T+1, n) and multipliers (T+1, R).
@@ -215,7 +216,7 @@ class Stages:
 
         Determines which rows act, and which variables each depends on, from slopes at the plan and near it.
         """
-        return self.sized(self.call("survey", self.about, _ordered(plan)))
+        return self.sized(self.call("determine_scales", self.about, _ordered(plan)))
 
     def sized(self, cost: float) -> Sizes:
         """The sizes that a kernel has just written, with the cost that it returned."""
