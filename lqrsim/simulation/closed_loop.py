@@ -1,20 +1,19 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
 `simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py`
-applies the disturbances, `physics.py` advances the physics, `collisions.py` detects collisions, and `recorder.py`
-records.
+applies the disturbances, `physics.py` advances the physics, and `collisions.py` detects collisions.
 """
 
 import copy
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
-from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, as_controller
+from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, as_controller, turn_to_nearest
 from lqrsim.errors import (
     Array,
     InputError,
@@ -41,7 +40,6 @@ from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
-from lqrsim.simulation.recorder import Recorder
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.versions import versions
 
@@ -109,7 +107,7 @@ def simulate(
     Returns:
       A Rollout of the trials. Its `controller_run` is the run of the controller, with its records.
     """
-    return _run(ClosedLoop(**locals()))  # all arguments, by name
+    return ClosedLoop(**locals()).run()  # all arguments, by name
 
 
 def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **options: Any) -> Rollout:
@@ -126,35 +124,90 @@ def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **o
         `InitialStateError`, are refused. Times of the rollout count from the knot.
     """
     states = check_array("states", states, (None, None))
-    return _run(ClosedLoop(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options))
+    return ClosedLoop(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options).run()
 
 
-def _run(loop: "ClosedLoop") -> Rollout:
-    with unlogged():
-        loop.run()
-    return loop.rollout(undisturbed=_undisturbed(loop))
+Mask = npt.NDArray[np.bool_]
 
 
-def _undisturbed(loop: "ClosedLoop") -> Array | None:
-    """States (T+1, n) of the plan's own policy without disturbances, NaN once that run has ended; None if unknown.
+class Records:
+    """The records of K trials of a plan with T steps, from which a `Rollout` is made.
 
-    A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
-    plant repeats, there is a further run; the plant remembers it until another plan runs there.
+    Attributes:
+      states, measured: (K, T+1, n). clearance: (K, T+1). commanded, applied: (K, T, m). wrench: (K, T, 6).
+      contacts: (K,) number of control periods in contact.
+      lost_since: (K,) knot from which on the records are invalid; T+1 if all are valid.
+      failed_since: (K,) knot at which the controller failed; T+1 if it never failed.
+      reasons: the reason why each trial's controller failed or its filter diverged; empty for other trials.
+      frames: arrays of MuJoCo's qpos, (K, nq) each.
     """
-    plant, plan = loop.plant, loop.followed
-    if loop.starts is not None or loop.moving is not None:
-        return None
-    if not loop.acting and loop.law.digest == plan.policy.digest:
-        loop.records.turn_to_plan(loop.state_coordinates)
-        ended = min(loop.collisions.at[0], loop.records.time_of(loop.records.lost_since)[0])
-        return np.where(plan.trajectory.times[:, None] < ended, loop.records.states[0], np.nan)
-    if not plant.robot.dynamics.by_mujoco or plant.simulator is not None:
-        return None
-    which = plan.policy.digest, plan.trajectory.states.tobytes()
-    if plant.ran is None or plant.ran[:2] != which:
-        alone = ClosedLoop(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1)
-        plant.ran = (*which, _run(alone).undisturbed)
-    return plant.ran[2]
+
+    def __init__(self, plan: Trajectory, trials: int) -> None:
+        def zeros(steps: int, size: int) -> Array:
+            """Zeros (K, steps, size). In memory, all trials of a step are adjacent, as they are written."""
+            return np.zeros((steps, trials, size)).transpose(1, 0, 2)
+
+        self.plan, steps = plan, plan.steps
+        n, m = plan.states.shape[1], plan.controls.shape[1]
+        self.states, self.measured, self.clearance = (
+            zeros(steps + 1, n),
+            zeros(steps + 1, n),
+            zeros(steps + 1, 1)[..., 0],
+        )
+        self.commanded, self.applied, self.wrench = zeros(steps, m), zeros(steps, m), zeros(steps, 6)
+        self.contacts = np.zeros(trials, dtype=np.int64)
+        self.lost_since, self.failed_since = np.full(trials, steps + 1), np.full(trials, steps + 1)
+        self.reasons, self.frames = [""] * trials, list[Array]()
+
+    def knot(self, step: int, states: Array, measured: Array, clearance: Array, lost: Mask) -> None:
+        """Record states (K, n), true and measured, and clearance (K,) at a knot, and which are invalid from here."""
+        self.states[:, step], self.measured[:, step], self.clearance[:, step] = states, measured, clearance
+        if lost.any():
+            self.lost_since[lost] = np.minimum(self.lost_since[lost], step)
+
+    def end(self, since: npt.NDArray[np.int64], step: int, who: str, reasons: Mapping[int, str]) -> None:
+        """Record in `lost_since` or `failed_since` that trials end, row -> reason, unless they have ended before."""
+        over = self.over(step)
+        for row, reason in reasons.items():
+            if not over[row]:
+                since[row] = step
+                self.reasons[row] = f"{who} at {step * self.plan.dt:.4g} s: {reason}"
+
+    def over(self, step: int) -> Mask:
+        """Whether each trial's controller has failed, or its records are invalid, at this knot or before, (K,)."""
+        return np.minimum(self.lost_since, self.failed_since) <= step
+
+    def time_of(self, knots: npt.NDArray[np.int64]) -> Array:
+        """The times of knots (K,) in s; infinite beyond the last one."""
+        return np.where(knots <= self.plan.steps, self.plan.dt * knots, np.inf)
+
+    def turn_to_plan(self, space: Coordinates) -> None:
+        """Replace the angles of all states by their representatives nearest the plan."""
+        for array in (self.states, self.measured):
+            turn_to_nearest(space, array.transpose(1, 0, 2), self.plan.states)
+
+    def finish(self, parts: int, *, all_frames: bool) -> Array:
+        """Set the records after the end of a trial to NaN, and return the frames (K, F, nq), NaN as well.
+
+        There are `parts` frames in a period, or only the first one of all.
+        """
+        steps = self.plan.steps
+        missing = steps * parts + 1 - len(self.frames) if all_frames else 0
+        frames = np.stack(self.frames + [np.full_like(self.frames[0], np.nan)] * missing, axis=1)
+        if not self.over(steps).any():
+            return frames
+        known_until = np.minimum(self.lost_since, self.failed_since + 1)  # where a controller fails, the state is known
+        driven_until = np.minimum(self.lost_since, self.failed_since)
+        knots = np.arange(steps + 1)
+        # A frame belongs to the knot at the end of its period: the trial was lost somewhere before that.
+        knot_of_frame = -(np.arange(frames.shape[1]) // -parts)
+        for array, knot, until in (
+            *((array, knots, known_until) for array in (self.states, self.measured, self.clearance)),
+            *((array, knots[:-1], driven_until) for array in (self.commanded, self.applied, self.wrench)),
+            (frames, knot_of_frame, known_until),
+        ):
+            array[knot >= until[:, None]] = np.nan
+        return frames
 
 
 @checked
@@ -203,18 +256,16 @@ class ClosedLoop:
         self.acting = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
-        self.state_coordinates, self.control_coordinates = _coordinates_of(self.law, plant)
-        _check_plan(plan, plant)
+        self.state_coordinates, self.control_coordinates = _coordinates_of(self.law, plan, plant)
         self.whole = plan.trajectory
         if self.knot >= self.whole.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {self.whole.steps - 1}, before the plan's end")
         self.followed = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
         if self.starts is not None:
             self.starts = check_array("states", self.starts, (trials, self.whole.states.shape[1]))
-        self._radius = self._target(self.followed.goal).radius(
-            plant.robot.radius, self.goal_radius, self.goal_tolerance
-        )
-        dt = self.trajectory.dt
+        self.trajectory, dt = self.followed.trajectory, self.whole.dt
+        self._target = Target(self.state_coordinates, self.followed.goal, self.trajectory.states)
+        self._radius = self._target.radius(plant.robot.radius, self.goal_radius, self.goal_tolerance)
         substeps, passing = plant.substeps(dt), _shape_among(plant, self.moving, self.knot * dt)
         _check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
         numbers = range(self.first_trial, self.first_trial + trials)
@@ -228,7 +279,7 @@ class ClosedLoop:
         self.physics.prepare(altered=self.effects.alter_models(self.physics))
         name = f"{type(self.law).__name__}.start"
         self.controller_run = check_kind(name, self.law.start(trials), ControllerRun, "a ControllerRun returned")
-        self.records = Recorder(self.trajectory, trials)
+        self.records = Records(self.trajectory, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
         self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
@@ -242,21 +293,16 @@ class ClosedLoop:
         elif sensors is not None:
             self._readings = Readings(sensors, self.effects, self.physics, dt)
 
-    @property
-    def trajectory(self) -> Trajectory:
-        return self.followed.trajectory
-
-    def _target(self, goal: Array | None) -> Target:
-        return Target(self.state_coordinates, goal, self.trajectory.states)
-
-    def run(self) -> None:
+    def run(self) -> Rollout:
         """Run all control periods; fewer if all trials have ended."""
         steps = self.trajectory.steps
-        self.begin()
-        while self.step < steps and self.period():
-            if self.progress is not None:
-                self.progress(self.step, steps)
-        self.detect_contacts_at_end()
+        with unlogged():
+            self.begin()
+            while self.step < steps and self.period():
+                if self.progress is not None:
+                    self.progress(self.step, steps)
+            self.detect_contacts_at_end()
+        return self.rollout(undisturbed=self._undisturbed())
 
     def begin(self) -> None:
         """Measure the states at the first knot, after what came before."""
@@ -266,8 +312,6 @@ class ClosedLoop:
             self.effects.follow(step, states, controls)
             read = self._readings
             shown = states if read is None else read.follow(step, states, self._held(step))
-            if isinstance(read, BeliefReadings):
-                shown = np.hstack([shown, states[:, read.belief.known]])
             self.controller_run.control(step, shown)
         self.step, self.measured = 0, self.measure(0)
 
@@ -297,23 +341,22 @@ class ClosedLoop:
         shape = self.trials, len(self._names)
         shown, knot = measured, self.knot + step
         if self._readings is not None:
-            shown = self._readings.arriving(knot, self.states, None if step else self._held(knot))
-            if isinstance(self._readings, BeliefReadings):
-                shown = np.hstack([shown, measured[:, self._readings.belief.known]])
+            shown = self._readings.arriving(knot, self.states, measured, None if step else self._held(knot))
         try:
             commands = _checked_commands(self.controller_run.control(knot, shown), shape)
             failed = _not_finite(commands)
             first = np.argmin(np.isfinite(commands), axis=1)
-            reasons = [
-                f"got {commands[k, first[k]]} for {self._names[first[k]]}, want a finite number"
-                for k in np.flatnonzero(failed)
-            ]
+            reasons = {
+                k: f"got {commands[k, first[k]]} for {self._names[first[k]]}, want a finite number"
+                for k in np.flatnonzero(failed).tolist()
+            }
         except Exception as error:  # a controller may raise anything; its trials have failed
             commands, failed = np.zeros(shape), np.ones(len(measured), dtype=bool)
-            reasons = [format_error(error)] * len(measured)
-        self.records.estimator_diverged(step, self.controller_run.estimator_diverged())
-        self.records.fail(step, failed, reasons)
-        self.records.commanded[:, step] = commands
+            reasons = dict.fromkeys(range(len(measured)), format_error(error))
+        records = self.records
+        records.end(records.lost_since, step, "filter", self.controller_run.estimator_diverged())
+        records.end(records.failed_since, step, "controller", reasons)
+        records.commanded[:, step] = commands
         return np.where(failed[:, None], self.trajectory.controls[step], commands)
 
     def _held(self, knot: int) -> Array:
@@ -374,9 +417,30 @@ class ClosedLoop:
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
         if self.step < self.trajectory.steps:
-            trials = self.trials
-            twin.records.fail(self.step, np.ones(trials, dtype=bool), ["went no further"] * trials)
+            reasons = dict.fromkeys(range(self.trials), "went no further")
+            twin.records.end(twin.records.failed_since, self.step, "controller", reasons)
         return twin.rollout()
+
+    def _undisturbed(self) -> Array | None:
+        """States (T+1, n) of the plan's own policy without disturbances, NaN once that run has ended; None if unknown.
+
+        A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
+        plant repeats, there is a further run; the plant remembers it until another plan runs there.
+        """
+        plant, plan, records = self.plant, self.followed, self.records
+        if self.starts is not None or self.moving is not None:
+            return None
+        if not self.acting and self.law.digest == plan.policy.digest:
+            records.turn_to_plan(self.state_coordinates)
+            ended = min(self.collisions.at[0], records.time_of(records.lost_since)[0])
+            return np.where(plan.trajectory.times[:, None] < ended, records.states[0], np.nan)
+        if not plant.robot.dynamics.by_mujoco or plant.simulator is not None:
+            return None
+        which = plan.policy.digest, plan.trajectory.states.tobytes()
+        if plant.ran is None or plant.ran[:2] != which:
+            alone = ClosedLoop(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1)
+            plant.ran = (*which, alone.run().undisturbed)
+        return plant.ran[2]
 
     def rollout(self, *, undisturbed: Array | None = None) -> Rollout:
         """A Rollout of all records, with the states of an undisturbed run."""
@@ -385,15 +449,14 @@ class ClosedLoop:
         goal, radius = self.followed.goal, self._radius
         if (moved := self.controller_run.moved_goal()) is not None:
             # A radius that was given holds for another goal only in the same unit.
-            same_unit = self._target(moved).unit == self._target(goal).unit
-            stated = (self.goal_radius, self.goal_tolerance) if same_unit else (None, None)
-            goal, radius = moved, self._target(moved).radius(plant.robot.radius, *stated)
+            target = replace(self._target, goal=moved)
+            stated = (self.goal_radius, self.goal_tolerance) if target.unit == self._target.unit else (None, None)
+            goal, radius = moved, target.radius(plant.robot.radius, *stated)
         changed = () if moved is None else (GOAL_MOVED,)
         begun = () if self.starts is None else ("given first states",)
         passing = () if self.moving is None else (f"moving obstacles {', '.join(self.moving.names)}",)
         records.turn_to_plan(self.state_coordinates)
-        frames = records.stacked_frames(parts, all_of_them=self.frames)
-        records.erase(frames, parts)
+        frames = records.finish(parts, all_frames=self.frames)
         return Rollout(
             robot=plant.robot.name,
             body=plant.robot.body,
@@ -461,7 +524,7 @@ def _checked_commands(commands: Any, shape: tuple[int, int]) -> Array:
     return command
 
 
-def _not_finite(rows: Array) -> npt.NDArray[np.bool_]:
+def _not_finite(rows: Array) -> Mask:
     """Whether each row has a number that is not finite, (K,)."""
     finite = np.isfinite(rows)
     if finite.all():  # much faster than testing each row
@@ -479,8 +542,12 @@ def _shape_among(plant: Plant, moving: World | None, time: float) -> ShapeInWorl
     return robot.among(moving.moved(time))
 
 
-def _coordinates_of(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
-    """The coordinates of the controller's states and controls. Raises InputError unless they match the plant's."""
+def _coordinates_of(controller: Controller, followed: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
+    """The coordinates of the controller's states and controls.
+
+    Raises:
+      InputError: they or the plan's do not match the plant's, or the plan is not finite.
+    """
     dynamics = plant.robot.dynamics
     kind = type(controller).__name__
     check_text(f"{kind}.digest", controller.digest, "a hash as text")
@@ -497,21 +564,17 @@ def _coordinates_of(controller: Controller, plant: Plant) -> tuple[Coordinates, 
             f"controller: got a policy for a position {_place(meant)}, want the position of robot {plant.robot.name}:"
             f" {_place(moves)}"
         )
-    # A command that the robot clips is at a limit, whatever limits the policy assumed.
-    control_space = dynamics.control_coordinates
-    low, high = np.maximum(spaces[1].low, control_space.low), np.minimum(spaces[1].high, control_space.high)
-    return spaces[0], spaces[1].limited((low, high))
-
-
-def _check_plan(followed: Plan, plant: Plant) -> None:
-    """Raise InputError unless the plan is finite, and has the plant's states and controls."""
-    plan, dynamics = followed.trajectory, plant.robot.dynamics
+    plan = followed.trajectory
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
         raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
     if not plan.finite:
         raise InputError(f"plan: got a plan that is not finite ({followed.status.name}), want one that can be run")
+    # A command that the robot clips is at a limit, whatever limits the policy assumed.
+    control_space = dynamics.control_coordinates
+    low, high = np.maximum(spaces[1].low, control_space.low), np.minimum(spaces[1].high, control_space.high)
+    return spaces[0], spaces[1].limited((low, high))
 
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:

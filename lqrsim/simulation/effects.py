@@ -163,7 +163,7 @@ class Readings:
         exact = self._sensors.reader()(states[:1], controls[:1], np.zeros((1, 6)))
         return self._arriving(step, np.repeat(exact, len(states), axis=0))
 
-    def arriving(self, step: int, states: Array, held: Array | None) -> Array:
+    def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
         """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
         exact = self._sensors.readings(self._physics.sense(held))
         named = {sensor.name: exact[:, at] for sensor, at in self._columns()}
@@ -184,27 +184,28 @@ class Readings:
 
 
 class BeliefReadings:
-    """The readings of K trials by the formulas of a belief, in the true states, at each knot.
+    """The readings of K trials by the formulas of a belief, in the true states, followed by the states that it knows.
 
-    `ReadingErrors` adds their noise.
+    `ReadingErrors` adds the noise of the readings.
     """
 
     def __init__(self, belief: Belief, effects: Effects) -> None:
         self.belief, self._effects, self._readings = belief, effects, list[Array]()
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
-        """The exact readings (K, Y) that arrive at a knot of the plan, before the run begins."""
-        return self._late(self.belief.read(states)[0])
+        """Exact readings and states at a knot of the plan, before the run begins; as `arriving`."""
+        return self._late(self.belief.read(states)[0], states)
 
-    def arriving(self, step: int, states: Array, held: Array | None) -> Array:
-        """The readings (K, Y) that arrive in the true states (K, n), NaN for those that are lost."""
+    def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
+        """The readings (K, Y) that arrive in the true states (K, n), NaN for lost ones; and measured known states."""
         exact, deviations = self.belief.read(states)
-        return self._late(self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS])
+        return self._late(self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS], measured)
 
-    def _late(self, readings: Array) -> Array:
+    def _late(self, readings: Array, states: Array) -> Array:
         self._readings.append(readings)
         arrived = len(self._readings) > self.belief.sensors.delay
-        return self._readings.pop(0) if arrived else np.full_like(readings, np.nan)
+        arriving = self._readings.pop(0) if arrived else np.full_like(readings, np.nan)
+        return np.hstack([arriving, states[:, self.belief.known]])
 
 
 class _Streams(Sequence[np.random.Generator]):
