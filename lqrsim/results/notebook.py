@@ -5,59 +5,19 @@ All text is escaped, because names come from files that anyone may have written.
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 
-if TYPE_CHECKING:
-    from lqrsim.results.rollout import Rollout
-    from lqrsim.results.solution import Solution
-
 WIDTH, HEIGHT, MARGIN = 360, 240, 12  # size of a drawing in pixels
 POINTS = 300  # largest number of points of a line
-MOST = 10  # largest number of trials in the table, and of lines in the drawing
+SHOWN = 10  # largest number of trials in a table or a summary, and of lines in a drawing
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
 
 
-def of_solution(solution: "Solution") -> str:
-    """Status, numbers and plan of a solution."""
-    plan = solution.trajectory
-    rows = [("cost", _number(solution.cost)), ("iterations", str(len(solution.iterations)))]
-    rows += [(name, _number(getattr(solution, name))) for name in ("gap", "optimality", "violation")]
-    if solution.clearance is not None:
-        rows.append(("clearance", f"{_number(solution.clearance.min())} m"))
-    if np.isfinite(plan.states[-1]).all():
-        away = float(solution.target.distance(plan.states[-1]))
-        rows.append((f"from the {solution.target.name}", f"{_number(away)} {solution.target.unit}"))
-    rows.append(("horizon", f"{plan.steps} steps of {_number(plan.dt)} s"))
-    remarks = [text for text in (solution.status.meaning, solution.detail, solution.remedy) if text]
-    none = np.empty((0, *plan.states.shape))
-    picture = _drawing(solution.policy.state_coordinates, plan.times, plan.states, none)
-    return of_table(f"{solution.status.name}, {solution.solver}", remarks, rows, picture, head=False)
-
-
-def of_rollout(rollout: "Rollout") -> str:
-    """Outcomes of the first trials, and their paths about the plan."""
-    target, least, away = rollout.target, rollout.least_clearance(), rollout.goal_distance
-    rows = [
-        ("trial", "outcome", "ended", f"largest error, {rollout.tracking_unit}", f"from the {target.name}", "clearance")
-    ]
-    for k in range(min(rollout.trials, MOST)):
-        worst = float(np.max(rollout.tracking_error[k], where=rollout.counts[k], initial=0.0))
-        ended, near = f"{_number(rollout.ended[k])} s", f"{_number(least[k])} m"
-        apart = f"{_number(away[k])} {target.unit}"
-        rows.append((str(rollout.first_trial + k), rollout.outcome[k], ended, _number(worst), apart, near))
-    remarks = ["; ".join(rollout.disturbances) or "undisturbed", rollout.tally()]
-    if rollout.trials > MOST:
-        remarks.append(f"the first {MOST} of {rollout.trials} trials are shown")
-    picture = _drawing(rollout.state_coordinates, rollout.times, rollout.plan.states, rollout.states)
-    return of_table(f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}", remarks, rows, picture)
-
-
-def _number(value: float) -> str:
+def number_text(value: float) -> str:
     """A number with four digits; a dash if it is not finite."""
     return f"{value:.4g}" if np.isfinite(value) else "-"
 
@@ -79,8 +39,8 @@ def of_table(
     )
 
 
-def _drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
-    """The plan (T+1, n) and runs (K, T+1, n) as SVG: paths of MOST runs along the first two axes of the position.
+def drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
+    """The plan (T+1, n) and runs (K, T+1, n) as SVG: paths of SHOWN runs along the first two axes of the position.
 
     Without a position, it shows the states of the plan and of the first run over time, each to its own scale.
     """
@@ -88,7 +48,7 @@ def _drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
     if space.position:
         place = list(space.position[:2])
         lines = [(plan[:, place], "currentColor", "plan", dashes)]
-        lines += [(run[:, place], COLOURS[k], f"run {k}", "") for k, run in enumerate(runs[:MOST])]
+        lines += [(run[:, place], COLOURS[k], f"run {k}", "") for k, run in enumerate(runs[:SHOWN])]
         names = [space.labels[i] for i in place]
         return _svg(lines, f"{names[0]} to the right, {names[1]} up", equal=True)
     low, high = _range(plan)
@@ -114,8 +74,7 @@ def _range(values: Array) -> tuple[Array, Array]:
 def _svg(lines: list[tuple[Array, str, str, str]], title: str, *, equal: bool) -> str:
     """Lines (N, 2) with colour, title and dashes, to one scale if `equal`; points that are not finite are left out."""
     low, high = _range(np.concatenate([line for line, *_ in lines]))
-    room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
-    scale = room / (high - low)
+    scale = (np.array([WIDTH, HEIGHT]) - 2 * MARGIN) / (high - low)
     if equal:
         scale = np.full(2, scale.min())
     middle = (low + high) / 2

@@ -11,12 +11,11 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Bounds, Index, Line, NonNegative, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_symmetric, excerpt, vectors_of
-from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_unit, worst_of
+from lqrsim.results.notebook import SHOWN, drawing, number_text, of_table
 from lqrsim.results.solution_parts import Trajectory
 
-LISTED = 10  # largest number of trials in a summary, as in a notebook
 GOAL_MOVED = "goal moved during the run"  # among the disturbances of a run
 
 # MuJoCo's warnings, in the order of mjtWarning.
@@ -370,8 +369,8 @@ class Rollout:
             counted = Counter(self.outcome)
             outcomes = ", ".join(f"{counted[outcome]} {outcome}" for outcome in OUTCOMES if counted[outcome])
             lines.append(f"  {self.trials} trials: {outcomes}")
-        lines += [f"  {self._line(k)}" for k in range(min(self.trials, LISTED))]
-        return "\n".join([*lines, f"  and {self.trials - LISTED} more"] if self.trials > LISTED else lines)
+        lines += [f"  {self._line(k)}" for k in range(min(self.trials, SHOWN))]
+        return "\n".join([*lines, f"  and {self.trials - SHOWN} more"] if self.trials > SHOWN else lines)
 
     def departure(self) -> str:
         """Where the undisturbed run of the plan's own policy leaves the plan, as text; empty if it does not.
@@ -431,4 +430,25 @@ class Rollout:
     __str__ = summary
 
     def _repr_html_(self) -> str:
-        return notebook.of_rollout(self)
+        """Outcomes of the first trials, and their paths about the plan, for notebooks."""
+        target, least, distance = self.target, self.least_clearance(), self.goal_distance
+        rows = [
+            (
+                "trial",
+                "outcome",
+                "ended",
+                f"largest error, {self.tracking_unit}",
+                f"from the {target.name}",
+                "clearance",
+            )
+        ]
+        for k in range(min(self.trials, SHOWN)):
+            worst = float(np.max(self.tracking_error[k], where=self.counts[k], initial=0.0))
+            end = f"{number_text(distance[k])} {target.unit}", f"{number_text(least[k])} m"
+            ended = f"{number_text(self.ended[k])} s"
+            rows.append((str(self.first_trial + k), self.outcome[k], ended, number_text(worst), *end))
+        remarks = ["; ".join(self.disturbances) or "undisturbed", self.tally()]
+        if self.trials > SHOWN:
+            remarks.append(f"the first {SHOWN} of {self.trials} trials are shown")
+        picture = drawing(self.state_coordinates, self.times, self.plan.states, self.states)
+        return of_table(f"{self.robot} in {self.scene}, seed {self.seed}", remarks, rows, picture)

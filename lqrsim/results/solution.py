@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import LINE, Line, checked
 from lqrsim.errors import Array, InputError, check_shape
-from lqrsim.results import notebook
+from lqrsim.results.notebook import drawing, number_text, of_table
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import BetweenKnots, Candidate, Certificate, Curvature, Iteration
@@ -233,7 +233,19 @@ class Solution(Plan):
     __str__ = summary
 
     def _repr_html_(self) -> str:
-        return notebook.of_solution(self)
+        """Status, numbers and plan, for notebooks."""
+        plan, target = self.trajectory, self.target
+        rows = [("cost", number_text(self.cost)), ("iterations", str(len(self.iterations)))]
+        rows += [(name, number_text(getattr(self, name))) for name in ("gap", "optimality", "violation")]
+        if self.clearance is not None:
+            rows.append(("clearance", f"{number_text(self.clearance.min())} m"))
+        if np.isfinite(plan.states[-1]).all():
+            distance = number_text(float(target.distance(plan.states[-1])))
+            rows.append((f"from the {target.name}", f"{distance} {target.unit}"))
+        rows.append(("horizon", f"{plan.steps} steps of {number_text(plan.dt)} s"))
+        remarks = [text for text in (self.status.meaning, self.detail, self.remedy) if text]
+        picture = drawing(self.policy.state_coordinates, plan.times, plan.states, np.empty((0, *plan.states.shape)))
+        return of_table(f"{self.status.name}, {self.solver}", remarks, rows, picture, head=False)
 
 
 def _first(lines: list[str], most: int) -> list[str]:
