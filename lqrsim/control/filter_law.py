@@ -1,6 +1,6 @@
 """A Kalman filter with the law that follows its estimates: matrices about a plan, runs of K trials, and the export.
 
-The run predicts with the nonlinear dynamics. The export, an `OutputFeedbackPolicy`, is linear about the plan.
+A run predicts with the nonlinear dynamics. The export, an `OutputFeedbackPolicy`, is linear about the plan.
 """
 
 from collections.abc import Mapping
@@ -10,15 +10,21 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
-from lqrsim.control.kalman import KalmanFilter
+from lqrsim.control.kalman import KalmanFilter, kalman_filter
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest
 from lqrsim.control.tracking_laws import Laws, Weights, tracking_laws
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError
 from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Measurements, Policy
+from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import OutputFeedbackPolicy
+from lqrsim.results.solution_parts import Trajectory
+from lqrsim.solvers import compiled
+from lqrsim.solvers.assembly import clearance_of
+from lqrsim.solvers.initial_guess import InitialGuess
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +94,7 @@ class FilterRun(ControllerRun):
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
         # If the first measurement is lost, the plan's first state is shown.
-        self._last = np.tile(law.model.plan.states[0], (trials, 1))
+        self._last_measured = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._differences = np.empty((trials, law.model.sensor.size))
         self._wider = np.ones(trials)  # see `correct`
@@ -116,8 +122,8 @@ class FilterRun(ControllerRun):
             self._predict(self.z, self._commands.pop(0))
         # After the horizon the last gain stays in force.
         knot = min(step - self.first - self._latency, law.model.plan.steps)
-        lost = (measured == self._last).all(axis=1).astype(np.float64)
-        self._last[:] = measured
+        lost = (measured == self._last_measured).all(axis=1).astype(np.float64)
+        self._last_measured[:] = measured
         model.compiled.correct(
             self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
             law.filter.gain[knot], law.filter.limit[knot], self._wider, model.compiled_sensor, model.turning,
@@ -130,28 +136,131 @@ class FilterRun(ControllerRun):
     def command(self, step: int) -> Array:
         """The controls of a step, after its measurement was used."""
         law, model = self.law, self.model
-        ahead = self.z
+        predicted = self.z
         if self._commands:
-            ahead = ahead.copy()
+            predicted = predicted.copy()
             for command in self._commands:
-                self._predict(ahead, command)
+                self._predict(predicted, command)
         t = min(step - self.first + self._delay, law.model.plan.steps - 1)
         out = np.empty((self._trials, self.model.m))
-        near = in_c_order(law.model.plan.states[t])
+        nominal = in_c_order(law.model.plan.states[t])
         gains = Policy(law.gain[t], law.offset[t])
-        model.compiled.command(self._trials, ahead, near, gains, self._limits, model.turning, out)
+        model.compiled.command(self._trials, predicted, nominal, gains, self._limits, model.turning, out)
         self._commands.append(out.copy())
         first_implausible = np.empty(self._trials)
-        model.compiled.diverged(self._trials, ahead, first_implausible)
+        model.compiled.diverged(self._trials, predicted, first_implausible)
         for k in np.flatnonzero(first_implausible < model.size):
             i = int(first_implausible[k])
-            fault = f"is beyond {FAR:g}" if np.isfinite(ahead[k, i]) else "is not finite"
+            fault = f"is beyond {FAR:g}" if np.isfinite(predicted[k, i]) else "is not finite"
             self._diverged.setdefault(int(k), f"the estimate of {model.names[i]} {fault}")
         return out
 
     def _predict(self, estimates: Array, commands: Array) -> None:
         with self.model.dynamics.quiet():
             self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
+
+
+class ReplannedRun(ControllerRun):
+    """A run in which each trial has its own law, about a new plan if the law no longer leads to the goal.
+
+    At each check of the rule, the law is simulated with the model, from the estimated state and with the unknown
+    constants at their estimated values. If that run collides or misses the goal, or `always`, the rest of the horizon
+    is solved from that state, and law and filter are recomputed about the new plan. Otherwise a new plan would do harm:
+    it would have a lower cost, and go as close to obstacles as its constraints permit. The estimates continue
+    unchanged, and the law acts on their difference from the values that the new plan assumes. Some disturbances are
+    left to the law: gusts, because they pass and plans do not model them; and gains and offsets of the controls and the
+    lag of the actuators, which are no parameters of the model. A solve takes no time in the simulation.
+
+    Attributes:
+      plans: plans of each trial, by the step at which they begin; without the first plan.
+      estimates, innovations: as in `FilterRun`.
+    """
+
+    def __init__(self, rule: ReplanRule, law: FilterLaw, trials: int, record: bool, *, always: bool) -> None:
+        self._rule, self._always = rule, always
+        self._runs = [FilterRun(law, 1, record) for _ in range(trials)]
+        self.plans: list[dict[int, Trajectory]] = [{} for _ in range(trials)]
+        self.log, self._sent = ReplanLog(), list[Array | None]([None] * trials)
+
+    @property
+    def estimates(self) -> Array | None:
+        return self._of_all([run.estimates for run in self._runs])
+
+    @property
+    def innovations(self) -> Array | None:
+        return self._of_all([run.innovations for run in self._runs])
+
+    def _of_all(self, records: list[Array | None]) -> Array | None:
+        known = [record for record in records if record is not None]
+        return np.concatenate(known, axis=1) if known else None
+
+    def control(self, step: int, measured: Array) -> Array:
+        commands: list[Array] = []
+        for k, run in enumerate(self._runs):
+            run.update(step, measured[k : k + 1])
+            if self._rule.due(step, max(step - 1, 0)) and not run.estimator_diverged():
+                self._replan(run, k, step)
+            commands.append(run.command(step))
+            self._sent[k] = commands[-1][0]
+        return np.concatenate(commands)
+
+    def estimator_diverged(self) -> Mapping[int, str]:
+        return {k: why for k, run in enumerate(self._runs) for why in run.estimator_diverged().values()}
+
+    def summary(self) -> str:
+        return self.log.summary()
+
+    def _leads_to_goal(self, problem: Problem, gain: Array, offset: Array, state: Array) -> bool:
+        """Whether a law leads from a state (n,) to the goal, clear of obstacles, by the model."""
+        states, _ = compiled.rollout(problem, gain, offset, state)
+        if not np.isfinite(states).all():
+            return False
+        clearance, solution = clearance_of(problem, states), self._rule.solution
+        radius = solution.target.radius_of_plan(solution.goal_radius)
+        reached = radius is None or bool(solution.target.distance(states[-1]) <= radius)
+        return reached and (clearance is None or bool(clearance.min() >= 0))
+
+    def _replan(self, run: FilterRun, trial: int, step: int) -> None:
+        """Replace the law of a trial by a law about a new plan, if a new plan is needed and found."""
+        law, model, z = run.law, run.model, run.z[0]
+        n, done = model.n, step - run.first
+        # The unknowns' states that are constant to the end of the horizon and change only parameters.
+        on_controls = (model.output[len(model.parameters) :] != 0).any(axis=0)
+        known = (model.output != 0).any(axis=0) & ~on_controls
+        for unknown, states in zip(model.remembered, model.own_states, strict=True):
+            known[list(states)] &= unknown.constant
+        granted = np.where(known, z[n + model.lagging :], 0.0)
+        changes = model.output[: len(model.parameters)] @ granted
+        values = {
+            name: float(model.dynamics.parameters[name] + change)
+            for name, change in zip(model.parameters, changes, strict=True)
+        }
+        try:
+            dynamics = model.dynamics.with_parameters(**values)
+            problem = replace(self._rule.problem, dynamics=dynamics)
+        except InputError as error:  # an estimate is not finite
+            self.log.kept[str(error)] += 1
+            return
+        # In that model the actuators have no lag, gains or offsets.
+        gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
+        fixed = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
+        offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
+        here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
+        gain = in_c_order(gain[:, :, :n])
+        if not self._always and self._leads_to_goal(problem, gain, offset, here):
+            return
+        plan = law.plan
+        start = InitialGuess(gain, in_c_order(offset), cost_to_go=plan.shifted(done, horizon="shrinking").cost_to_go)
+        sent = self._sent[trial] if problem.control_rate is not None else None
+        solution = self._rule.solve(SolveRequest(step, step, here, start, problem, sent))
+        if not self.log.enter(step, trial, solution):
+            return
+        self.plans[trial][step] = solution.trajectory
+        about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
+        # The filter begins with a measurement that has been used already.
+        kalman = kalman_filter(about, law.filter.corrected_root[done])
+        weights = replace(law.weights, emphasis=None)  # that of another plan
+        run.law, run.first = FilterLaw.of(solution, Design.of(about, kalman, weights), granted), step
 
 
 def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:

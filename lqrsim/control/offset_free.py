@@ -12,12 +12,11 @@ import numpy as np
 
 from lqrsim.annotations import checked
 from lqrsim.control.controllers import Controller
-from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, policy_of
+from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, ReplannedRun, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
-from lqrsim.control.replanned import ReplannedRun
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.control.tracking import (
     Predictions,

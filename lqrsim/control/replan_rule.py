@@ -1,6 +1,6 @@
 """Re-planning: the rule that determines the problem, time and start of each solve; and the log of the solves.
 
-`replanner.py` applies the rule in simulations or on a robot. `replanned.py` applies it within output feedback.
+`replanner.py` applies the rule in simulations or on a robot, and `filter_law.py` within output feedback.
 """
 
 import math
