@@ -133,7 +133,7 @@ def test_the_compiled_law_is_the_one_in_numpy(request: pytest.FixtureRequest, fi
     solution: ls.Solution = request.getfixturevalue(fixture)
     policy, rng = solution.policy, np.random.default_rng(0)
     space, limits = policy.state_coordinates, policy.control_coordinates
-    evaluate = evaluator(space, limits)
+    evaluate = evaluator(policy)
     at_limits = []
     for step in (0, 40, policy.steps - 1):
         states = policy.nominal[step] + rng.normal(size=(50, len(space))) * rng.choice([0.01, 3.0], size=(50, 1))
@@ -142,7 +142,7 @@ def test_the_compiled_law_is_the_one_in_numpy(request: pytest.FixtureRequest, fi
         for i in space.rotation_vectors:
             angle = np.linalg.norm(states[:, i : i + 3], axis=1, keepdims=True)
             states[:, i : i + 3] *= 1 + 2 * np.pi * rng.integers(-2, 3, size=(50, 1)) / angle
-        compiled_controls = evaluate(states, policy.gain[step], policy.offset[step], policy.nominal[step])
+        compiled_controls = evaluate(policy, step, states)
         controls = policy(states, step * policy.dt)
         # Gains of up to 3 on a dozen states of up to 20: rounding, not more.
         np.testing.assert_allclose(compiled_controls, controls, rtol=0, atol=1e-12)

@@ -80,8 +80,7 @@ class BeliefRun(ControllerRun):
     """
 
     def __init__(self, law: BeliefFeedback, trials: int) -> None:
-        policy = law.solution.policy
-        self._law, self._evaluate = law, evaluator(policy.state_coordinates, policy.control_coordinates)
+        self._law, self._evaluate = law, evaluator(law.solution.policy)
         self._read = np.tile(law.solution.trajectory.states[0], (trials, 1))  # at the last knot whose readings arrived
         self._commands, self._known, self._record = list[Array](), list[Array](), list[Array]()
 
@@ -103,6 +102,5 @@ class BeliefRun(ControllerRun):
             now = belief.corrected(now, command, np.full_like(readings, np.nan))
         now[:, belief.known] = self._known[step]
         self._record.append(now)
-        t = min(step, policy.steps - 1)
-        self._commands.append(self._evaluate(now, policy.gain[t], policy.offset[t], policy.nominal[t]))
+        self._commands.append(self._evaluate(policy, min(step, policy.steps - 1), now))
         return self._commands[-1]

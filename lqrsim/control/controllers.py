@@ -27,18 +27,19 @@ from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.robots.sensors import RobotSensors
 
 
-def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
-    """A function that evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
+def evaluator(policy: AffinePolicy) -> Callable[[AffinePolicy, int, Array], Array]:
+    """A function that evaluates laws: (policy, row, states (K, n)) -> controls (K, m), with this policy's coordinates.
 
     It works like `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
     """
+    states, controls = spaces_of(policy)
     limits, turning = Limits(np.array(controls.low), np.array(controls.high)), turning_of(states)
     laws = _laws(len(states), len(controls))
 
-    def evaluate(shown: Array, gain: Array, offset: Array, nominal: Array) -> Array:
-        near, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
-        law = Policy(in_c_order(gain), in_c_order(offset))
-        laws.apply_policy(len(shown), near, law, in_c_order(nominal), turning, limits, out)
+    def evaluate(policy: AffinePolicy, row: int, shown: Array) -> Array:
+        x, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
+        law = Policy(in_c_order(policy.gain[row]), in_c_order(policy.offset[row]))
+        laws.apply_policy(len(shown), x, law, in_c_order(policy.nominal[row]), turning, limits, out)
         return out
 
     return evaluate
@@ -182,12 +183,10 @@ class Feedback(_OfPolicy, ControllerRun):
 
     @cached_property
     def _evaluate(self) -> Callable[..., Array]:
-        return evaluator(*spaces_of(self.policy))
+        return evaluator(self.policy)
 
     def control(self, step: int, measured: Array) -> Array:
-        policy = self.policy
-        t = min(step, policy.steps - 1)
-        return self._evaluate(measured, policy.gain[t], policy.offset[t], policy.nominal[t])
+        return self._evaluate(self.policy, min(step, self.policy.steps - 1), measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,27 +203,22 @@ class OutputFeedback(_OfPolicy):
                 f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             )
 
-    @property
-    def measures(self) -> list[int]:
-        """The indices of the measured states."""
-        return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
-
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self.policy, self.measures, trials)
+        return _OutputFeedbackRun(self.policy, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, policy: OutputFeedbackPolicy, measures: list[int], trials: int) -> None:
-        self._policy, self._measures = policy, measures
-        self._z = np.tile(policy.start(), (trials, 1))
-        self._last = np.full((trials, len(policy.state_coordinates)), np.nan)
+    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
+        states = policy.state_coordinates.names
+        self._policy, self._measures = policy, [states.index(name) for name in policy.measured_coordinates.names]
+        self._z, self._previous = np.tile(policy.start(), (trials, 1)), np.full((trials, len(states)), np.nan)
 
     def control(self, step: int, measured: Array) -> Array:
         policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))
-        for k, (shown, last) in enumerate(zip(measured, self._last, strict=True)):
-            y = None if np.array_equal(shown, last) else shown[self._measures]
+        for k, (shown, previous) in enumerate(zip(measured, self._previous, strict=True)):
+            y = None if np.array_equal(shown, previous) else shown[self._measures]
             commands[k], self._z[k] = policy.step(self._z[k], y, step * policy.dt)
-        self._last[:] = measured
+        self._previous[:] = measured
         return commands
 
 

@@ -265,7 +265,7 @@ class ReplannerRun(ControllerRun):
     """K trials of a simulation, with the plan in force in each."""
 
     def __init__(self, of: Replanner, trials: int) -> None:
-        self._of, self._rule, self._evaluate = of, of.rule, evaluator(*of.coordinates)
+        self._of, self._rule, self._evaluate = of, of.rule, evaluator(of.solution.policy)
         self.log = ReplanLog()
         self._problem = of.problem  # as last known
         self.active = [ActivePlan(of.solution, 0)] * trials
@@ -279,8 +279,7 @@ class ReplannerRun(ControllerRun):
             self._activate(step)
         commands = np.empty((len(measured), len(self._of.coordinates[1])))
         for trial, active in enumerate(self.active):
-            row, policy, state = active.row(step), active.plan.policy, measured[trial : trial + 1]
-            commands[trial] = self._evaluate(state, policy.gain[row], policy.offset[row], policy.nominal[row])[0]
+            commands[trial] = self._evaluate(active.plan.policy, active.row(step), measured[trial : trial + 1])[0]
         self._sent = within_rates(commands, self._problem, self._sent)
         return self._sent
 
