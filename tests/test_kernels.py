@@ -1311,13 +1311,13 @@ class TestDesigns:
             filtered = kalman.kalman_filter(model, known=np.tril(rng_of_root.normal(size=(model.size,) * 2)))
             filtered_from_start = kalman.kalman_filter(model)
             laws = tracking_laws.tracking_laws(model, weights)
-            loop = linear_loop.LinearLoop(model, *laws, filtered_from_start.gain, *limits)
+            loop = linear_loop.LinearLoop(model, *laws, filtered_from_start.gain, limits)
             return [
                 *filtered,
                 *filtered_from_start,
                 *laws,
                 *loop.moments(),
-                *with_filter(model, filtered, laws, limits),
+                *with_filter(model, filtered, limits, laws),
             ]
 
         rng_of_root = np.random.default_rng(0)

@@ -97,7 +97,7 @@ def test_moments_with_another_lag_than_the_filters_are_those_of_runs(seed: int, 
     truth = PlanModel.of(system.problem.dynamics, system.plan, only)
     limits = np.full(2, -1e6), np.full(2, 1e6)
     offset = law.offset - system.plan.controls + np.einsum("tij,tj->ti", law.gain, law.nominal[:-1])
-    found = LinearLoop(truth, law.gain, offset, law.filter.gain, *limits, law.model).moments()
+    found = LinearLoop(truth, law.gain, offset, law.filter.gain, limits, law.model).moments()
     states = run(system, law, lag, SMALL * np.eye(4))
     wanted = np.einsum("tki,tkj->tij", states, states)
     np.testing.assert_allclose(found.covariance[:, :4, :4], wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())

@@ -20,7 +20,7 @@ from lqrsim.control import tracking
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.linear_loop import LinearLoop, kernels
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking_laws import Weights, tracking_laws
+from lqrsim.control.tracking_laws import Laws, Weights, tracking_laws
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
@@ -220,7 +220,7 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
     model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
     gain, offset = rng.normal(size=(3, steps, m, n)), rng.normal(size=(3, steps, m))
     limits = np.full(m, -1.0), np.full(m, 1.5)
-    found = LinearLoop(model, gain, offset, None, *limits).moments(n)
+    found = LinearLoop(model, gain, offset, None, limits).moments(n)
     shown, (F, G, c), onto_force = np.diag(model.shown_std**2), model.arriving, np.eye(m, model.size, n)
     for i in range(3):
         x, P = np.zeros(model.size), model.start_root @ model.start_root.T
@@ -259,11 +259,11 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
     uncertainty = dataclasses.replace(uncertainty, start=0.3, measurement=0.1, control=0.2, model_error=0.05)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
-    laws = rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m))
+    laws = Laws(rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m)))
     bounds = (np.full(m, -1.0), np.full(m, 1.5)) if limits else (np.full(m, -np.inf), np.full(m, np.inf))
     filtered = kalman_filter(model)
-    part = tracking.with_filter(model, filtered, laws, bounds)
-    whole = LinearLoop(model, *laws, filtered.gain, *bounds).moments(n)
+    part = tracking.with_filter(model, filtered, bounds, laws)
+    whole = LinearLoop(model, *laws, filtered.gain, bounds).moments(n)
     for found, wanted in zip(part, whole, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
 
@@ -278,7 +278,7 @@ def test_moments_of_commands_that_get_lost_are_those_of_all_patterns(structure: 
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
     gain, offset, no = rng.normal(size=(steps, m, n)), rng.normal(size=(steps, m)), np.zeros(0)
-    moments = LinearLoop(model, gain, offset, None, np.full(m, -np.inf), np.full(m, np.inf)).moments()
+    moments = LinearLoop(model, gain, offset, None, (np.full(m, -np.inf), np.full(m, np.inf))).moments()
     oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
 
     def end(e: Array, lost: tuple[bool, ...]) -> Array:

@@ -307,10 +307,10 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
         policy = ls.track(system.problem, system.solution, tolerate=tolerate, effort=0.5, uncertainty=stated)
         controller, model = Feedback(policy), PlanModel.of(system.problem.dynamics, system.plan, stated)
         offset = np.einsum("tij,tj->ti", policy.gain, system.plan.states[:-1]) + policy.offset - system.plan.controls
-        loop = LinearLoop(model, policy.gain, offset, None, np.full(1, -1e6), np.full(1, 1e6))
+        loop = LinearLoop(model, policy.gain, offset, None, (np.full(1, -1e6), np.full(1, 1e6)))
     moments, n = loop.moments(), loop.model.n
     surroundings, counted = Surroundings.of(system.problem, 0.0), Counted.of(system.solution, ())
-    found = sample_loop(loop.model, controller, (loop.low, loop.high), surroundings, counted, 20_000, 0).moments
+    found = sample_loop(loop.model, controller, loop.limits, surroundings, counted, 20_000, 0).moments
     std = np.sqrt(np.diagonal(moments.covariance[:, :n, :n], axis1=1, axis2=2))
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), std, rtol=0.05)
     assert (np.abs(found.mean - moments.mean[:, :n]) < 5 * std / np.sqrt(20_000)).all()

@@ -33,7 +33,7 @@ def evaluator(policy: AffinePolicy) -> Callable[[AffinePolicy, int, Array], Arra
     It works like `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
     """
     states, controls = spaces_of(policy)
-    limits, turning = Limits(np.array(controls.low), np.array(controls.high)), turning_of(states)
+    limits, turning = Limits(*controls.limits), turning_of(states)
     laws = _laws(len(states), len(controls))
 
     def evaluate(policy: AffinePolicy, row: int, shown: Array) -> Array:

@@ -42,8 +42,7 @@ class Design:
 
     def pick(self, i: int) -> "Design":
         """The design with one of the C laws."""
-        gain, offset = self.laws
-        return replace(self, weights=self.weights.pick(i), laws=(gain[i], offset[i]))
+        return replace(self, weights=self.weights.pick(i), laws=self.laws.pick(i))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +73,6 @@ class FilterLaw:
     def coordinates(self) -> Spaces:
         return spaces_of(self.plan.policy)
 
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Lowest and highest controls, (m,) each."""
-        controls = self.plan.policy.control_coordinates
-        return np.array(controls.low), np.array(controls.high)
-
 
 class FilterRun(ControllerRun):
     """K trials of a run, with their estimates z (K, Z) at the knot of the newest measurement.
@@ -100,7 +93,7 @@ class FilterRun(ControllerRun):
         self._wider = np.ones(trials)  # see `correct`
         shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
         self.estimates, self.innovations = (np.full((*shape, size), np.nan) if record else None for size in sizes)
-        self._limits = Limits(*law.limits)
+        self._limits = Limits(*law.coordinates[1].limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
         # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
         controls = law.model.plan.controls

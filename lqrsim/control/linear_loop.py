@@ -63,8 +63,7 @@ class LinearLoop:
     gain: Array  # (T, m, Z or n) of a law in deviations from the plan, or (C, T, m, Z or n) of C laws
     offset: Array  # (T, m)
     filter_gain: Array | None  # of a Kalman filter, (T+1, Z, Y); None for a law of the measured states
-    low: Array
-    high: Array
+    limits: tuple[Array, Array]  # of the controls, (m,) each
     assumed: PlanModel | None = None  # by the filter, whose estimates have its Z; by default the true system's
 
     def moments(self, count: int | None = None) -> LoopMoments:
@@ -110,6 +109,6 @@ class LinearLoop:
         planned, reached = first.plan.controls, np.stack([model.reached for model in models], axis=1)
         arrays = LoopArrays(
             F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned,
-            shaking @ shaking.swapaxes(-1, -2), jointly, reached, self.low, self.high,
+            shaking @ shaking.swapaxes(-1, -2), jointly, reached, *self.limits,
         )  # fmt: skip
         return moments_of(arrays, stated, count, first.uncertainty.command_loss)

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from lqrsim.annotations import checked
+from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Controller
 from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, ReplannedRun, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
+from lqrsim.control.sampled_loop import Counted
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.control.tracking import (
     Predictions,
@@ -134,7 +136,7 @@ class OffsetFree(Controller):
         self._sensing = None if self._sensors is None else self._sensor_filter(self._sensors, replan_every)
         self.filter = kalman_filter(self.model) if self._sensing is None else self._sensing.along
         if tolerate is None:
-            moments = partial(with_filter, self.model, self.filter)
+            moments = partial(with_filter, self.model, self.filter, solution.policy.control_coordinates.limits)
             arguments = problem, solution, uncertainty, self.model, efforts, at_end, moments
             design = Design(self.model, self.filter, *choose_tolerances(*arguments, call="OffsetFree(...)"))
         else:
@@ -211,7 +213,7 @@ class OffsetFree(Controller):
         truth = self.model.under(met.steady(np.inf))
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
-        return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits, self.model)
+        return LinearLoop(truth, self.gain, offset, self.filter.gain, self.coordinates[1].limits, self.model)
 
     @property
     def policy(self) -> OutputFeedbackPolicy:
@@ -225,7 +227,7 @@ class OffsetFree(Controller):
 
     @property
     def digest(self) -> str:
-        model, limits = self.model, np.array(self._law.limits)
+        model, limits = self.model, np.array(self.coordinates[1].limits)
         parts = (self.gain, self.offset, self._law.nominal, self.filter.gain, model.output, model.transition, limits)
         uncertainty = self.uncertainty
         numbers = np.array(
@@ -267,22 +269,24 @@ def with_margin(
       stated: model of the true system, with a lag. memory, effort: as in `PlanModel.assumed`.
       at_end: as in `tolerances_to_try`, which has the tolerances that compete; None to keep those of the design.
     """
-    uncertainty, space = stated.uncertainty.steady(np.inf), solution.policy.control_coordinates
-    limits = np.array(space.low), np.array(space.high)
+    uncertainty = stated.uncertainty.steady(np.inf)
+    surroundings = Surroundings.of(problem, uncertainty.obstacles)
+    counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
     # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
     none = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
     truths = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, none)]
 
-    def predicted(one: Design) -> Predictions:
+    def predicted(design: Design) -> Predictions:
         """The predictions for C laws, with the lag and without it: (2, C)."""
-        loop = LinearLoop(truths[0], *one.laws, one.filter.gain, *limits, one.model)
+        limits = solution.policy.control_coordinates.limits
+        loop = LinearLoop(truths[0], *design.laws, design.filter.gain, limits, design.model)
         with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
             moments = loop.in_systems(truths, stated.n)
             lost = np.asarray(~np.isfinite(moments.covariance).all(axis=(-3, -2, -1)))
-        for part in moments:
-            part[lost] = 0.0
-        shown = predictions(problem, solution, uncertainty, stated, moments)
-        return Predictions(*(np.where(lost, gone, value) for gone, value in zip(GONE, shown, strict=True)))
+        for moment in moments:
+            moment[lost] = 0.0
+        finite = predictions(solution, surroundings, counted, moments)
+        return Predictions(*(np.where(lost, gone, value) for gone, value in zip(GONE, finite, strict=True)))
 
     outcomes = predicted(design)
     worth = outcomes.worth(narrowest(stated, outcomes.width[0]))
@@ -293,8 +297,8 @@ def with_margin(
     else:
         weights = tolerances_to_try(design.model, effort, at_end, solution.target)
     designs = [Design.of(design.model, design.filter, weights)]
-    for share, doubt in MILDER:
-        partly = stated.under(replace(stated.uncertainty, lag=share * stated.uncertainty.lag))
+    for fraction, doubt in MILDER:
+        partly = stated.under(replace(stated.uncertainty, lag=fraction * stated.uncertainty.lag))
         model = partly.assumed(memory, effort, doubt)
         designs.append(Design.of(model, kalman_filter(model), weights))
     outcomes = [predicted(candidate) for candidate in designs]

@@ -75,63 +75,65 @@ class Predictions(NamedTuple):
 
 def choose_tolerances(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
-    moments: Callable[[Laws, tuple[Array, Array]], LoopMoments], truth: PlanModel | None = None, *, call: str,
+    moments: Callable[[Laws], LoopMoments], truth: PlanModel | None = None, *, call: str,
 ) -> tuple[Weights, Laws]:  # fmt: skip
     """Choose the tolerances whose law is predicted to fail least often, and that law.
 
     Args:
       call: name of the user's call, for warnings.
       at_end: as in `track`.
-      moments: predicts the states' moments under C laws and the limits of the controls.
+      moments: predicts the states' moments under C laws.
       truth: model with the unknowns, for trials of laws that act on the measured state itself.
     """
     counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
-    tried, space = tolerances_to_try(model, effort, at_end, solution.target), solution.policy.control_coordinates
-    limits = np.array(space.low), np.array(space.high)
-    gain, offset = tracking_laws(model, tried)
-    loop_moments = moments((gain, offset), limits)
-    predicted = predictions(problem, solution, uncertainty, model, loop_moments)
+    surroundings = Surroundings.of(problem, uncertainty.obstacles)
+    tried, limits = (
+        tolerances_to_try(model, effort, at_end, solution.target),
+        solution.policy.control_coordinates.limits,
+    )
+    laws = tracking_laws(model, tried)
+    loop_moments = moments(laws)
+    predicted = predictions(solution, surroundings, counted, loop_moments)
     least = narrowest(model, predicted.width)
     worth = predicted.worth(least)
 
     def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
-        law = laws[0][i], laws[1][i]
+        law = laws.pick(i)
         limited = moments.saturation[i].mean() > LIMITED
-        far = LOST * np.sqrt(_squares(counted, moments.covariance[i]).max())
-        count = runs_lost(problem, solution, law, moments.mean[i], moments.covariance[i], counted, far)
+        farthest = LOST * np.sqrt(_squares(counted, moments.covariance[i]).max())
+        count = runs_lost(problem, solution, law, moments.mean[i], moments.covariance[i], counted, farthest)
         if count or not limited or truth is None or not truth.uncertainty.unknowns:
             return count
         run = Feedback(_policy_of(solution, law))
-        return int((sample_loop(truth, run, limits, OPEN, counted, TRIALS, 0).farthest > far).sum())
+        return int((sample_loop(truth, run, limits, OPEN, counted, TRIALS, 0).farthest > farthest).sum())
 
-    left = dict[int, int]()
+    runs = dict[int, int]()  # the number of lost runs of each law
     for best in sorted(range(len(worth)), key=lambda i: (worth[i], -i)):  # of equals the gentlest first
-        left[best] = lost(loop_moments, (gain, offset), best)
-        if not left[best]:
+        runs[best] = lost(loop_moments, laws, best)
+        if not runs[best]:
             break
     else:
-        best = min(left, key=lambda i: left[i])
+        best = min(runs, key=lambda i: runs[i])
         _log.warning(
             "%s: each law that was tried loses the plan from some deviations of the predicted size; the plan's own"
             " policy or tolerances of your own (tolerate=) may do better",
             call,
         )
-    weights, laws = tried.pick(best), (gain[best], offset[best])
+    chosen = tried.pick(best), laws.pick(best)
     # The same with emphasis, if it is predicted to fail less often.
     if predicted.saturation[best] > MODELLED:
-        return weights, laws
+        return chosen
     mean, covariance, across = loop_moments.mean[best], loop_moments.covariance[best], loop_moments.across[best]
-    surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    emphasis = surroundings.emphasis(model.plan.states + mean, covariance, across, weights.state)
+    emphasis = surroundings.emphasis(model.plan.states + mean, covariance, across, chosen[0].state)
     if not emphasis.any():
-        return weights, laws
-    stressing = weights.stressing(emphasis, EMPHASIS)
-    gain, offset = tracking_laws(model, stressing)
-    loop_moments = moments((gain, offset), limits)
-    stressed = predictions(problem, solution, uncertainty, model, loop_moments).worth(least)
+        return chosen
+    stressing = chosen[0].stressing(emphasis, EMPHASIS)
+    laws = tracking_laws(model, stressing)
+    loop_moments = moments(laws)
+    stressed = predictions(solution, surroundings, counted, loop_moments).worth(least)
     i = int(np.argmin(stressed))
-    better = stressed[i] < worth[best] and lost(loop_moments, (gain, offset), i) <= left[best]
-    return (stressing.pick(i), (gain[i], offset[i])) if better else (weights, laws)
+    better = stressed[i] < worth[best] and lost(loop_moments, laws, i) <= runs[best]
+    return (stressing.pick(i), laws.pick(i)) if better else chosen
 
 
 def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Target) -> Weights:
@@ -151,38 +153,34 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     )
 
 
-def predictions(
-    problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, moments: LoopMoments
-) -> Predictions:
+def predictions(solution: Solution, surroundings: Surroundings, counted: Counted, moments: LoopMoments) -> Predictions:
     """The predictions for laws with these moments of the states, (..., T+1, n) and so on."""
-    surroundings, plan = Surroundings.of(problem, uncertainty.obstacles), model.plan.states
     mean, covariance = moments.mean, moments.covariance
-    collide = collision_chance(plan + mean, covariance, moments.across, surroundings)[1]
-    counted = Counted.of(solution, model.dynamics.state_coordinates.position)
+    collide = collision_chance(solution.trajectory.states + mean, covariance, moments.across, surroundings)[1]
     squares = _squares(counted, covariance) + counted.distance(mean) ** 2
     width = np.sqrt(squares.mean(axis=-1))
-    miss = _miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
+    miss = _chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
     return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
 
 
 def runs_lost(
-    problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array, counted: Counted, far: float
+    problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array, counted: Counted, farthest: float
 ) -> int:
     """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
 
     The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n). A run that gets
-    farther from the plan than `far` is lost.
+    farther from the plan than `farthest` is lost.
     """
     plan, n, rng, lost = solution.trajectory, mean.shape[1], np.random.default_rng(0), 0
-    gain, offset = law_about(plan.states, plan.controls + law[1], law[0][..., :n])
+    gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., :n])
     for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
         variances, axes = np.linalg.eigh(covariance[t])
         off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
         for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
             states, _ = rollout(problem, gain[t:], offset[t:], start)
             with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
-                away = counted.distance(states - plan.states[t:])
-            lost += not (away <= far).all()
+                distance = counted.distance(states - plan.states[t:])
+            lost += not (distance <= farthest).all()
     return lost
 
 
@@ -197,7 +195,7 @@ def narrowest(model: PlanModel, widths: Array) -> float:
     return max(float(widths.min()), 1e-3 * extent)
 
 
-def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
+def _chance_of_miss(mean: Array, covariance: Array, solution: Solution) -> Array:
     """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
 
     Of a position it is that of its most uncertain direction. Without one, each state that counts has its own bound.
@@ -206,20 +204,20 @@ def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
     if place := target.places:
         widest = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[..., place, :][..., place])[..., -1], 0.0))
         off = np.linalg.norm(mean[..., place], axis=-1)
-        return np.zeros(off.shape) if radius is None else _beyond(radius, off, widest)
+        return np.zeros(off.shape) if radius is None else _chance_outside(radius, off, widest)
     radius = target.radius(None, None, None) if radius is None else radius
     counts, variance = np.isfinite(target.state), np.diagonal(covariance, axis1=-2, axis2=-1)
     bounds, std = radius * target.scale, np.sqrt(np.maximum(variance, 0.0))
-    return 1 - np.prod(1 - _beyond(bounds, np.abs(mean), std)[..., counts], axis=-1)
+    return 1 - np.prod(1 - _chance_outside(bounds, np.abs(mean), std)[..., counts], axis=-1)
 
 
-def _beyond(bound: Array | float, off: Array, std: Array) -> Array:
+def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
     """The chance that normal numbers with these means exceed a bound in size."""
     std = np.maximum(std, 1e-12)
     return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
 
 
-def with_filter(model: PlanModel, kalman: KalmanFilter, laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
+def with_filter(model: PlanModel, kalman: KalmanFilter, limits: tuple[Array, Array], laws: Laws) -> LoopMoments:
     """Moments of the states under C laws that follow a filter's estimates.
 
     The filter is assumed to be right about the noise. Its error is then independent of its estimate, and what it learns
@@ -282,7 +280,7 @@ def track(
     model = PlanModel.of(dynamics, plan, Uncertainty(command_loss=command_loss))
     efforts = effort_of(effort, dynamics)
     if tolerate is not None:
-        gain, offset = _laws(problem, solution, model, Weights.of(tolerate, efforts, dynamics, at_end=at_end), risk)
+        law = _law(problem, solution, model, Weights.of(tolerate, efforts, dynamics, at_end=at_end), risk)
     elif uncertainty is None:
         raise InputError(
             "track: tolerate: got none, want how far each state may be off, such as {'m': 0.05, 'm/s': 0.2}, or"
@@ -291,13 +289,14 @@ def track(
     else:
         truth = PlanModel.of(dynamics, plan, uncertainty)
 
-        def moments(laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
-            return LinearLoop(truth, laws[0][..., : model.n], laws[1], None, *limits).moments(model.n)
+        def moments(laws: Laws) -> LoopMoments:
+            limits = solution.policy.control_coordinates.limits
+            return LinearLoop(truth, laws.gain[..., : model.n], laws.offset, None, limits).moments(model.n)
 
-        _, (gain, offset) = choose_tolerances(
+        _, law = choose_tolerances(
             problem, solution, uncertainty, model, efforts, at_end, moments, truth, call="track(...)"
         )
-    return _policy_of(solution, (gain, offset))
+    return _policy_of(solution, law)
 
 
 def _policy_of(solution: Solution, law: Laws) -> AffinePolicy:
@@ -314,25 +313,25 @@ def _policy_of(solution: Solution, law: Laws) -> AffinePolicy:
     )
 
 
-def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> Laws:
-    """The laws, with the risk if it is not 0. If the risk is too high, raises InputError with the largest possible."""
+def _law(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> Laws:
+    """The law, with the risk if it is not 0. If the risk is too high, raises InputError with the largest possible."""
     if not risk or problem.noise is None:
         return tracking_laws(model, weights)
     plan = solution.trajectory
     matrices = problem.noise.matrices(problem.dynamics, plan.states[:-1], plan.controls)
 
-    def laws(tried: float) -> Laws | None:
+    def law_of(tried: float) -> Laws | None:
         try:
             return tracking_laws(model, weights, Averse(matrices, tried))
         except np.linalg.LinAlgError:
             return None
 
-    if (averse := laws(risk)) is not None:
+    if (averse := law_of(risk)) is not None:
         return averse
     low, high = 0.0, risk
     while high - low > 1e-6 * high:
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if laws(middle) is None else (middle, high)
+        low, high = (low, middle) if law_of(middle) is None else (middle, high)
     raise InputError(
         f"track: risk: got {risk:g}, want at most {low * (1 - 1e-5):.5g}: with more the expected cost is infinite"
     )

@@ -15,6 +15,7 @@ does not count.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,11 +32,21 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry, check_same_system, spaces_of
 from lqrsim.results.solution import Solution
 
-Laws = tuple[Array, Array]  # gain and offset, as of `tracking_laws`
 CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to the range between its limits
 # The tolerances of the position at the plan's end, relative to those before. Reaching a goal depends on the position
 # alone; controls that also bring the velocity to rest there have less effort left for it.
 AT_END = 0.1
+
+
+class Laws(NamedTuple):
+    """A law u = gain z + offset in deviations from a plan, or C laws to compare."""
+
+    gain: Array  # (T, m, Z), or (C, T, m, Z)
+    offset: Array  # (T, m), or (C, T, m)
+
+    def pick(self, i: int) -> "Laws":
+        """One of C."""
+        return Laws(self.gain[i], self.offset[i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +69,7 @@ class Weights:
         return cls(state**-2.0, effort**-2.0, end**-2.0)
 
     def pick(self, i: int | None) -> "Weights":
-        """Those of one of C."""
+        """One of C."""
         emphasis = None if self.emphasis is None else self.emphasis[i]
         return Weights(self.state[i], self.control, self.end[i], emphasis)
 
@@ -102,7 +113,7 @@ class Averse:
 
 
 def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> Laws:
-    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z).
+    """The law for these weights, or the laws for C of them.
 
     The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot. The cost
     of d alone does not change the law.
@@ -144,8 +155,8 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
         improve(t, sizes, arrays, work)
         if emphasis is not None:
             cost[:, :n, :n] += emphasis[:, t]
-    gain, offset = laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1]
-    return (gain, offset) if weights.state.ndim == 2 else (gain[0], offset[0])
+    chosen = Laws(laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1])
+    return chosen if weights.state.ndim == 2 else chosen.pick(0)
 
 
 def check_plan(who: str, problem: Problem, solution: Solution) -> None:

@@ -136,8 +136,7 @@ def predict_tube(
         model = PlanModel.of(problem.dynamics, plan, uncertainty)
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
-        space = policy.control_coordinates
-        loop = LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
+        loop = LinearLoop(model, policy.gain, offset, None, policy.control_coordinates.limits)
         law = Feedback(policy)
     surroundings, modelled = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
     late = [f"{field} of {getattr(modelled, field)}" for field in ("latency", "delay") if getattr(modelled, field)]
@@ -152,8 +151,8 @@ def predict_tube(
             f"predict_tube: samples: got 0 and a {' and a '.join(late)} control periods, which the moments do not have,"
             " want more than 0"
         )
-    counted, limits = Counted.of(solution, problem.dynamics.state_coordinates.position), (loop.low, loop.high)
-    trials = sample_loop(loop.model, law, limits, surroundings, counted, samples, seed) if samples else None
+    counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
+    trials = sample_loop(loop.model, law, loop.limits, surroundings, counted, samples, seed) if samples else None
     shown, estimate = trials.moments if late and trials else loop.moments(), None
     model, n = loop.model, loop.model.n
     if not late and loop.filter_gain is not None:

@@ -68,7 +68,7 @@ class Task:
         for remark in [] if self._given is None else remarks(self.scenario, self._given):
             _log.warning("the given solution %s", remark)
         space = self.plant.robot.dynamics.control_coordinates
-        self.low, self.high = np.array(space.low), np.array(space.high)
+        self.low, self.high = space.limits
         for name, low, high in zip(space.names, space.low, space.high, strict=True):
             if not np.isfinite(high - low):
                 raise InputError(f"scenario: got control {name} within {low:g} to {high:g}, want finite limits")

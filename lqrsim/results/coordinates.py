@@ -122,6 +122,11 @@ class Coordinates:
         return f"{self.low} {self.high} {self.angles} {self.rotation_vectors}"
 
     @property
+    def limits(self) -> tuple[Array, Array]:
+        """The lower and the upper limits, (n,) each."""
+        return np.array(self.low), np.array(self.high)
+
+    @property
     def turns(self) -> tuple[int, ...]:
         """Which entry of each rotation vector, 0 to 2, is an angle, a turn about its axis; -1 if none is."""
         return tuple(next((i for i in range(3) if first + i in self.angles), -1) for first in self.rotation_vectors)
@@ -236,7 +241,7 @@ class Coordinates:
     def _ranges(self, field: str, limits: Limits) -> tuple[Array, Array]:
         """The lowest and the highest value of each entry, (n,) each, as `limited` takes them."""
         if isinstance(limits, Mapping):
-            low, high = np.array(self.low), np.array(self.high)
+            low, high = self.limits
 
             def pair_of(entry: str, pair: object) -> Array:
                 return check_array(entry, pair, (2,), infinite=True)  # pyright: ignore[reportArgumentType]

@@ -268,7 +268,7 @@ def _values(law: AffinePolicy | OutputFeedbackPolicy) -> dict[str, Array]:
 
 def _limits(controls: Coordinates, dtype: npt.DTypeLike) -> tuple[Array, Array]:
     """The limits in the number type, rounded inwards, (m,) each."""
-    low, high = np.array(controls.low), np.array(controls.high)
+    low, high = controls.limits
     with np.errstate(over="ignore"):
         lowest, highest = low.astype(dtype), high.astype(dtype)
     lowest = np.where(lowest < low, np.nextafter(lowest, np.array(np.inf, dtype)), lowest)

@@ -288,7 +288,7 @@ class Rollout:
     @property
     def saturated(self) -> npt.NDArray[np.bool_]:
         """Whether a command was at a limit, (K, T)."""
-        low, high = np.array(self.control_coordinates.low), np.array(self.control_coordinates.high)
+        low, high = self.control_coordinates.limits
         return np.any((self.commanded <= low) | (self.commanded >= high), axis=-1)
 
     @cached_property

@@ -284,7 +284,7 @@ class ClosedLoop:
         self.states = self.physics.state()
         self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
         space = plant.robot.dynamics.control_coordinates
-        self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
+        self._names, self._limits = space.names, space.limits
         self.step, self.measured = 0, self.states
         sensors = self.law.sensors
         self._readings: Readings | BeliefReadings | None = None
@@ -365,7 +365,7 @@ class ClosedLoop:
 
     def actuate(self, step: int, commands: Array) -> Array:
         """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""
-        controls = np.clip(self.effects.actuate(self.knot + step, commands), self._low, self._high)
+        controls = np.clip(self.effects.actuate(self.knot + step, commands), *self._limits)
         self.records.applied[:, step] = controls
         return controls
 

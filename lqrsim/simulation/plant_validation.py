@@ -98,8 +98,7 @@ def _check_limits(plant: "Plant") -> None:
     """
     robot, space, model = plant.robot, plant.robot.dynamics.control_coordinates, plant.model
     m = len(space)
-    limits = np.array([space.low, space.high])
-    finite = np.clip(limits, -UNLIMITED, UNLIMITED)
+    finite = np.clip(space.limits, -UNLIMITED, UNLIMITED)
     if m <= MIXED:  # every corner, because actuation may mix controls
         which = np.array(list(itertools.product((0, 1), repeat=m)))
         corners = np.take_along_axis(finite, which, axis=0)

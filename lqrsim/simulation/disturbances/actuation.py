@@ -98,7 +98,7 @@ class Saturation(Disturbance):
     def limits(self, plant: Plant) -> tuple[Array, Array]:
         """The narrowed limits, which the robot's own limits must contain."""
         space = plant.robot.dynamics.control_coordinates
-        own = np.array([space.low, space.high])
+        own = np.array(space.limits)
         if self.share is not None:
             if not np.isfinite(own).all():
                 raise InputError(f"Saturation: share: got robot {plant.robot.name} without limits, want one with them")
