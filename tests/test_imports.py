@@ -85,7 +85,7 @@ FLOORS_WITHIN = {
         ("between_knots", "constrained", "free_duration", "reach"),
         ("strategy",),
     ),
-    "simulation": (("plant_validation", "plant", "simulator"), ("physics",), ("disturbances",)),
+    "simulation": (("plant_validation", "simulator"), ("plant",), ("physics",), ("disturbances",)),
 }
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.

@@ -105,7 +105,7 @@ class Plant(OneVersion):
             batch.Batch(self.model, 1, 1)
         except ValueError as error:
             raise InputError(f"scene {scene.name}: got an MJCF that cannot be run in batches: {error}") from None
-        plant_validation.check_maps(self)
+        plant_validation.check_maps(robot, scene, self.model, self.shape, clips=simulator is None)
         if simulator is not None:
             if self.obstacles != self.world.names:
                 raise InputError(

@@ -1,20 +1,18 @@
 """Checks that a robot fits a scene: its names exist, its maps fit MuJoCo's arrays, and its body is at its position."""
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
+from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, indices_in
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import PLANES, SPACE
-
-if TYPE_CHECKING:
-    from lqrsim.simulation.plant import Plant
 
 OFF = 1e-4  # allowed error in m of positions, and of moves by a metre; numbers in an MJCF have six digits
 UNLIMITED = 1e9  # used for an infinite limit of a control
@@ -61,42 +59,48 @@ def check_names(robot: Robot, scene: Scene) -> None:
 
 
 def _present(kind: str, names: list[str]) -> str:
-    """A list of the names, and of the elements without a name, for a message."""
-    named, unnamed = list(filter(None, names)), [str(number) for number, name in enumerate(names) if not name]
-    if kind not in ("joint", "actuator") or not unnamed:
+    """What an MJCF has of a kind, for a message: names, and the numbers of joints and actuators without one."""
+    named = [name for name in names if name]
+    nameless = [str(number) for number, name in enumerate(names) if not name]
+    if not nameless or kind not in ("joint", "actuator"):
         return ", ".join(named) or "none"
-    several = f"{kind}s {', '.join(unnamed)} have" if len(unnamed) > 1 else f"{kind} {unnamed[0]} has"
-    return f"{', '.join([*named, f'{len(unnamed)} without a name'])} ({several} none, counted from 0: name them there)"
+    which = f"{kind} {nameless[0]} has" if len(nameless) == 1 else f"{kind}s {', '.join(nameless)} have"
+    listed = ", ".join([*named, f"{len(nameless)} without a name"])
+    return f"{listed} ({which} none, counted from 0: name them there)"
 
 
-def check_maps(plant: "Plant") -> None:
-    """Raise InputError unless the robot's maps fit its joints and actuators, and its body is at its position."""
-    robot = plant.robot
+def check_maps(robot: Robot, scene: Scene, model: mujoco.MjModel, shape: ShapeInWorld, *, clips: bool) -> None:
+    """Raise InputError unless the robot's maps fit the model, and its body and balls are where its states say.
+
+    Args:
+      clips: whether MuJoCo applies the controls, and clips those that exceed an actuator's ctrlrange.
+    """
+    in_qpos, in_qvel, in_ctrl = indices_in(robot, model)
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
     qpos, qvel = (np.asarray(part) for part in robot.configuration(np.zeros(n)))
     joints, actuators = ", ".join(robot.joints) or "no joints", ", ".join(robot.actuators) or "no actuators"
     for field, got, want, of in (
-        ("configuration: qpos", qpos, len(plant.qpos), joints),
-        ("configuration: qvel", qvel, len(plant.qvel), joints),
-        ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(plant.ctrl), actuators),
+        ("configuration: qpos", qpos, len(in_qpos), joints),
+        ("configuration: qvel", qvel, len(in_qvel), joints),
+        ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(in_ctrl), actuators),
         ("state", np.asarray(robot.state(qpos, qvel)), n - robot.activations, "its dynamics"),
     ):
         if got.shape != (want,):
             raise InputError(f"robot {robot.name}: {field}: got shape {got.shape}, want ({want},) for {of}")
-    if plant.simulator is None:
-        _check_limits(plant)
+    if clips:
+        _check_limits(robot, scene, model)
     if robot.dynamics.state_coordinates.position:
-        _check_position(plant)
+        _check_position(robot, model)
     if robot.balls is not None:
-        _check_sites(plant, robot.balls)
+        _check_sites(robot, model, robot.balls, in_plane=shape.in_plane)
 
 
-def _check_limits(plant: "Plant") -> None:
+def _check_limits(robot: Robot, scene: Scene, model: mujoco.MjModel) -> None:
     """Raise InputError if a control within its limits gives a command that exceeds an actuator's ctrlrange.
 
     MuJoCo would clip it silently, and records of applied controls would be wrong.
     """
-    robot, space, model = plant.robot, plant.robot.dynamics.control_coordinates, plant.model
+    space, (_, _, ctrl) = robot.dynamics.control_coordinates, indices_in(robot, model)
     m = len(space)
     finite = np.clip(space.limits, -UNLIMITED, UNLIMITED)
     if m <= MIXED:  # every corner, because actuation may mix controls
@@ -107,32 +111,34 @@ def _check_limits(plant: "Plant") -> None:
         for k in range(m):
             corners[2 * k : 2 * k + 2, k] = finite[:, k]
     commands = np.asarray(robot.actuation(corners), dtype=np.float64)
-    if commands.shape != (len(corners), len(plant.ctrl)):
+    if commands.shape != (len(corners), len(ctrl)):
         return  # the map takes one control only; running it raises an error
-    low, high = model.actuator_ctrlrange[plant.ctrl].T
+    low, high = model.actuator_ctrlrange[ctrl].T
     spare = 1e-9 * np.maximum(np.abs(low), np.abs(high))
-    beyond = model.actuator_ctrllimited[plant.ctrl].astype(bool) & ~(
-        (commands >= low - spare) & (commands <= high + spare)
-    )
-    if beyond.any():
-        row, k = (int(place) for place in np.argwhere(beyond)[0])
+    exceeds = model.actuator_ctrllimited[ctrl].astype(bool) & ~((commands >= low - spare) & (commands <= high + spare))
+    if exceeds.any():
+        row, k = (int(place) for place in np.argwhere(exceeds)[0])
         controls = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
-        name = plant.scene.mjcf.controls[plant.ctrl[k]].name
+        name = scene.mjcf.controls[ctrl[k]].name
         raise InputError(
             f"robot {robot.name}: control_limits: got controls ({controls}), for which actuation() commands"
             f" {commands[row, k]:g} of actuator {name!r}, want its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"
         )
 
 
-def _check_position(plant: "Plant") -> None:
+def _check_position(robot: Robot, model: mujoco.MjModel) -> None:
     """Raise InputError unless the body's origin is at the position, and moves with it, by MuJoCo's kinematics."""
-    robot, space = plant.robot, plant.robot.dynamics.state_coordinates
-    n, data = len(space), mujoco.MjData(plant.model)
+    space, (in_qpos, _, _), number = (
+        robot.dynamics.state_coordinates,
+        indices_in(robot, model),
+        model.body(robot.body).id,
+    )
+    n, data = len(space), mujoco.MjData(model)
 
     def body(state: Array) -> Array:
-        data.qpos[plant.qpos] = robot.configuration(state)[0]
-        mujoco.mj_kinematics(plant.model, data)
-        return data.xpos[plant.body].copy()
+        data.qpos[in_qpos] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        return data.xpos[number].copy()
 
     # About a state without zeros, so that angles have an effect.
     middle = 0.1 + 0.01 * np.arange(n)
@@ -141,7 +147,7 @@ def _check_position(plant: "Plant") -> None:
     who = f"robot {robot.name}: position"
     names = [space.names[index] for index in space.position]
     if np.abs(moves - wanted).max() > OFF:
-        raise InputError(f"{who}: got ({', '.join(names)}) in {_of(space)}; {_remedy(plant, names, moves)}")
+        raise InputError(f"{who}: got ({', '.join(names)}) in {_of(space)}; {_remedy(robot, names, moves)}")
     for state in (np.zeros(n), middle):
         place = state[list(space.position)]
         origin, said = body(state), space.in_world(place)
@@ -171,9 +177,9 @@ def anchor_of(model: mujoco.MjModel, site: str) -> Array:
     return np.array([model.geom_bodyid[number], *model.geom_pos[number]])
 
 
-def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
+def _check_sites(robot: Robot, model: mujoco.MjModel, balls: CollisionSpheres, *, in_plane: bool) -> None:
     """Raise InputError unless each ball that names a site or a geom has its centre there in MuJoCo."""
-    robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
+    (in_qpos, _, _), data = indices_in(robot, model), mujoco.MjData(model)
     who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
     names = [model.site(number).name for number in range(model.nsite)]
     names = list(filter(None, [*names, *(model.geom(number).name for number in range(model.ngeom))]))
@@ -184,13 +190,13 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
     anchors = [(k, site, anchor_of(model, site)) for k, site in enumerate(balls.sites) if site is not None]
     rng = np.random.default_rng(0)
     for state in (np.zeros(n), 0.1 + 0.01 * np.arange(n), *rng.uniform(-1.0, 1.0, (3, n))):
-        data.qpos[plant.qpos] = robot.configuration(state)[0]
+        data.qpos[in_qpos] = robot.configuration(state)[0]
         mujoco.mj_kinematics(model, data)
         centres = balls.centres(robot.dynamics, state) if anchors else ()
         for k, site, (body, *place) in anchors:
             position = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
             off = position - centres[k]
-            if plant.shape.in_plane and robot.dynamics.state_coordinates.from_above:
+            if in_plane and robot.dynamics.state_coordinates.from_above:
                 off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
                 raise InputError(
@@ -199,13 +205,13 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
                 )
 
 
-def _remedy(plant: "Plant", names: list[str], jacobian: Array) -> str:
+def _remedy(robot: Robot, names: list[str], jacobian: Array) -> str:
     """A message that says how each position state moves the body, and how to correct this."""
     exact = np.abs(np.round(jacobian) - jacobian).max() <= OFF
     rows = np.round(jacobian)
     directions = [_direction(row) for row in (rows if exact else jacobian)]
     moved = ", ".join(f"{name} along {direction}" for name, direction in zip(names, directions, strict=True))
-    motion = f"MuJoCo moves body {plant.robot.body!r} by a metre of {moved}"
+    motion = f"MuJoCo moves body {robot.body!r} by a metre of {moved}"
     if exact and (np.abs(rows).sum(axis=1) == 1).all() and (rows.sum(axis=1) == 1).all():
         axes = "".join(SPACE[int(row.argmax())] for row in rows)
         if axes in PLANES:
