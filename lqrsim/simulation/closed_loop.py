@@ -38,7 +38,7 @@ from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
-from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, part_of
+from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, steps_per_frame
 from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.versions import versions
@@ -585,7 +585,7 @@ def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, f
             f" physics steps, want at most {MOST_STEPS}"
         )
     n, m = plan.states.shape[1], plan.controls.shape[1]
-    pictures = plan.steps * (substeps // part_of(plant, substeps)) + 1 if frames else 1
+    pictures = plan.steps * (substeps // steps_per_frame(plant, substeps)) + 1 if frames else 1
     numbers = (plan.steps + 1) * 3 * (2 * n + 2 * m + 6 + 1) + 2 * pictures * plant.model.nq + 3 * len(plant.world)
     check_memory("trials", trials, 8 * numbers + 2000, "whose records")
 

@@ -16,7 +16,7 @@ from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
 FINEST = 0.02  # smallest step along a line, relative to the radius; a larger clearance is itself the step
-MOST = 1000  # steps along a line
+MOST_STEPS = 1000  # along a line
 
 
 class Collisions:
@@ -37,25 +37,25 @@ class Collisions:
         moving = () if passing is None else passing.world.obstacles
         self._velocities = np.array([obstacle.velocity for obstacle in moving]).reshape(-1, 3)
         self._fastest = float(np.linalg.norm(self._velocities, axis=1).max(initial=0.0))
-        self._displaced, self._moved = plant.shape.across(displaced), bool(displaced.any())
+        self._displaced, self._any_displaced = plant.shape.across(displaced), bool(displaced.any())
         self.at = np.full(len(states), np.inf)
         self.obstacles = [""] * len(states)
-        self._last = self.shape.places(states)
+        self._places = self.shape.places(states)
         self._time = 0.0  # of the last places, in s
-        self.clearance = self._clear(self._last, self._time)
+        self.clearance = self._clear(self._places, self._time)
         for row in np.flatnonzero(self.clearance < 0):
-            self._hit(int(row), 0.0, self._last[row])
+            self._hit(int(row), 0.0, self._places[row])
 
     def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
         """The rows of the trials that first collide in a period; those `ignored` (K,) have ended before."""
         begun, parts = self.at.copy(), len(period.states)
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
-            open_ = np.isinf(self.at) & ~ignored & (part < period.stable)
+            running = np.isinf(self.at) & ~ignored & (part < period.stable)
             start = (step + part / parts) * self.dt
-            for row in np.flatnonzero(open_ & touching.any(axis=1)) if len(touching) else ():
+            for row in np.flatnonzero(running & touching.any(axis=1)) if len(touching) else ():
                 self.touch(int(row), start, touching[row])
             if len(self.plant.world) or len(self._velocities):
-                self._search_line(step, part, parts, self.shape.places(states), open_)
+                self._search_line(step, part, parts, self.shape.places(states), running)
         rows = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # Rounding may put a time in the period past the period's end.
         self.at[rows] = np.minimum(self.at[rows], (step + 1) * self.dt)
@@ -68,51 +68,51 @@ class Collisions:
 
     def relocate(self, states: Array) -> None:
         """Replace the current states: obstacles have stopped some of the trials."""
-        self._last = self.shape.places(states)
-        self.clearance = self._clear(self._last, self._time)
+        self._places = self.shape.places(states)
+        self.clearance = self._clear(self._places, self._time)
 
-    def _search_line(self, step: int, part: int, parts: int, arrived: Array, open_: npt.NDArray[np.bool_]) -> None:
+    def _search_line(self, step: int, part: int, parts: int, arrived: Array, running: npt.NDArray[np.bool_]) -> None:
         """Check the lines from the robot's last positions to the new ones, (K, B, 2 or 3) or (K, 1, n)."""
-        last, before = self._last, self.clearance
+        last, before = self._places, self.clearance
         self._time = (step + (part + 1) / parts) * self.dt
-        self._last, self.clearance = arrived, self._clear(arrived, self._time)
+        self._places, self.clearance = arrived, self._clear(arrived, self._time)
         length = self.shape.travel(last, arrived) + self._fastest * self.dt / parts  # moves of robot and obstacles
         # If the clearances at both ends add up to more than the length, no point of the line touches an obstacle.
-        rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
+        rows = np.flatnonzero(running & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
         if not len(rows):
             return
-        finest = np.maximum(FINEST * float(self.shape.radii.min()), length[rows] / MOST)
-        gone, clear = np.zeros(len(rows)), before[rows]
-        looking = np.ones(len(rows), dtype=bool)
-        while looking.any():
-            gone = np.where(looking, np.minimum(gone + np.maximum(clear, finest), length[rows]), gone)
-            share = (gone / np.where(length[rows] > 0, length[rows], 1.0))[:, None, None]
-            at_end = gone >= length[rows]
-            places = np.where(at_end[:, None, None], arrived[rows], last[rows] + share * (arrived[rows] - last[rows]))
-            times = (step + (part + share[:, 0, 0]) / parts) * self.dt
+        finest = np.maximum(FINEST * float(self.shape.radii.min()), length[rows] / MOST_STEPS)
+        travelled, clear = np.zeros(len(rows)), before[rows]
+        searching = np.ones(len(rows), dtype=bool)
+        while searching.any():
+            travelled = np.where(searching, np.minimum(travelled + np.maximum(clear, finest), length[rows]), travelled)
+            ratio = (travelled / np.where(length[rows] > 0, length[rows], 1.0))[:, None, None]
+            at_end = travelled >= length[rows]
+            places = np.where(at_end[:, None, None], arrived[rows], last[rows] + ratio * (arrived[rows] - last[rows]))
+            times = (step + (part + ratio[:, 0, 0]) / parts) * self.dt
             clear = self._clear(places, times, rows)
-            for k in np.flatnonzero(looking & (clear < 0)):
+            for k in np.flatnonzero(searching & (clear < 0)):
                 self._hit(int(rows[k]), float(times[k]), places[k])
-            looking &= (clear >= 0) & ~at_end
+            searching &= (clear >= 0) & ~at_end
 
     def _clear(self, places: Array, time: float | Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
         """The clearance (k,) of these trials with their balls at places (k, B, 2 or 3), at times (k,) in s."""
         displaced = self._displaced if rows is None else self._displaced[rows]
-        clear = self.shape.clearance(places, displaced if self._moved else None)
+        clear = self.shape.clearance(places, displaced if self._any_displaced else None)
         if self._passing is None:
             return clear
-        return np.minimum(clear, self._passing.clearance(places, self._gone(np.broadcast_to(time, len(places)))))
+        return np.minimum(clear, self._passing.clearance(places, self._motion(np.broadcast_to(time, len(places)))))
 
-    def _gone(self, times: Array) -> Array:
+    def _motion(self, times: Array) -> Array:
         """How far the moving obstacles have come at times (k,) in s, (k, obstacles, 3) in m."""
         return times[:, None, None] * self._velocities
 
     def _hit(self, row: int, time: float, places: Array) -> None:
         """Record a collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
-        gone = self._gone(np.array([time]))
-        if self._passing is None or not self._passing.clearance(places[None], gone)[0] < 0:
+        moved = self._motion(np.array([time]))
+        if self._passing is None or not self._passing.clearance(places[None], moved)[0] < 0:
             self.obstacles[row] = self.plant.world.names[self.shape.nearest(places, self._displaced[row])]
         else:
-            self.obstacles[row] = self._passing.world.names[self._passing.nearest(places, gone[0])]
+            self.obstacles[row] = self._passing.world.names[self._passing.nearest(places, moved[0])]

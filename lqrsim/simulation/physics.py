@@ -1,5 +1,6 @@
 """The physics of the closed loop: K simulations of a plant, advanced by one control period at a time."""
 
+import abc
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import Simulator, states_of
 
 FRAME_PERIOD = 1 / 30  # s; positions are checked and recorded at least this often, unless the physics step is longer
-AWAY = 2.0**20  # m; depth inside an obstacle up to which it exerts no force while contacts are only sensed
+SENSED_DEPTH = 2.0**20  # m; inside an obstacle, up to which it exerts no force while contacts are only sensed
 
 _WARNINGS = mujoco.mjtWarning
 # Warnings after which MuJoCo resets the state or the controls.
@@ -40,7 +41,7 @@ class Period:
     stable: npt.NDArray[np.int64]  # (K,) number of leading parts in which the simulation was stable
 
 
-class Physics:
+class Physics(abc.ABC):
     """K simulations of a plant. Call `place`, then change the models, then `prepare`, then `advance` repeatedly.
 
     `MujocoPhysics` says what each method does.
@@ -53,7 +54,7 @@ class Physics:
 
     def __init__(self, plant: Plant, trials: int, substeps: int, part: int) -> None:
         self.plant, self._part, self.parts = plant, part, substeps // part
-        self._every = part_of(plant, substeps) // part
+        self._every = steps_per_frame(plant, substeps) // part
         self.drawn_parts = self.parts // self._every
         self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
         self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
@@ -61,6 +62,26 @@ class Physics:
     def drawn(self, period: Period) -> list[Array]:
         """The frames that are needed for drawing."""
         return period.frames[self._every - 1 :: self._every]
+
+    @abc.abstractmethod
+    def state(self) -> Array: ...
+    @abc.abstractmethod
+    def frame(self) -> Array: ...
+    @abc.abstractmethod
+    def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
+        """Advance some or all simulations by a part of a period; returns the contacts, as in `Period.touching`."""
+
+    def _run(self, rows: npt.NDArray[np.intp] | None = None) -> Period:
+        """Advance some or all simulations by a period."""
+        period = Period([], [], [], np.full(len(self.unstable), self.parts))
+        for part in range(self.parts):
+            touching = self._step(rows)
+            if self.unstable.any():
+                period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
+            period.states.append(self.state())
+            period.frames.append(self.frame())
+            period.touching.append(touching)
+        return period
 
 
 class MujocoPhysics(Physics):
@@ -80,7 +101,7 @@ class MujocoPhysics(Physics):
     def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
         self.senses_contacts, self.solidifies = not plant.enclosed, contacts
         # Contacts are sensed at each step.
-        super().__init__(plant, trials, substeps, 1 if self.senses_contacts else part_of(plant, substeps))
+        super().__init__(plant, trials, substeps, 1 if self.senses_contacts else steps_per_frame(plant, substeps))
         sensing = contacts or self.senses_contacts
         model = plant.model if sensing else plant.without_contacts
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
@@ -137,7 +158,7 @@ class MujocoPhysics(Physics):
                 ("geom_margin", geoms, -1), ("geom_gap", geoms, 1), ("pair_margin", pairs, -1), ("pair_gap", pairs, 1),
             ):  # fmt: skip
                 if len(ids):
-                    self._disarm(field, ids, lambda values, sign=sign: values + sign * AWAY)
+                    self._disarm(field, ids, lambda values, sign=sign: values + sign * SENSED_DEPTH)
             self.simulations.set_const()
         elif self.solidifies and len(geoms):
             for field in ("geom_contype", "geom_conaffinity"):
@@ -183,7 +204,7 @@ class MujocoPhysics(Physics):
         if self.solidifies:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
             self._had_warned = self.warnings.copy()
-        return self._run(None)
+        return self._run()
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
         """Let the states of some or all trials jump by (K, n) at the end of a period.
@@ -225,36 +246,27 @@ class MujocoPhysics(Physics):
             return np.zeros(len(self.solid), dtype=bool)
         return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
-    def _run(self, rows: npt.NDArray[np.intp] | None) -> Period:
-        trials = len(self.unstable)
-        period = Period([], [], [], np.full(trials, self.parts))
-        for part in range(self.parts):
-            try:
-                self.simulations.step(rows, nstep=self._part)
-            except batch.SimulationError as error:
-                self.unstable[error.ids] = True
-            # MuJoCo resets an unstable simulation and continues; only its warnings show it.
-            warned = self.simulations.warning[..., 1]
-            if warned.any():
-                self.warnings += np.where(self.unstable[:, None], 0, warned)
-                self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
-                self.simulations.warning[:] = 0
-            if self.unstable.any():
-                period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
-            period.states.append(self.state())
-            period.frames.append(self.frame())
-            if self._sensors is not None and (self.senses_contacts or self.solid.any()):
-                period.touching.append(self._sensors[:, self.plant.contact] > 0)
-            else:
-                period.touching.append(np.zeros((0, 0), dtype=bool))
-        return period
+    def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
+        try:
+            self.simulations.step(rows, nstep=self._part)
+        except batch.SimulationError as error:
+            self.unstable[error.ids] = True
+        # MuJoCo resets an unstable simulation and continues; only its warnings show it.
+        warned = self.simulations.warning[..., 1]
+        if warned.any():
+            self.warnings += np.where(self.unstable[:, None], 0, warned)
+            self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
+            self.simulations.warning[:] = 0
+        if self._sensors is not None and (self.senses_contacts or self.solid.any()):
+            return self._sensors[:, self.plant.contact] > 0
+        return np.zeros((0, 0), dtype=bool)
 
 
 class SimulatorPhysics(Physics):
     """The physics of a plant with a `Simulator`. Robots pass through obstacles; frames show them in their states."""
 
     def __init__(self, plant: Plant, simulator: Simulator, trials: int, substeps: int) -> None:
-        super().__init__(plant, trials, substeps, part_of(plant, substeps))
+        super().__init__(plant, trials, substeps, steps_per_frame(plant, substeps))
         self._simulator, self._factors = simulator, dict[str, Array]()
 
     def place(self, states: Array) -> None:
@@ -296,15 +308,13 @@ class SimulatorPhysics(Physics):
         return frames
 
     def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
-        period = Period([], [], [], np.full(len(controls), self.parts))
-        for part in range(self.parts):
-            self._simulator.step(self._simulations, controls, wrench, wind, self._part)
-            self._read_states()
-            period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
-            period.states.append(self.state())
-            period.frames.append(self.frame())
-            period.touching.append(np.zeros((0, 0), dtype=bool))
-        return period
+        self._inputs = controls, wrench, wind
+        return self._run()
+
+    def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
+        self._simulator.step(self._simulations, *self._inputs, self._part)
+        self._read_states()
+        return np.zeros((0, 0), dtype=bool)
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
         self._simulator.place(self._simulations, self._states + jumps)
@@ -315,7 +325,7 @@ class SimulatorPhysics(Physics):
 AnyPhysics = MujocoPhysics | SimulatorPhysics
 
 
-def part_of(plant: Plant, substeps: int) -> int:
+def steps_per_frame(plant: Plant, substeps: int) -> int:
     """Physics steps per frame: the longest equal parts of the control period that are at most FRAME_PERIOD long."""
     longest = min(substeps, int((FRAME_PERIOD + 1e-9) / plant.timestep))
     return max((part for part in range(1, longest + 1) if substeps % part == 0), default=1)
