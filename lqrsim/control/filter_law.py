@@ -18,7 +18,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Measurements, Policy
 from lqrsim.problem.problem import Problem
-from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import OutputFeedbackPolicy
 from lqrsim.results.solution_parts import Trajectory
@@ -69,10 +69,6 @@ class FilterLaw:
         offset = trajectory.controls + offset - np.einsum("tij,tj->ti", gain, nominal[:-1])
         return cls(plan, model, design.filter, design.weights, in_c_order(gain), offset, nominal)
 
-    @property
-    def coordinates(self) -> Spaces:
-        return spaces_of(self.plan.policy)
-
 
 class FilterRun(ControllerRun):
     """K trials of a run, with their estimates z (K, Z) at the knot of the newest measurement.
@@ -93,7 +89,7 @@ class FilterRun(ControllerRun):
         self._wider = np.ones(trials)  # see `correct`
         shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
         self.estimates, self.innovations = (np.full((*shape, size), np.nan) if record else None for size in sizes)
-        self._limits = Limits(*law.coordinates[1].limits)
+        self._limits = Limits(*law.plan.policy.control_coordinates.limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
         # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
         controls = law.model.plan.controls
@@ -298,7 +294,8 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
         arrays["nominal"][t, size:] = plan.controls[places].ravel()
         _advance({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
     return OutputFeedbackPolicy(
-        **arrays, dt=plan.dt, state_coordinates=law.coordinates[0], control_coordinates=law.coordinates[1],
+        **arrays, dt=plan.dt, state_coordinates=law.plan.policy.state_coordinates,
+        control_coordinates=law.plan.policy.control_coordinates,
         measured_coordinates=_measured_coordinates(law),
     )  # fmt: skip
 
@@ -321,7 +318,7 @@ def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int,
 
 def _measured_coordinates(law: FilterLaw) -> Coordinates:
     """Coordinates of the measured numbers: the coordinates of the states, if states are measured."""
-    space, names = law.coordinates[0], law.model.sensor.names
+    space, names = law.plan.policy.state_coordinates, law.model.sensor.names
     if not set(names) <= set(space.names):
         return Coordinates(names=names, units=("",) * len(names))
     chosen = [space.names.index(name) for name in names]

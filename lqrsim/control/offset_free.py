@@ -33,7 +33,7 @@ from lqrsim.control.uncertainty import Uncertainty, check_seconds
 from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates, PerEntry
+from lqrsim.results.coordinates import PerEntry, Spaces, spaces_of
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
@@ -245,8 +245,8 @@ class OffsetFree(Controller):
         return sha256(*parts, numbers, *sources, *again, *read, *rules)[:16]
 
     @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        return self._law.coordinates
+    def coordinates(self) -> Spaces:
+        return spaces_of(self.solution.policy)
 
 
 def with_margin(

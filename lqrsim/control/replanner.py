@@ -18,7 +18,7 @@ from lqrsim.errors import Array, InputError, check_array, check_function, check_
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates, spaces_of
+from lqrsim.results.coordinates import Spaces, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.solution_parts import Horizon
@@ -257,7 +257,7 @@ class Replanner(Controller):
         return sha256(f"{self.solution.policy.digest} {self.problem.digest} {parts} {computing} {changes}{funnel}")[:16]
 
     @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+    def coordinates(self) -> Spaces:
         return spaces_of(self.solution.policy)
 
 

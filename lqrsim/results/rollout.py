@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_unit, worst_of
 from lqrsim.results.notebook import SHOWN, drawing, number_text, of_table
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.scenes.world import World
 
 GOAL_MOVED = "goal moved during the run"  # among the disturbances of a run
 
@@ -72,6 +73,17 @@ class MovingObstacles:
     velocities: Annotated[Array, "O 3", Bounds()]  # in m/s
 
     __repr__ = repr_of
+
+    @classmethod
+    def of(cls, world: World) -> Self:
+        positions, rotations, sizes, velocities = (
+            np.array([getattr(obstacle, field) for obstacle in world.obstacles])
+            for field in ("position", "rotation", "size", "velocity")
+        )
+        kinds = tuple(obstacle.kind for obstacle in world.obstacles)
+        return cls(
+            names=world.names, kinds=kinds, positions=positions, rotations=rotations, sizes=sizes, velocities=velocities
+        )  # fmt: skip
 
     def at(self, time: float) -> Array:
         """Their positions (O, 3) in metres, `time` seconds from the beginning of the run."""

@@ -266,7 +266,8 @@ class ClosedLoop:
         self.trajectory, dt = self.followed.trajectory, self.whole.dt
         self._target = Target(self.state_coordinates, self.followed.goal, self.trajectory.states)
         self._radius = self._target.radius(plant.robot.radius, self.goal_radius, self.goal_tolerance)
-        substeps, passing = plant.substeps(dt), _shape_among(plant, self.moving, self.knot * dt)
+        substeps = plant.substeps(dt)
+        passing = None if self.moving is None else _shape_among(plant, self.moving.moved(self.knot * dt))
         _check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
         numbers = range(self.first_trial, self.first_trial + trials)
         self.effects = Effects(plant, self.whole, self.acting, numbers, self.generators or seeded(self.seed))
@@ -493,24 +494,9 @@ class ClosedLoop:
             obstacle_geoms=plant.obstacle_geoms,
             warnings=self.physics.warnings if plant.simulator is None else None,
             undisturbed=undisturbed,
-            moving=_record_of(self.moving, self.knot * plan.dt),
+            moving=MovingObstacles.of(self.moving.moved(self.knot * plan.dt)) if self.moving else None,
             controller_run=self.controller_run,
         )
-
-
-def _record_of(moving: World | None, begun: float) -> MovingObstacles | None:
-    """The obstacles that move, where they are at the time at which the run begins, in s."""
-    if moving is None or not len(moving):
-        return None
-    obstacles = moving.moved(begun).obstacles
-    positions, rotations, sizes, velocities = (
-        np.array([getattr(obstacle, field) for obstacle in obstacles])
-        for field in ("position", "rotation", "size", "velocity")
-    )
-    return MovingObstacles(
-        names=moving.names, kinds=tuple(obstacle.kind for obstacle in obstacles), positions=positions,
-        rotations=rotations, sizes=sizes, velocities=velocities,
-    )  # fmt: skip
 
 
 def _checked_commands(commands: Any, shape: tuple[int, int]) -> Array:
@@ -532,14 +518,11 @@ def _not_finite(rows: Array) -> Mask:
     return ~np.all(finite, axis=1)
 
 
-def _shape_among(plant: Plant, moving: World | None, time: float) -> ShapeInWorld | None:
-    """The robot's shape among obstacles that MuJoCo does not have, at this time in s."""
-    if moving is None:
-        return None
-    robot = plant.robot
+def _shape_among(plant: Plant, moving: World) -> ShapeInWorld:
+    """The robot's shape among obstacles that MuJoCo does not have."""
     if twice := sorted({*moving.names} & {*plant.obstacles, *plant.world.names}):
         raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")
-    return robot.among(moving.moved(time))
+    return plant.robot.among(moving)
 
 
 def _coordinates_of(controller: Controller, followed: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:

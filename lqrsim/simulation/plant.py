@@ -44,6 +44,7 @@ class Plant(OneVersion):
       obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
         balls in space, all that the MJCF lets it touch, except what a free joint, or a slide that is not level, lets it
         stand on: level planes that face up, and height fields.
+      obstacle_geoms: ids of the geoms of the obstacles in `world`.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body. bodies: ids of it, of those that the robot's joints move, and of what is attached.
       qpos, qvel, ctrl: indices of the robot's joints and controls in MuJoCo's arrays.
@@ -83,6 +84,9 @@ class Plant(OneVersion):
             self.shape = replace(self.shape, world=near)
         self.world = self.shape.world
         self.obstacles = self.world.names if bounded else near.names
+        self._scenery = list(zip(scene.geoms, scene.world.names, strict=True))  # ids and names of the scene's obstacles
+        ids = {name: geom for geom, name in self._scenery}
+        self.obstacle_geoms: npt.NDArray[np.int64] = np.array([ids[name] for name in self.world.names], dtype=np.int64)
         self.body = root
         jointed = (int(scene.model.joint(name).bodyid[0]) for name in robot.joints)
         attached = {root, *jointed}
@@ -90,7 +94,7 @@ class Plant(OneVersion):
             if scene.model.body_parentid[body] in attached:
                 attached.add(body)
         self.bodies = np.array(sorted(attached), dtype=np.intp)
-        mounts = mounting_pairs(scene.model, [geom for geom, name in self._scenery() if name in self.obstacles])
+        mounts = mounting_pairs(scene.model, [geom for geom, name in self._scenery if name in self.obstacles])
         # What a choice of obstacles leaves out does not collide, but ground and what the robot stands on; for a robot
         # whose own steps are MuJoCo's all of it does.
         left = [] if robot.geoms is not None else sorted({*obstacle_geoms(scene.model)} - {*scene.geoms})
@@ -254,27 +258,17 @@ class Plant(OneVersion):
         poses = mjcf_kinematics.posed(self.model, positions)
         return np.reshape([data.xpos[number] + data.xmat[number].reshape(3, 3) @ place for data in poses], (-1, 1, 3))
 
-    @property
-    def obstacle_geoms(self) -> npt.NDArray[np.int64]:
-        """Ids of the geoms of the obstacles in `world`, (obstacles,)."""
-        ids = {name: geom for geom, name in self._scenery()}
-        return np.array([ids[name] for name in self.world.names], dtype=np.int64)
-
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of K simulations by (K, obstacles, 3) m, in the world's axes; `set_const` must follow."""
         geoms = self.obstacle_geoms
         simulations.expand("geom_pos")[:, geoms] += mjcf_kinematics.in_axes_of_bodies(self.model, geoms, displaced)
-
-    def _scenery(self) -> list[tuple[int, str]]:
-        """The ids and names of the scene's obstacles."""
-        return list(zip(self.scene.geoms, self.scene.world.names, strict=True))
 
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         spec = self.scene.mjcf.spec()
         if self._step is not None:
             spec.option.timestep = self._step
         geoms = list(spec.geoms)
-        for geom, name in self._scenery():
+        for geom, name in self._scenery:
             geoms[geom].name = name  # sensors need names
         _separate(spec, geoms, self._apart, self.scene.model)
         sensors = {sensor.name for sensor in spec.sensors}
