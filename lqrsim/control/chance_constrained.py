@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from lqrsim.annotations import Chance, Count, Positive, TextProgress, Want, checked
-from lqrsim.control.collision_chance import FAR, Spread, Surroundings, chance_of_clearances
+from lqrsim.control.collision_chance import LARGEST_MARGIN, Spread, Surroundings, chance_of_clearances
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
@@ -294,8 +294,8 @@ class _Search:
         if self.too_few == 0 and self.too_few < wanted < self.enough:
             return wanted
         # Between the two, the logarithm of the chance is assumed to be linear.
-        share = (self.log_of_too_few - np.log(AIM * self.asked)) / (self.log_of_too_few - self.log_of_enough)
-        return self.too_few + float(np.clip(share, 0.1, 0.9)) * (self.enough - self.too_few)
+        fraction = (self.log_of_too_few - np.log(AIM * self.asked)) / (self.log_of_too_few - self.log_of_enough)
+        return self.too_few + float(np.clip(fraction, 0.1, 0.9)) * (self.enough - self.too_few)
 
     def _needed(self, plan: SafePlan) -> float:
         """The number of standard deviations at which the plan would be as safe as requested; at most twice its own.
@@ -310,7 +310,7 @@ class _Search:
         wanted, tube = AIM * self.asked, plan.tube
         if tube.collision_chance > 0:
             wanted *= tube.linear_chance / tube.collision_chance
-        low, high = 0.0, FAR
+        low, high = 0.0, LARGEST_MARGIN
         for _ in range(40):
             middle = (low + high) / 2
             moved = np.maximum(clearance, middle * std)

@@ -17,7 +17,7 @@ from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import KeepsClear, ShapeInWorld, each_once
 from lqrsim.problem.problem import Problem
 
-FAR = 12.0  # standard deviations of clearance; beyond, the chance of a collision is below 1e-32
+LARGEST_MARGIN = 12.0  # standard deviations of clearance; with more the chance of a collision is below 1e-32
 
 
 class Spread(NamedTuple):
@@ -68,11 +68,8 @@ class Surroundings:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
         parts = [shape.with_slopes(states, self.position) for shape in self.shapes]
         fixed = [obstacle.kind == "plane" for shape in self.shapes for obstacle in shape.world.obstacles]
-        return (
-            np.concatenate([clearance for clearance, _ in parts], axis=1),
-            np.concatenate([normals for _, normals in parts], axis=1),
-            np.where(fixed, 0.0, self.std**2),
-        )
+        clearance, normals = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+        return clearance, normals, np.where(fixed, 0.0, self.std**2)
 
     @property
     def by_mujoco(self) -> bool:
@@ -88,7 +85,7 @@ class Surroundings:
     def nearest(self, states: Array, displaced: list[Array]) -> Array:
         """Clearance of states (K, n) to the nearest obstacle, (K,), the obstacles of each world displaced (K, O, 3)."""
         pairs = zip(self.shapes, displaced, strict=True)
-        clearances = [shape.clearance(shape.places(states), away) for shape, away in pairs]
+        clearances = [shape.clearance(shape.places(states), moved) for shape, moved in pairs]
         return np.min(clearances, axis=0, initial=np.inf) if clearances else np.full(len(states), np.inf)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
@@ -148,12 +145,12 @@ def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, Arra
 
 def beginnings(margin: Array, correlation: Array) -> Array:
     """The chance that a collision with each obstacle begins at each knot, (..., T+1, O)."""
-    chance, here, last = ndtr(-margin), margin[..., 1:, :], margin[..., :-1, :]
-    begins, near = np.zeros_like(margin), here < FAR
+    chance, now, previous = ndtr(-margin), margin[..., 1:, :], margin[..., :-1, :]
+    begins, possible = np.zeros_like(margin), now < LARGEST_MARGIN
     begins[..., 0, :] = chance[..., 0, :]
     # In collision at a knot, but not at the previous knot.
-    before = both_below(-here[near], -last[near], correlation[near])
-    begins[..., 1:, :][near] = np.maximum(chance[..., 1:, :][near] - before, 0.0)
+    both = both_below(-now[possible], -previous[possible], correlation[possible])
+    begins[..., 1:, :][possible] = np.maximum(chance[..., 1:, :][possible] - both, 0.0)
     return begins
 
 
@@ -164,6 +161,6 @@ def both_below(first: Array, second: Array, correlation: Array) -> Array:
     a, b = (np.where(np.abs(bound) < 1e-200, 1e-200, np.clip(bound, -40.0, 40.0)) for bound in (first, second))
     spread = np.maximum(np.sqrt((1 - correlation) * (1 + correlation)), 1e-100)
     with np.errstate(over="ignore"):
-        beyond = owens_t(a, (b - correlation * a) / (a * spread)) + owens_t(b, (a - correlation * b) / (b * spread))
+        owens = owens_t(a, (b - correlation * a) / (a * spread)) + owens_t(b, (a - correlation * b) / (b * spread))
     opposite = (a < 0) != (b < 0)
-    return np.maximum(0.5 * (ndtr(a) + ndtr(b) - opposite) - beyond, 0.0)
+    return np.maximum(0.5 * (ndtr(a) + ndtr(b) - opposite) - owens, 0.0)

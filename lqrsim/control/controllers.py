@@ -203,15 +203,20 @@ class OutputFeedback(_OfPolicy):
                 f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             )
 
+    @property
+    def measures(self) -> list[int]:
+        """The indices of the measured states."""
+        return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
+
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self.policy, trials)
+        return _OutputFeedbackRun(self, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
-        states = policy.state_coordinates.names
-        self._policy, self._measures = policy, [states.index(name) for name in policy.measured_coordinates.names]
-        self._z, self._previous = np.tile(policy.start(), (trials, 1)), np.full((trials, len(states)), np.nan)
+    def __init__(self, controller: OutputFeedback, trials: int) -> None:
+        self._policy, self._measures = controller.policy, controller.measures
+        self._z = np.tile(self._policy.start(), (trials, 1))
+        self._previous = np.full((trials, len(self._policy.state_coordinates)), np.nan)
 
     def control(self, step: int, measured: Array) -> Array:
         policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))

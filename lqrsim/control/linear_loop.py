@@ -81,7 +81,7 @@ class LinearLoop:
         F, K = np.zeros((steps, len(models), size, size + unknown)), np.zeros((*gain.shape[:-1], size + unknown))
         G, c = np.empty((steps, len(models), m, size)), np.empty((steps, len(models), size))
         noise, jointly = np.zeros((steps + 1, len(models), size, size)), np.zeros(0)
-        fresh = np.empty((steps + 1, len(models), unknown, unknown))
+        drawn = np.empty((steps + 1, len(models), unknown, unknown))
         if self.filter_gain is None:
             K[..., :n], shaking = gain, gain * first.shown_std
         else:
@@ -104,11 +104,11 @@ class LinearLoop:
             )
             G[:, i, :, :stated], c[:, i, :stated] = model.G[:, :stated].swapaxes(1, 2), model.c[:, :stated]
             start, process = model.start_root @ model.start_root.T, model.process_noise
-            noise[0, i, :stated, :stated], fresh[0, i] = start[:stated, :stated], start[stated:, stated:]
-            noise[1:, i, :stated, :stated], fresh[1:, i] = process[:, :stated, :stated], process[:, stated:, stated:]
+            noise[0, i, :stated, :stated], drawn[0, i] = start[:stated, :stated], start[stated:, stated:]
+            noise[1:, i, :stated, :stated], drawn[1:, i] = process[:, :stated, :stated], process[:, stated:, stated:]
         planned, reached = first.plan.controls, np.stack([model.reached for model in models], axis=1)
         arrays = LoopArrays(
-            F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned,
+            F, G, c, noise, drawn, first.transition, K, planned[:, None] + offset, planned,
             shaking @ shaking.swapaxes(-1, -2), jointly, reached, *self.limits,
         )  # fmt: skip
         return moments_of(arrays, stated, count, first.uncertainty.command_loss)

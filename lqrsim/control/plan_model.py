@@ -205,7 +205,7 @@ class PlanModel:
     @cached_property
     def own_states(self) -> list[range]:
         """For each remembered unknown, the indices of its states."""
-        ends = np.cumsum([0, *(len(part.output) for part in self._filters)])
+        ends = np.cumsum([0, *(len(shaping.output) for shaping in self._filters)])
         return [range(first, end) for first, end in pairwise(ends.tolist())]
 
     @property
@@ -228,14 +228,14 @@ class PlanModel:
     @cached_property
     def transition(self) -> Array:
         """Transition matrix of the unknowns' states, (D, D)."""
-        return _diagonal([part.transition for part in self._filters])
+        return _diagonal([shaping.transition for shaping in self._filters])
 
     @cached_property
     def output(self) -> Array:
         """From the unknowns' states to values of the parameters, and the gain and the offset of each control."""
         columns = [
-            self._column(unknown)[:, None] * part.output
-            for unknown, part in zip(self.remembered, self._filters, strict=True)
+            self._column(unknown)[:, None] * shaping.output
+            for unknown, shaping in zip(self.remembered, self._filters, strict=True)
         ]
         return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
 
@@ -243,13 +243,13 @@ class PlanModel:
         """The weights of an unknown in these values, (P + 2 m,)."""
         controls, count = self.dynamics.control_coordinates.names, len(self.parameters)
         column = np.zeros(count + 2 * self.m)
-        for name, share in unknown.shares.items():
+        for name, weight in unknown.shares.items():
             if name.startswith(GAIN):
-                column[count + controls.index(name.removeprefix(GAIN))] = share
+                column[count + controls.index(name.removeprefix(GAIN))] = weight
             elif name.startswith(OFFSET):
-                column[count + self.m + controls.index(name.removeprefix(OFFSET))] = share
+                column[count + self.m + controls.index(name.removeprefix(OFFSET))] = weight
             else:
-                column[self.parameters.index(name)] = share
+                column[self.parameters.index(name)] = weight
         return column
 
     @cached_property
@@ -295,11 +295,11 @@ class PlanModel:
     def jacobian(self) -> Array:
         """[A B] of each step, (T, n, n + m)."""
         plan = self.plan
-        ahead, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
+        following, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
         states, controls = in_c_order(plan.states), in_c_order(plan.controls)
         dynamics = self.compiled_dynamics
         with self.dynamics.quiet():
-            self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, ahead, jacobian)
+            self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, following, jacobian)
         return jacobian
 
     @cached_property
@@ -424,7 +424,7 @@ class PlanModel:
         """Square root of the covariance of z at the start, (Z, Z)."""
         std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
         at_rest = np.zeros((self.lagging, self.lagging))
-        return _diagonal([np.diag(std), at_rest, *(part.start for part in self._filters)])
+        return _diagonal([np.diag(std), at_rest, *(shaping.start for shaping in self._filters)])
 
     @cached_property
     def process_root(self) -> Array:
@@ -451,9 +451,9 @@ class PlanModel:
             pushed[:, :n] = self.effects @ np.array(white).T
         error = np.zeros((self.size, n))
         error[range(n), range(n)] = per_entry("Uncertainty: model_error", self.uncertainty.model_error, states)
-        fresh = np.zeros((self.size, self.size - first))
-        fresh[first:] = _diagonal([part.noise for part in self._filters])
-        return np.concatenate([commanded, pushed], axis=2), np.concatenate([error, fresh], axis=1)
+        drawn = np.zeros((self.size, self.size - first))
+        drawn[first:] = _diagonal([shaping.noise for shaping in self._filters])
+        return np.concatenate([commanded, pushed], axis=2), np.concatenate([error, drawn], axis=1)
 
     @cached_property
     def process_noise(self) -> Array:

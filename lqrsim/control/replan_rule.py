@@ -235,13 +235,13 @@ class ReplanRule:
         row = active.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
         if self.delay and (self.predict or problem.control_rate is not None):
-            predicted, command = self._ahead(active, step, here, problem, late)
+            predicted, command = self._predicted(active, step, here, problem, late)
             here, sent = predicted if self.predict else here, sent if command is None else command
         done = min(first - active.first, plan.trajectory.steps - 1)
         previous = sent if problem.control_rate is not None else None
         return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem, previous)
 
-    def _ahead(
+    def _predicted(
         self, active: ActivePlan, step: int, state: Array, problem: Problem, late: float
     ) -> tuple[Array, Array | None]:
         """The state that the law in force reaches by the deadline, according to the model, and its last command."""

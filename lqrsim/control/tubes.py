@@ -32,8 +32,8 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
-# The default number of trials: such that all z at all steps are NUMBERS numbers, but at least FEWEST and at most MOST.
-NUMBERS, FEWEST, MOST = 15_000_000, 4000, 20_000
+# The default number of trials: such that all z at all steps are NUMBERS numbers, within these limits.
+NUMBERS, FEWEST_TRIALS, MOST_TRIALS = 15_000_000, 4000, 20_000
 STRAY = 6.0  # largest standard deviations of the position, over directions and knots
 
 
@@ -126,8 +126,8 @@ def predict_tube(
     check_count("predict_tube: seed", seed, at_least=0)
     plan = solution.trajectory
     if isinstance(controller, OffsetFree):
-        own = controller.solution.trajectory
-        if not (np.array_equal(own.states, plan.states) and np.array_equal(own.controls, plan.controls)):
+        other = controller.solution.trajectory
+        if not (np.array_equal(other.states, plan.states) and np.array_equal(other.controls, plan.controls)):
             raise InputError("predict_tube: controller: got an OffsetFree of another plan, want one of the solution")
         loop, law = controller.loop(uncertainty), controller
     else:
@@ -142,7 +142,7 @@ def predict_tube(
     late = [f"{field} of {getattr(modelled, field)}" for field in ("latency", "delay") if getattr(modelled, field)]
     if samples is None:
         slow = problem.dynamics.by_mujoco or problem.dynamics.level in ("jax", "plain") or surroundings.by_mujoco
-        affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST), MOST)
+        affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST_TRIALS), MOST_TRIALS)
         samples = 0 if slow or not (surroundings.kept or late) else affordable
     if samples and surroundings.by_mujoco:
         raise InputError(f"predict_tube: samples: got {samples} for distances by MuJoCo, want 0: trials lack them")
@@ -163,8 +163,8 @@ def predict_tube(
     chance, linear = collision_chance(plan.states + mean, covariance, across, surroundings)
     strays = None
     if trials is not None:
-        own = covariance[:, counted.states][:, :, counted.states] / np.outer(counted.scale, counted.scale)
-        widest = np.sqrt(max(np.linalg.eigvalsh(own).max(), 0.0))
+        scaled = covariance[:, counted.states][:, :, counted.states] / np.outer(counted.scale, counted.scale)
+        widest = np.sqrt(max(np.linalg.eigvalsh(scaled).max(), 0.0))
         strays = float((trials.farthest > STRAY * widest).mean())
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,
@@ -195,11 +195,11 @@ def _tube_of_belief(belief: Belief, problem: Problem, solution: Solution) -> Tub
     across = closed[:, :n] @ strayed[:-1, :, :n] + A[:, :n, :n] @ known[:-1]
     command = np.sqrt(np.vecdot(policy.gain @ strayed[:-1], policy.gain))
     space, scale = policy.control_coordinates, np.maximum(command, 1e-12)
-    beyond = ndtr((space.low - plan.controls) / scale) + ndtr((plan.controls - space.high) / scale)
+    saturation = ndtr((space.low - plan.controls) / scale) + ndtr((plan.controls - space.high) / scale)
     chance, linear = collision_chance(plan.states, covariance, across, Surroundings.of(problem, 0.0))
     return Tube(
         plan=Trajectory(plan.states[:, :n], plan.controls, plan.dt), state_coordinates=belief.robot.state_coordinates,
         mean=np.zeros((plan.steps + 1, n)), covariance=covariance, across=across,
         estimate_covariance=known + np.concatenate([np.zeros((1, n, n)), pushed[:, :n, :n]]), command=command,
-        saturation=beyond, step_chance=chance, linear_chance=float(linear), collision_chance=float(linear),
+        saturation=saturation, step_chance=chance, linear_chance=float(linear), collision_chance=float(linear),
     )  # fmt: skip

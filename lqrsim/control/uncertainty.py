@@ -26,7 +26,7 @@ from lqrsim.errors import (
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates, PerEntry
 
-MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to the unknown's
+MEAN_STD = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to the unknown's
 SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)  # of Gauss and Legendre, from -1 to 1
@@ -160,13 +160,13 @@ class Uncertainty:
             and what varies has the mean zero: the same uncertainty, with its unknowns in the order of a filter's.
         """
         memory = check_seconds("memory", memory, above=0.0)
-        share = 0.0 if memory == np.inf else MEAN
+        mean_std = 0.0 if memory == np.inf else MEAN_STD
         constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
         for unknown in self.unknowns:
             constants.setdefault(tuple(sorted(unknown.shares.items())), []).append(unknown)
         merged = []
         for same in constants.values():
-            std = float(np.hypot.reduce([unknown.std * (1.0 if unknown.constant else share) for unknown in same]))
+            std = float(np.hypot.reduce([unknown.std * (1.0 if unknown.constant else mean_std) for unknown in same]))
             drift = float(np.hypot.reduce([unknown.drift for unknown in same if unknown.constant] or [0.0]))
             merged.append(Unknown(same[0].of, std, drift=max(drift, std / np.sqrt(memory))))
         return replace(self, unknowns=(*merged, *(unknown for unknown in self.unknowns if not unknown.constant)))
@@ -231,8 +231,8 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
     step = dt / unknown.time_constant
     keep = np.exp(-step)
     if unknown.order == 1:
-        fresh = np.hypot(std * np.sqrt(-np.expm1(-2 * step)), drift * np.sqrt(dt))  # one of the two is zero
-        return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std))
+        noise = np.hypot(std * np.sqrt(-np.expm1(-2 * step)), drift * np.sqrt(dt))  # one of the two is zero
+        return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), noise), np.ones(1), np.full((1, 1), std))
     F = keep * np.array([[1 + step, step], [-step, 1 - step]])
     # The integral of e^As b b' e^A's over the period. It equals I - F F', but that form cancels if the period is short.
     length = min(step, 40.0)

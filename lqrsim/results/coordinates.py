@@ -295,9 +295,9 @@ class _Spaced(Protocol):
     def control_coordinates(self) -> Coordinates: ...
 
 
-def spaces_of(one: _Spaced) -> Spaces:
+def spaces_of(system: _Spaced) -> Spaces:
     """The coordinates of the states and of the controls of dynamics, a policy or a rollout."""
-    return one.state_coordinates, one.control_coordinates
+    return system.state_coordinates, system.control_coordinates
 
 
 def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose: str) -> None:

@@ -229,15 +229,12 @@ class _Tables:
         self.bytes += array.size * (2 if kind == "short" else np.dtype(DTYPES[self._number]).itemsize)
         sizes = "".join(f"[{length}]" for length in array.shape)
 
-        def as_text(one: float) -> str:
-            return f"{int(one)}" if kind == "short" else _number(one, self._number)
+        def text_of(array: Array) -> str:
+            if array.ndim == 1:
+                return _list(f"{int(value)}" if kind == "short" else _number(value, self._number) for value in array)
+            return "{" + (",\n" if array.ndim < 3 else ",\n\n").join(map(text_of, array)) + "}"
 
-        def inner(part: Array) -> str:
-            if part.ndim == 1:
-                return _list(as_text(number) for number in part)
-            return "{" + (",\n" if part.ndim < 3 else ",\n\n").join(inner(row) for row in part) + "}"
-
-        self._lines.append(f"static const {kind} {name}{sizes} = {inner(array)};")
+        self._lines.append(f"static const {kind} {name}{sizes} = {text_of(array)};")
 
 
 def _number(value: float, number: str) -> str:

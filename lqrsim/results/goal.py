@@ -17,11 +17,11 @@ from lqrsim.results.coordinates import Coordinates
 
 OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
 TOLERANCE = 0.1  # default tolerance of the scaled error
-NEAR = 4.0  # robot radii within which a start is so near its goal that the radius says little
-STAYS = 1e-3  # fraction of a radius; a plan that begins closer to its goal is to stay there
+NEAR_GOAL = 4.0  # robot radii within which a start is so near its goal that the radius says little
+AT_GOAL = 1e-3  # fraction of a radius; a plan that begins closer to its goal is to stay there
 NEGLIGIBLE = 1e-6  # in the units of a state; a shorter way is rounding
-ABRUPT = 1e-4  # of the ranges, in `departure`
-ASIDE = 0.01  # of the longest way in a unit; a state with a shorter way starts at its goal
+ON_PLAN = 1e-4  # of the ranges, in `departure`
+SHORT_WAY = 0.01  # of the longest way in a unit; a state with a shorter way starts at its goal
 OF_RANGE, OF_WAY = "of the plan's range", "of the way"
 
 
@@ -47,24 +47,24 @@ def departure(space: Coordinates, states: Array, plan: Array, dt: float) -> str:
     """Where a run (T+1, n) leaves a plan (T+1, n), as text: "LEAVES the plan at 0.4 s: ..."; empty if it does not.
 
     It leaves the plan where a state is not finite, or off by more than TOLERANCE of the largest range along the plan in
-    its unit. A run that was still on the plan a period before, to within ABRUPT of that, met a step that jumps.
+    its unit. A run that was still on the plan a period before, to within ON_PLAN of that, met a step that jumps.
     """
     units, ranges = np.array(space.units), np.ptp(plan, axis=0)
     alike = (units[:, None] == units) & (units != "") | np.eye(len(units), dtype=bool)
     scale = (alike * ranges).max(axis=1)
     scale = np.where(scale > NEGLIGIBLE, scale, 1.0)
     off = space.difference(states, plan)
-    share = np.max(np.abs(off) / scale, axis=1)
-    beyond = ~(share <= TOLERANCE)
-    if not beyond.any():
+    error = np.max(np.abs(off) / scale, axis=1)
+    left = ~(error <= TOLERANCE)
+    if not left.any():
         return ""
-    knot = int(np.argmax(beyond))
-    if not np.isfinite(share[knot]):
+    knot = int(np.argmax(left))
+    if not np.isfinite(error[knot]):
         return f"does not get beyond {(knot - 1) * dt:.4g} s of the plan"
     text = f"LEAVES the plan at {knot * dt:.4g} s: {worst_of(space, off[knot], scale, TOLERANCE)}"
-    if knot and share[knot - 1] <= ABRUPT:
+    if knot and error[knot - 1] <= ON_PLAN:
         text += (
-            f"; a period before, no state was off by more than {share[knot - 1]:.1g} of its range: that step jumps, as"
+            f"; a period before, no state was off by more than {error[knot - 1]:.1g} of its range: that step jumps, as"
             " where a contact or a limit begins, and a rounding error decides which way"
         )
     return text
@@ -117,9 +117,9 @@ class Target:
         """What the scaled error divides the difference of each state by, (n,).
 
         It is the state's way, from the start of the plan to the goal. A state whose way is within TOLERANCE of its
-        range along the plan, or ASIDE of the longest way in its unit or of the distance between its own limits, starts
-        at its goal: it has its range, and at least the longest way in its unit. If no state in that unit has a way, it
-        has at least their largest range, and 1 rad, or the distance between its own limits, such as those of a
+        range along the plan, or SHORT_WAY of the longest way in its unit or of the distance between its own limits,
+        starts at its goal: it has its range, and at least the longest way in its unit. If no state in that unit has a
+        way, it has at least their largest range, and 1 rad, or the distance between its own limits, such as those of a
         gripper's finger; and its rate as much in a second. If all states start at their goals there is nothing to be
         relative to, and each has at least 1 unit.
         """
@@ -129,7 +129,7 @@ class Target:
         alike = (units[:, None] == units) & (units != "") & counts | np.eye(len(units), dtype=bool)
         between = np.subtract(self.space.high, self.space.low)
         between = np.where(np.isfinite(between), between, 0.0)
-        little = np.maximum(TOLERANCE * ranges, ASIDE * np.maximum(between, (alike * way).max(axis=1)))
+        little = np.maximum(TOLERANCE * ranges, SHORT_WAY * np.maximum(between, (alike * way).max(axis=1)))
         moves = counts & (way > little)
         longest = (alike * np.where(moves, way, 0.0)).max(axis=1)
         least = np.where(longest > 0, longest, (alike * ranges).max(axis=1))
@@ -137,7 +137,7 @@ class Target:
         rates = units[:, None] == np.char.add(units, "/s")
         rested = np.where((rates & (longest > 0)).any(axis=1) | (longest > 0), 0.0, (rates * held).max(axis=1))
         least = np.maximum(least, np.maximum(held, rested))
-        if (way <= STAYS * ranges).all():
+        if (way <= AT_GOAL * ranges).all():
             least = np.maximum(least, 1.0)
         scale = np.where(moves, way, np.maximum(ranges, least))
         return np.where(scale > NEGLIGIBLE, scale, 1.0)
@@ -155,8 +155,8 @@ class Target:
         state = self.state
         if self.places:
             return np.linalg.norm(states[..., self.places] - state[self.places], axis=-1)
-        apart = np.max(np.abs(self._off(states)) / self.scale, axis=-1)
-        return np.where(np.isfinite(states).all(axis=-1), apart, np.nan)
+        error = np.max(np.abs(self._off(states)) / self.scale, axis=-1)
+        return np.where(np.isfinite(states).all(axis=-1), error, np.nan)
 
     @checked
     def radius(
@@ -198,8 +198,8 @@ class Target:
         Near is within four radii in metres, for the radius of a robot with arms is their reach; else within one. A plan
         that starts at its target, within a thousandth of the radius, keeps the radius.
         """
-        way, near = float(self.distance(self.plan[0])), NEAR * radius if self.places else radius
-        return TOLERANCE * way if STAYS * radius < way <= near else radius
+        way, near = float(self.distance(self.plan[0])), NEAR_GOAL * radius if self.places else radius
+        return TOLERANCE * way if AT_GOAL * radius < way <= near else radius
 
     def describe(self, distance: float) -> str:
         """A distance as text: "0.1 m from the goal", "10 % of the way from the goal"."""
@@ -219,11 +219,12 @@ class Target:
         """
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
-        away = float(self.distance(self.plan[-1]))
-        near = "" if radius is None else self._measured(radius).removesuffix(f" {OF_WAY}")
-        within = f", which is reached within {near}" if near else ""
+        within = ""
+        if radius is not None:
+            within = f", which is reached within {self._measured(radius).removesuffix(f' {OF_WAY}')}"
         worst = self.worst(self.plan[-1], radius)
-        lines = [f"the plan ends {self.describe(away)}{within}{f': {worst}' if worst else ''}"]
+        end = self.describe(float(self.distance(self.plan[-1])))
+        lines = [f"the plan ends {end}{within}{f': {worst}' if worst else ''}"]
         if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):
             by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
             mend = "raise the weights of the final cost or, if controls are at their limits, the number of steps"

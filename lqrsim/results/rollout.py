@@ -421,9 +421,9 @@ class Rollout:
         begun = counts[:-1]
         saturated = 100 * np.where(begun, self.saturated[k], False).sum() / max(begun.sum(), 1)
         clearance = self.least_clearance()[k]
-        near = f"; clearance {clearance:.3f} m" if np.isfinite(clearance) else ""
+        least = f"; clearance {clearance:.3f} m" if np.isfinite(clearance) else ""
         return (
-            f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{self._worst(k)}{final} {unit}{near};"
+            f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{self._worst(k)}{final} {unit}{least};"
             f" {self.contacts[k]} periods in contact with obstacles; {saturated:.0f} % saturated"
         )
 

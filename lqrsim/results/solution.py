@@ -115,11 +115,11 @@ class Solution(Plan):
           InputError: the solution is not as `smooth` or `smooth_many` returned it, but from a file or changed, or its
             plan is not finite.
         """
-        look = vars(self).get("_look")
-        if look is None or not self.trajectory.finite:
-            got = "a solution from a file, or one that was changed" if look is None else "a plan that is not finite"
+        examine = vars(self).get("_examine_between_knots")
+        if examine is None or not self.trajectory.finite:
+            got = "a solution from a file, or one that was changed" if examine is None else "a plan that is not finite"
             raise InputError(f"between_knots: got {got}, want one as smooth returns it, as smooth(problem, start=this)")
-        return look()
+        return examine()
 
     @property
     def dynamics_residual(self) -> float:
@@ -203,7 +203,7 @@ class Solution(Plan):
 
     def _between_knots(self) -> list[str]:
         """What is wrong between the knots, with the remedy; nothing for a plan that failed, or from a file."""
-        if not self.success or "_look" not in vars(self):
+        if not self.success or "_examine_between_knots" not in vars(self):
             return []
         faults = self.between_knots()._faults(1e-6)  # the default tolerance
         remedies = {"accuracy": "accuracy=1e-6", "between_knots": "between_knots=True"}

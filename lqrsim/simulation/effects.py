@@ -27,7 +27,7 @@ class _ForceHook(NamedTuple):
 
     label: str  # for messages
     hook: Hook
-    part: slice  # which of force, torque and wind, (9,) together, it adds to
+    entries: slice  # of force, torque and wind, (9,) together, to which it adds
     factor: float  # times this
 
 
@@ -137,7 +137,7 @@ class Effects:
         """Forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3), in world axes, at states (K, n)."""
         pushed = np.zeros((len(states), 9))
         for push in self._pushes:
-            pushed[:, push.part] += push.factor * shaped(push.label, push.hook(step, states), (len(states), 3))
+            pushed[:, push.entries] += push.factor * shaped(push.label, push.hook(step, states), (len(states), 3))
         return pushed[:, :6], pushed[:, 6:]
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:

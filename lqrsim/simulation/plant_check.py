@@ -26,7 +26,7 @@ MOST_STEPS = 1_000_000  # physics steps in a check; they run one by one
 PRINTED = 8  # pairs of geoms in contact
 SPREAD = 0.3  # of samples, relative to what a state or control changes by, or in its unit if that is unknown
 SLIGHT = 0.1  # what a state or control that does not change counts as changing, relative to others of its unit
-LINE = 20  # points of the line from a start to a goal
+POINTS = 20  # of the line from a start to a goal
 
 
 @checked
@@ -142,7 +142,7 @@ def check_plant(
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
-    near = _Region.of(robot, problem, plan, around, spread, controls)
+    region = _Region.of(robot, problem, plan, around, spread, controls)
     taken_away = [plant.model.geom(name).id for name in plant.obstacles]
     plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
     rng = np.random.default_rng(seed)
@@ -157,7 +157,7 @@ def check_plant(
     compared, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
-            state, control = near.draw(rng)
+            state, control = region.draw(rng)
             if simulator is not None:
                 compared.append(_in_simulator(simulator, plant, state, control, round(waiting), period))
                 continue
@@ -199,7 +199,7 @@ class _Region(NamedTuple):
             check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces, "the robot")
             start, goal, seconds = problem.start, problem.weighed_goal, problem.steps * problem.dt
             start = np.zeros(n) if start is None else start
-            points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), LINE)
+            points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), POINTS)
         if plan is not None:
             check_same_system("plan", "a plan", spaces_of(plan.policy), spaces, "the robot")
             points, middles = plan.trajectory.states[:-1], plan.trajectory.controls

@@ -153,7 +153,9 @@ def smooth_many(
 def _solve(problem: Problem, settings: SmootherSettings, **options: Any) -> Solution:
     """Solve; the solution can look at its plan between the knots."""
     solution = solve(problem, settings, **options)
-    vars(solution)["_look"] = functools.cache(functools.partial(between_knots, problem, solution.trajectory))
+    vars(solution)["_examine_between_knots"] = functools.cache(
+        functools.partial(between_knots, problem, solution.trajectory)
+    )
     return solution
 
 

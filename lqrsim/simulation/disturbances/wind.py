@@ -183,10 +183,10 @@ class Dryden(Wind):
 def first_order(noise: Array, step: float) -> Array:
     """White noise (K, T, d) through 1 / (1 + s), stationary with variance 1; `step` is in time constants."""
     values, keep = np.empty_like(noise), np.exp(-step)
-    fresh = np.sqrt(-np.expm1(-2 * step))
+    strength = np.sqrt(-np.expm1(-2 * step))
     values[:, 0] = noise[:, 0]
     for t in range(1, noise.shape[1]):
-        values[:, t] = keep * values[:, t - 1] + fresh * noise[:, t]
+        values[:, t] = keep * values[:, t - 1] + strength * noise[:, t]
     return values
 
 
@@ -198,7 +198,6 @@ def second_order(noise: Array, step: float) -> Array:
     decay = np.exp(-step)
     a, b, c, d = decay * (1 + step), decay * step, -decay * step, decay * (1 - step)
     # The covariance of a step's noise, I - F F', preserves the stationary covariance I.
-
     covariance = np.eye(2) - np.array([[a * a + b * b, a * c + b * d], [a * c + b * d, c * c + d * d]])
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(variances, 0.0))
