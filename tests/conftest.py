@@ -36,8 +36,8 @@ def is_short(config: pytest.Config) -> bool:
 def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if is_short(pytestconfig):
-            patch.setattr("lqrsim.control.tubes.FEWEST", 400)
-            patch.setattr("lqrsim.control.tubes.MOST", 400)
+            patch.setattr("lqrsim.control.tubes.FEWEST_TRIALS", 400)
+            patch.setattr("lqrsim.control.tubes.MOST_TRIALS", 400)
         yield
 
 

@@ -82,7 +82,7 @@ def test_a_plan_is_not_much_safer_than_asked(
     Without a margin the plan collides too often; with one as large across as along it is five times safer than asked,
     and costs more than it need.
     """
-    monkeypatch.setattr("lqrsim.control.tubes.MOST", 20_000)  # as without the few of the short run
+    monkeypatch.setattr("lqrsim.control.tubes.MOST_TRIALS", 20_000)  # as without the few of the short run
     cost = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=sharpness)
     changed: dict[str, Any] = {"stage_cost": cost}
     narrow = Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.8}, measurement=0.01)
