@@ -46,7 +46,7 @@ ABSENT = 0.3
 # The increase in the chance of failure without the lag from which other designs compete; a tube of six times the width
 # counts as much.
 CLIFF = 0.1
-# What milder filters are told: a fraction of the stated lag, and noise that bypasses the actuators, relative to the
+# What milder filters assume: a fraction of the stated lag, and noise that bypasses the actuators, relative to the
 # tolerated effort times `Lag.mean`.
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
 # The largest width of the tube with the lag, relative to the narrowest.
@@ -125,15 +125,14 @@ class OffsetFree(Controller):
         }  # fmt: skip
         self.record = record
         self.replan_always = replan_always
-        self._sensors = sensors if isinstance(sensors, RobotSensors) else None
-        states = None if isinstance(sensors, RobotSensors) else sensors
-        sensor = sensor_of(states, problem.dynamics.state_coordinates)
+        of_mjcf, of_states = (sensors, None) if isinstance(sensors, RobotSensors) else (None, sensors)
+        sensor = sensor_of(of_states, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         stated = PlanModel.of(problem.dynamics, plan, uncertainty, sensor)
         self.model = stated.assumed(memory, efforts)
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
-        self._sensing = None if self._sensors is None else self._sensor_filter(self._sensors, replan_every)
+        self._sensing = None if of_mjcf is None else self._sensor_filter(of_mjcf, replan_every)
         self.filter = kalman_filter(self.model) if self._sensing is None else self._sensing.along
         if tolerate is None:
             moments = partial(with_filter, self.model, self.filter, solution.policy.control_coordinates.limits)
@@ -172,7 +171,7 @@ class OffsetFree(Controller):
             got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
             raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty with neither")
         problem = replace(self.problem, dynamics=self.model.dynamics)
-        return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
+        return ReplanRule("OffsetFree", problem, self.solution, every, 0.0, name="replan_every")
 
     def start(self, trials: int) -> FilterRun | ReplannedRun:
         if self._sensing is not None:
@@ -187,11 +186,11 @@ class OffsetFree(Controller):
 
     @property
     def sensors(self) -> RobotSensors | None:
-        return self._sensors
+        return None if self._sensing is None else self._sensing.sensors
 
     def _check_in_advance(self, what: str) -> None:
         """Raise InputError if matrices are not known in advance: about later plans, or gains after losses."""
-        if self._sensors is not None:
+        if self._sensing is not None:
             raise InputError(f"OffsetFree: {what}: got a law that reads sensors of the MJCF, want measured states")
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
@@ -235,14 +234,13 @@ class OffsetFree(Controller):
         )
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.step_source.digest, moved, model.sensor.source.digest, model.sensor.data
-        read = () if self._sensors is None else (self._sensors.digest,)
-        again = (
-            ()
-            if self._rule is None
-            else (f"{self.problem.digest} {self._rule.periods} {self.replan_always}", self.filter.corrected)
-        )
+        further: list[str | Array] = []
+        if self._rule is not None:
+            further += [f"{self.problem.digest} {self._rule.periods} {self.replan_always}", self.filter.corrected]
+        if self._sensing is not None:
+            further.append(self._sensing.sensors.digest)
         rules = (space.rules for space in self.coordinates)
-        return sha256(*parts, numbers, *sources, *again, *read, *rules)[:16]
+        return sha256(*parts, numbers, *sources, *further, *rules)[:16]
 
     @property
     def coordinates(self) -> Spaces:
@@ -255,13 +253,13 @@ def with_margin(
 ) -> Design:  # fmt: skip
     """The design, or a milder one if it is much worse without the lag.
 
-    A filter and a law that are told of a lag compensate for it: the law commands more, and the filter explains
-    unexpected motion by actuators that run ahead of their commands. Without the lag, both overcompensate. Such a loop
-    may be unstable with any tolerances, and the robot then leaves its plan even undisturbed.
+    A filter and a law that assume a lag compensate for it: the law commands more, and the filter explains unexpected
+    motion by actuators that run ahead of their commands. Without the lag, both overcompensate. Such a loop may be
+    unstable with any tolerances, and the robot then leaves its plan even undisturbed.
 
     Each design is therefore also predicted without the lag. If that is much worse, milder designs compete with it: the
-    filter assumes noise on the controls that bypasses the actuators, which is the effect of an unknown lag, and it may
-    be told of only a part of the lag. Among the designs that stay about as near to the plan if the lag exists, the one
+    filter assumes noise on the controls that bypasses the actuators, which is the effect of an unknown lag, and maybe
+    only a part of the lag. Among the designs that stay about as near to the plan if the lag exists, the one
     with the least chance of failure with and without the lag is chosen. A lag of several control periods leaves little
     choice: without it the robot stays near its plan, but may miss its goal.
 
@@ -289,8 +287,8 @@ def with_margin(
         return Predictions(*(np.where(lost, gone, value) for gone, value in zip(GONE, finite, strict=True)))
 
     outcomes = predicted(design)
-    worth = outcomes.worth(narrowest(stated, outcomes.width[0]))
-    if worth[1, 0] <= worth[0, 0] + CLIFF:
+    scores = outcomes.scores(narrowest(stated, outcomes.width[0]))
+    if scores[1, 0] <= scores[0, 0] + CLIFF:
         return design
     if at_end is None:
         weights = design.weights.pick(None)
@@ -304,7 +302,7 @@ def with_margin(
     outcomes = [predicted(candidate) for candidate in designs]
     widths = np.array([outcome.width[0] for outcome in outcomes])
     least = narrowest(stated, widths)
-    worth = np.array([outcome.worth(least) for outcome in outcomes])
-    worth = np.where(widths > WIDER * least, np.inf, worth[:, 0] + ABSENT * worth[:, 1])
-    i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
+    scores = np.array([outcome.scores(least) for outcome in outcomes])
+    scores = np.where(widths > WIDER * least, np.inf, scores[:, 0] + ABSENT * scores[:, 1])
+    i, j = np.unravel_index(int(np.argmin(scores)), scores.shape)
     return designs[i].pick(int(j))

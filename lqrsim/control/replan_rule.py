@@ -138,8 +138,7 @@ class ReplanRule:
     """The problem that is solved, when, and from which state. Runs do not change it.
 
     Args:
-      who, name: the user's call and its argument for `every`, in messages. at_least: the least deadline by default.
-        The others are as in `Replanner`.
+      who, name: the user's call and its argument for `every`, in messages. The others are as in `Replanner`.
 
     Attributes:
       periods: control periods between two solves. delay: control periods until the answer comes into force.
@@ -151,15 +150,14 @@ class ReplanRule:
         problem: Problem,
         solution: Plan,
         every: float,
+        deadline: float,
         *,
         name: str = "every",
-        deadline: float | None = None,
         horizon: str = "shrinking",
         predict: bool = True,
         when: Funnel | None = None,
         share: float = 1.0,
         changes: Changes | None = None,
-        at_least: float = 0.0,
     ) -> None:
         plan, want = solution.trajectory, spaces_of(problem.dynamics)
         check_same_system(f"{who}: solution", "a plan", spaces_of(solution.policy), want, "the problem")
@@ -170,7 +168,6 @@ class ReplanRule:
         if self.every < 0.999 * problem.dt:
             raise InputError(f"{who}: {name}: got {self.every:g} s, want at least a control period, {problem.dt:g} s")
         self.periods = round(self.every / problem.dt)
-        deadline = max(problem.dt, at_least) if deadline is None else deadline
         self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
         self.delay = math.ceil(self.deadline / problem.dt - 1e-9)
         if self.delay > self.periods:

@@ -221,9 +221,11 @@ class Replanner(Controller):
             raise InputError(f'{who}: computing: got {excerpt(computing)}, want seconds, a function or "{MEASURED}"')
         elif not isinstance(computing, str):
             computing = check_number(f"{who}: computing", computing, at_least=0.0)
+        if deadline is None:
+            deadline = max(problem.dt, computing) if isinstance(computing, float) else problem.dt
         self.rule = ReplanRule(
-            who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict, when=when, share=share,
-            changes=changes, at_least=computing if isinstance(computing, float) else 0.0,
+            who, problem, solution, every, deadline, horizon=horizon, predict=predict, when=when, share=share,
+            changes=changes,
         )  # fmt: skip
         self.problem, self.solution = problem, solution
         self.computing, self.seed = computing, seed

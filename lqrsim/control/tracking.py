@@ -6,10 +6,11 @@ state may deviate by as much as random controls of the tolerated effort move it 
 matter, and no state is held much more tightly than the controls permit. Weights that are tuned one by one can have
 better predictions, but only with the linear model for which they are tuned.
 
-The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law. And
-it says nothing of dynamics that bend within the tube: a tight law can turn a sailboat into the wind, from where it does
-not return. A law must therefore bring the nonlinear model back from a few likely deviations. Nor does it say what the
-limits do to a law that works against a wrong parameter, so `track` also runs a few trials with unknowns that are drawn.
+The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law. It
+is also wrong where the dynamics are nonlinear within the tube: a tight law can turn a sailboat into the wind, and
+then it does not return. A law must therefore bring the nonlinear model back from a few likely deviations. And it does not
+show what the limits do to a law that works against a wrong parameter, so `track` also runs a few trials with unknowns
+that are drawn.
 
 If collisions are what makes a law fail, laws with an emphasis on the deviations that lead to them compete with it.
 """
@@ -68,8 +69,12 @@ class Predictions(NamedTuple):
     width: Array
     saturation: Array
 
-    def worth(self, least: float) -> Array:
-        """How bad each law is: its chance to fail, more with saturation and with a tube wider than `least`."""
+    def scores(self, least: float) -> Array:
+        """What a choice of laws minimises: the chance of failure, plus terms for saturation and for wide tubes.
+
+        Args:
+          least: width of the narrowest tube.
+        """
         return self.chance + FRAGILE * self.saturation**2 + NARROW * np.maximum(self.width / least, 1.0)
 
 
@@ -95,7 +100,7 @@ def choose_tolerances(
     loop_moments = moments(laws)
     predicted = predictions(solution, surroundings, counted, loop_moments)
     least = narrowest(model, predicted.width)
-    worth = predicted.worth(least)
+    scores = predicted.scores(least)
 
     def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
         law = laws.pick(i)
@@ -108,7 +113,7 @@ def choose_tolerances(
         return int((sample_loop(truth, run, limits, OPEN, counted, TRIALS, 0).farthest > farthest).sum())
 
     runs = dict[int, int]()  # the number of lost runs of each law
-    for best in sorted(range(len(worth)), key=lambda i: (worth[i], -i)):  # of equals the gentlest first
+    for best in sorted(range(len(scores)), key=lambda i: (scores[i], -i)):  # of equals the gentlest first
         runs[best] = lost(loop_moments, laws, best)
         if not runs[best]:
             break
@@ -130,9 +135,9 @@ def choose_tolerances(
     stressing = chosen[0].stressing(emphasis, EMPHASIS)
     laws = tracking_laws(model, stressing)
     loop_moments = moments(laws)
-    stressed = predictions(solution, surroundings, counted, loop_moments).worth(least)
+    stressed = predictions(solution, surroundings, counted, loop_moments).scores(least)
     i = int(np.argmin(stressed))
-    better = stressed[i] < worth[best] and lost(loop_moments, laws, i) <= runs[best]
+    better = stressed[i] < scores[best] and lost(loop_moments, laws, i) <= runs[best]
     return (stressing.pick(i), laws.pick(i)) if better else chosen
 
 

@@ -229,11 +229,11 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
     if unknown.white:
         return ShapingFilter(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
     step = dt / unknown.time_constant
-    keep = np.exp(-step)
+    decay = np.exp(-step)
     if unknown.order == 1:
         noise = np.hypot(std * np.sqrt(-np.expm1(-2 * step)), drift * np.sqrt(dt))  # one of the two is zero
-        return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), noise), np.ones(1), np.full((1, 1), std))
-    F = keep * np.array([[1 + step, step], [-step, 1 - step]])
+        return ShapingFilter(np.full((1, 1), decay), np.full((1, 1), noise), np.ones(1), np.full((1, 1), std))
+    F = decay * np.array([[1 + step, step], [-step, 1 - step]])
     # The integral of e^As b b' e^A's over the period. It equals I - F F', but that form cancels if the period is short.
     length = min(step, 40.0)
     s = 0.5 * length * (NODES + 1)

@@ -193,10 +193,10 @@ class Target:
         return self.on_the_way(TOLERANCE) if radius is None and not self.places else radius
 
     def on_the_way(self, radius: float) -> float:
-        """The radius; if the plan starts near the target for it, a tenth of the way, so that the start is far from it.
+        """The radius; for a plan that starts near its target, a tenth of the distance between the two.
 
-        Near is within four radii in metres, for the radius of a robot with arms is their reach; else within one. A plan
-        that starts at its target, within a thousandth of the radius, keeps the radius.
+        A plan starts near its target within four radii in metres, because the radius of a robot with arms is their
+        reach, or within one radius if the error is scaled. A plan that starts at its target keeps the radius.
         """
         way, near = float(self.distance(self.plan[0])), NEAR_GOAL * radius if self.places else radius
         return TOLERANCE * way if AT_GOAL * radius < way <= near else radius

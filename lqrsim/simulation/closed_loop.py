@@ -306,13 +306,13 @@ class ClosedLoop:
         return self.rollout(undisturbed=self._undisturbed())
 
     def begin(self) -> None:
-        """Measure the states at the first knot, after what came before."""
-        whole_plan, trials = self.whole, self.trials
+        """Let disturbances and controller follow the plan to the first knot, and measure the states there."""
         for step in range(self.knot):
-            states, controls = (np.tile(rows[step], (trials, 1)) for rows in (whole_plan.states, whole_plan.controls))
+            states, controls = (
+                np.tile(rows[step], (self.trials, 1)) for rows in (self.whole.states, self.whole.controls)
+            )
             self.effects.follow(step, states, controls)
-            read = self._readings
-            shown = states if read is None else read.follow(step, states, self._held(step))
+            shown = states if self._readings is None else self._readings.follow(step, states, self._held(step))
             self.controller_run.control(step, shown)
         self.step, self.measured = 0, self.measure(0)
 

@@ -101,7 +101,7 @@ class Effects:
         return moved or any(effect.alter or effect.factors for _, effect in self._effects)
 
     def follow(self, step: int, states: Array, controls: Array) -> None:
-        """Call all with the states (K, n) and controls (K, m) of a plan, for those that remember."""
+        """Call all hooks with the plan's states (K, n) and controls (K, m), for disturbances that have a memory."""
         for _, measure in self._measures:
             measure(step, states.copy())
         for _, actuate in self._actuations:

@@ -234,7 +234,7 @@ class WheelRadiusMismatch(WheelMismatch):
         return plant.robot.wheels
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        wheels, hubs = treads(plant)
+        wheels, hubs = wheel_geoms(plant)
         simulations.expand("geom_size")[:, wheels] *= factors[:, :, None]
         # Raise the axle by the difference of the radii, so that the wheel touches the floor and the casters do not.
         raised = plant.model.geom_size[wheels, 0] * (factors - 1)
@@ -242,7 +242,7 @@ class WheelRadiusMismatch(WheelMismatch):
         simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * parents[:, 2]  # upward, in their axes
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return self._of_gains(plant, [driven_by(plant, hub) for hub in treads(plant)[1]])
+        return self._of_gains(plant, [driven_by(plant, hub) for hub in wheel_geoms(plant)[1]])
 
 
 class AxleMismatch(WheelMismatch):
@@ -251,7 +251,7 @@ class AxleMismatch(WheelMismatch):
     what = "axle length"
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        _, hubs = treads(plant)
+        _, hubs = wheel_geoms(plant)
         from_middle = plant.model.body_pos[hubs] - plant.model.body_pos[hubs].mean(axis=0)
         simulations.expand("body_pos")[:, hubs] += (factors - 1)[:, :, None] * from_middle
 
@@ -265,7 +265,7 @@ class FrictionMismatch(WheelMismatch):
     what = "friction of the wheels"
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        wheels, _ = treads(plant)
+        wheels, _ = wheel_geoms(plant)
         simulations.expand("geom_friction")[:, wheels, 0] *= factors
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
@@ -317,7 +317,7 @@ def cut_normal(generator: np.random.Generator) -> float:
     return float(ndtri(low + (high - low) * generator.random()))
 
 
-def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def wheel_geoms(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Ids of the wheels' geoms, and of their bodies."""
     geoms = np.array([plant.model.geom(name).id for name in plant.robot.wheels], dtype=np.intp)
     return geoms, plant.model.geom_bodyid[geoms].astype(np.intp)

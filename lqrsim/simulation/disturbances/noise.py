@@ -44,7 +44,7 @@ class AddedError(GaussianDisturbance):
         std, steps = self._deviations(plant), 1 if self.lasts else plan.steps + (self.hook == "measure")
         errors = std * normal(generators, steps, len(std))
         if self.hook == "initial_states":
-            return Effect(initial_states=lambda states: _off(plant, states, errors[:, 0]))
+            return Effect(initial_states=lambda states: _moved(plant, states, errors[:, 0]))
         hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.lasts else step]}
         return Effect(**hooks)
 
@@ -95,10 +95,11 @@ class InitialStateError(AddedError):
     what, hook, known_as = "initial state off", "initial_states", "start"
 
 
-def _off(plant: Plant, states: Array, errors: Array) -> Array:
-    moved, noisy = errors.any(axis=-1), states + errors
-    noisy[moved] = plant.robot.with_closed_loops(noisy[moved])
-    return noisy
+def _moved(plant: Plant, states: Array, errors: Array) -> Array:
+    """The states (K, n) moved by errors, with the robot's kinematic loops closed again."""
+    rows, moved = errors.any(axis=-1), states + errors
+    moved[rows] = plant.robot.with_closed_loops(moved[rows])
+    return moved
 
 
 class WrenchNoise(GaussianDisturbance):
