@@ -7,10 +7,10 @@ matter, and no state is held much more tightly than the controls permit. Weights
 better predictions, but only with the linear model for which they are tuned.
 
 The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law. It
-is also wrong where the dynamics are nonlinear within the tube: a tight law can turn a sailboat into the wind, and
-then it does not return. A law must therefore bring the nonlinear model back from a few likely deviations. And it does not
-show what the limits do to a law that works against a wrong parameter, so `track` also runs a few trials with unknowns
-that are drawn.
+is also wrong where the dynamics are nonlinear within the tube: a tight law can turn a sailboat into the wind, and it
+does not return. A law must therefore bring the nonlinear model back from a few likely deviations. And it does not show
+what the limits do to a law that works against a wrong parameter, so `track` also runs a few trials with unknowns that
+are drawn.
 
 If collisions are what makes a law fail, laws with an emphasis on the deviations that lead to them compete with it.
 """
