@@ -25,8 +25,7 @@ from lqrsim.control.uncertainty import per_entry, triangular_root
 from lqrsim.errors import Array, InputError
 from lqrsim.robots.sensors import RobotSensors
 
-# A reading tells nothing of the state if that moves it by less than this share of the state's own change, or of one
-# step of the differences: those of MuJoCo are good to about 1e-9.
+# A reading does not depend on the state if its derivatives are below this: differences of MuJoCo's are good to 1e-9.
 _SILENT = 1e-8
 _WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
@@ -215,12 +214,12 @@ class SensorFilter:
     def _sizes(self) -> list[int]:
         return [at.stop - at.start for at in self.sensors.columns]
 
-    def _aligned(self, readings: Array, near: Array) -> Array:
-        """The readings (K, Y), with each quaternion or its negative, whichever is nearer to another reading's."""
+    def _aligned(self, readings: Array, reference: Array) -> Array:
+        """The readings (K, Y), with each quaternion or its negative, whichever is nearer to that of the reference."""
         aligned = readings.copy()
         for at, turns in zip(self.sensors.columns, self.sensors.quaternions, strict=True):
             if turns:
-                aligned[:, at] *= np.where(np.vecdot(readings[:, at], near[:, at]) < 0, -1.0, 1.0)[:, None]
+                aligned[:, at] *= np.where(np.vecdot(readings[:, at], reference[:, at]) < 0, -1.0, 1.0)[:, None]
         return aligned
 
     def difference(self, readings: Array, expected: Array) -> Array:
@@ -276,9 +275,9 @@ class SensorRun(FilterRun):
         if knot:
             self._predict(z, self._acting[knot])
             filter_.predict(covariance, knot)
-        near = in_c_order(model.plan.states[[min(knot, model.plan.steps)]])
+        planned = in_c_order(model.plan.states[[min(knot, model.plan.steps)]])
         states = in_c_order(z[None, :, : model.n])
-        turn_to_nearest(model.dynamics.state_coordinates, states, near)
+        turn_to_nearest(model.dynamics.state_coordinates, states, planned)
         z[:, : model.n] = states[0]
         known = ~np.isnan(self._readings[knot])
         if known.any():

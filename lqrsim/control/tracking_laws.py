@@ -119,39 +119,39 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     of d alone does not change the law.
     """
     n, m, steps, lost = model.n, model.m, model.plan.steps, model.uncertainty.command_loss
-    own, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
+    movable, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
     state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
     # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
-    (F, G, c), onto = model.arriving, np.zeros((steps, width, width + m))
-    onto[:, :own, : width - 1], onto[:, :own, width - 1], onto[:, :own, width:] = F[:, :own], c[:, :own], G[:, :own]
-    onto[:, range(own, width), range(own, width)] = 1.0
-    back = np.concatenate([F[:, :own, :own], G[:, :own]], axis=2).transpose(0, 2, 1)
+    (F, G, c), forward = model.arriving, np.zeros((steps, width, width + m))
+    forward[:, :movable] = np.concatenate([F, c[:, :, None], G], axis=2)[:, :movable]
+    forward[:, range(movable, width), range(movable, width)] = 1.0
+    adjoint = np.concatenate([F[:, :movable, :movable], G[:, :movable]], axis=2).transpose(0, 2, 1)
     held = np.zeros((steps, m, width))
     if lost:  # a lost command is that in force, which is a
-        held[:, range(m), range(n, own)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
-    undo = np.zeros((steps, len(state), m, width))
+        held[:, range(m), range(n, movable)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
+    compensation = np.zeros((steps, len(state), m, width))
     # M_t, (C, T, m, D), by Q.
     B = model.jacobian[:, :, n:]
     weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
     curve = weighed @ B
     least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
-    undoing = np.linalg.inv(curve + least[..., None, None] * np.eye(m)) @ (weighed @ model.E)
-    undo[..., own:-1] = weights.control[:, None] * undoing.swapaxes(0, 1)
-    cost, products = np.zeros((len(state), own, width)), np.empty((len(state), own + m, width + m))
+    cancelling = np.linalg.inv(curve + least[..., None, None] * np.eye(m)) @ (weighed @ model.E)
+    compensation[..., movable:-1] = weights.control[:, None] * cancelling.swapaxes(0, 1)
+    cost, products = np.zeros((len(state), movable, width)), np.empty((len(state), movable + m, width + m))
     cost[:, range(n), range(n)] = end
     emphasis = None if weights.emphasis is None else weights.emphasis.reshape(len(state), steps + 1, n, n)
     if emphasis is not None:
         cost[:, :n, :n] += emphasis[:, steps]
-    every = np.zeros((len(state), own))
-    every[:, :n] = state
-    sizes, laws = PassSizes(len(state), own, model.size, m, lost), np.empty(undo.shape)
-    arrays = PassArrays(weights.control, every.ravel(), undo.ravel(), held.ravel(), laws.ravel())
+    stage = np.zeros((len(state), movable))
+    stage[:, :n] = state
+    sizes, laws = PassSizes(len(state), movable, model.size, m, lost), np.empty(compensation.shape)
+    arrays = PassArrays(weights.control, stage.ravel(), compensation.ravel(), held.ravel(), laws.ravel())
     work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
     improve = module_of(source_of(tracking_law), "tracking laws").lay_out("improve", 0, sizes, arrays, work)
     for t in range(steps - 1, -1, -1):
         if averse is not None:
-            cost[0, :, :own], cost[0, :, -1] = averse.worst(t, cost[0, :, :own], cost[0, :, -1])
-        np.matmul(back[t], cost @ onto[t], out=products)
+            cost[0, :, :movable], cost[0, :, -1] = averse.worst(t, cost[0, :, :movable], cost[0, :, -1])
+        np.matmul(adjoint[t], cost @ forward[t], out=products)
         improve(t, sizes, arrays, work)
         if emphasis is not None:
             cost[:, :n, :n] += emphasis[:, t]
