@@ -65,7 +65,7 @@ def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tup
         noise[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks[i]
         seen = slice(i * model.sensor.size, (i + 1) * model.sensor.size)
         H[seen, i * size : i * size + model.n] = model.H[i]
-        V[seen, seen] = model.H[i] @ np.diag(model.shown_std**2) @ model.H[i].T
+        V[seen, seen] = model.H[i] @ np.diag(model.measurement_std**2) @ model.H[i].T
         y[seen] = model.H[i] @ (measured[i] - known[i, : model.n])
     prior = to @ noise @ to.T
     gain = np.linalg.solve(H @ prior @ H.T + V, H @ prior).T

@@ -221,7 +221,7 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
     gain, offset = rng.normal(size=(3, steps, m, n)), rng.normal(size=(3, steps, m))
     limits = np.full(m, -1.0), np.full(m, 1.5)
     found = LinearLoop(model, gain, offset, None, limits).moments(n)
-    shown, (F, G, c), onto_force = np.diag(model.shown_std**2), model.arriving, np.eye(m, model.size, n)
+    shown, (F, G, c), onto_force = np.diag(model.measurement_std**2), model.arriving, np.eye(m, model.size, n)
     for i in range(3):
         x, P = np.zeros(model.size), model.start_root @ model.start_root.T
         for t in range(steps + 1):

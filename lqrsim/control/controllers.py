@@ -36,10 +36,10 @@ def evaluator(policy: AffinePolicy) -> Callable[[AffinePolicy, int, Array], Arra
     limits, turning = Limits(*controls.limits), turning_of(states)
     laws = _laws(len(states), len(controls))
 
-    def evaluate(policy: AffinePolicy, row: int, shown: Array) -> Array:
-        x, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
+    def evaluate(policy: AffinePolicy, row: int, measured: Array) -> Array:
+        x, out = np.array(measured, dtype=np.float64), np.empty((len(measured), len(controls)))
         law = Policy(in_c_order(policy.gain[row]), in_c_order(policy.offset[row]))
-        laws.apply_policy(len(shown), x, law, in_c_order(policy.nominal[row]), turning, limits, out)
+        laws.apply_policy(len(x), x, law, in_c_order(policy.nominal[row]), turning, limits, out)
         return out
 
     return evaluate
@@ -220,8 +220,8 @@ class _OutputFeedbackRun(ControllerRun):
 
     def control(self, step: int, measured: Array) -> Array:
         policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))
-        for k, (shown, previous) in enumerate(zip(measured, self._previous, strict=True)):
-            y = None if np.array_equal(shown, previous) else shown[self._measures]
+        for k, (state, previous) in enumerate(zip(measured, self._previous, strict=True)):
+            y = None if np.array_equal(state, previous) else state[self._measures]
             commands[k], self._z[k] = policy.step(self._z[k], y, step * policy.dt)
         self._previous[:] = measured
         return commands

@@ -82,7 +82,7 @@ class FilterRun(ControllerRun):
         self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
-        # If the first measurement is lost, the plan's first state is shown.
+        # If the first measurement is lost, it counts as the plan's first state.
         self._last_measured = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._differences = np.empty((trials, law.model.sensor.size))

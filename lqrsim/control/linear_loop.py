@@ -83,20 +83,20 @@ class LinearLoop:
         noise, jointly = np.zeros((steps + 1, len(models), size, size)), np.zeros(0)
         drawn = np.empty((steps + 1, len(models), unknown, unknown))
         if self.filter_gain is None:
-            K[..., :n], shaking = gain, gain * first.shown_std
+            K[..., :n], on_command = gain, gain * first.measurement_std
         else:
             # F and K act on the corrected estimate. With losses, all measurements count less.
             assumed, received = self.assumed or first, 1 - first.uncertainty.loss
             seen = received * (self.filter_gain @ first.H)[:-1, None]
-            shown = np.sqrt(received) * (self.filter_gain @ first.measurement_root)[:-1, None]
+            measured = np.sqrt(received) * (self.filter_gain @ first.measurement_root)[:-1, None]
             for after, on in ((gain, K), (assumed.F[:, None], F[..., stated:, :])):
                 on[..., stated:size], on[..., :n] = after, after @ seen
                 on[..., stated : stated + n] -= on[..., :n]
             G[..., stated:], c[..., stated:] = assumed.G[:, None].swapaxes(-1, -2), assumed.c[:, None]
-            shaking, shown = gain @ shown, assumed.F[:, None] @ shown
-            noise[1:, :, stated:, stated:] = shown @ shown.swapaxes(-1, -2)
+            on_command, measured = gain @ measured, assumed.F[:, None] @ measured
+            noise[1:, :, stated:, stated:] = measured @ measured.swapaxes(-1, -2)
             jointly = np.zeros((*gain.shape[:-1], size))
-            jointly[..., stated:] = shaking @ shown.swapaxes(-1, -2)
+            jointly[..., stated:] = on_command @ measured.swapaxes(-1, -2)
         for i, model in enumerate(models):
             F[:, i, :stated, :stated], F[:, i, :stated, size:] = (
                 model.F[:, :stated, :stated],
@@ -109,6 +109,6 @@ class LinearLoop:
         planned, reached = first.plan.controls, np.stack([model.reached for model in models], axis=1)
         arrays = LoopArrays(
             F, G, c, noise, drawn, first.transition, K, planned[:, None] + offset, planned,
-            shaking @ shaking.swapaxes(-1, -2), jointly, reached, *self.limits,
+            on_command @ on_command.swapaxes(-1, -2), jointly, reached, *self.limits,
         )  # fmt: skip
         return moments_of(arrays, stated, count, first.uncertainty.command_loss)

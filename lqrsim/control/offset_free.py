@@ -295,9 +295,9 @@ def with_margin(
     else:
         weights = tolerances_to_try(design.model, effort, at_end, solution.target)
     designs = [Design.of(design.model, design.filter, weights)]
-    for fraction, doubt in MILDER:
+    for fraction, bypass in MILDER:
         partly = stated.under(replace(stated.uncertainty, lag=fraction * stated.uncertainty.lag))
-        model = partly.assumed(memory, effort, doubt)
+        model = partly.assumed(memory, effort, bypass)
         designs.append(Design.of(model, kalman_filter(model), weights))
     outcomes = [predicted(candidate) for candidate in designs]
     widths = np.array([outcome.width[0] for outcome in outcomes])

@@ -397,18 +397,20 @@ class PlanModel:
         same = np.array([[unit == other for other in units] for unit in units], dtype=np.float64)
         return np.sqrt(reach**2 @ same / same.sum(axis=0))
 
-    def assumed(self, memory: float, effort: Array, doubt: float = 0.0) -> "PlanModel":
+    def assumed(self, memory: float, effort: Array, bypass: float = 0.0) -> "PlanModel":
         """The model that a filter assumes of this one, with a memory in s: see `Uncertainty.steady`. Nothing is exact.
 
         Args:
-          effort: tolerated effort of the controls, (m,). doubt: of the lag; see `with_margin`.
+          effort: tolerated effort of the controls, (m,).
+          bypass: noise on the controls that bypasses the actuators, relative to the effort times `Lag.mean`; see
+            `with_margin`.
         """
         stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
         steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss
         control = per_entry("Uncertainty: control", stated.control, controls)
         control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
         error = per_entry("Uncertainty: model_error", stated.model_error, space)
-        behind = zip(controls.names, doubt * Lag.of(stated.lag, self.plan.dt).mean * effort, strict=True)
+        behind = zip(controls.names, bypass * Lag.of(stated.lag, self.plan.dt).mean * effort, strict=True)
         directly = [Unknown(OFFSET + name, float(std), time_constant=0.0) for name, std in behind if std]
         assumed = replace(
             steady, unknowns=(*steady.unknowns, *directly),
@@ -462,14 +464,14 @@ class PlanModel:
         return varying @ varying.transpose(0, 2, 1) + constant @ constant.T
 
     @cached_property
-    def shown_std(self) -> Array:
+    def measurement_std(self) -> Array:
         """Standard deviation of the noise on each measured state, (n,)."""
         return per_entry("Uncertainty: measurement", self.uncertainty.measurement, self.dynamics.state_coordinates)
 
     @cached_property
     def measurement_root(self) -> Array:
         """Square root of the covariance of v, (T+1, Y, n)."""
-        return self.H * self.shown_std
+        return self.H * self.measurement_std
 
 
 def _diagonal(blocks: list[Array]) -> Array:

@@ -119,7 +119,7 @@ class _Robots:
         self._late_measured = deque[Array]()
         first = [np.tile(plan.controls[min(i, plan.steps - 1)], (trials, 1)) for i in range(uncertainty.delay)]
         self._late_commands = deque(first)
-        self._shown, self._applied = np.tile(plan.states[0], (trials, 1)), np.tile(plan.controls[0], (trials, 1))
+        self._measured, self._applied = np.tile(plan.states[0], (trials, 1)), np.tile(plan.controls[0], (trials, 1))
 
     def _normal(self, size: int) -> Array:
         return self.rng.standard_normal((self._trials, size))
@@ -134,11 +134,11 @@ class _Robots:
 
     def measure(self, t: int) -> Array:
         uncertainty, measured = self.model.uncertainty, self._late_measured
-        measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.shown_std)
-        shown = measured.popleft() if t >= uncertainty.latency else measured[0]
+        measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.measurement_std)
+        arrived = measured.popleft() if t >= uncertainty.latency else measured[0]
         lost = self.rng.random((self._trials, 1)) < uncertainty.loss
-        self._shown = np.where(lost, self._shown, shown)
-        return self._shown
+        self._measured = np.where(lost, self._measured, arrived)
+        return self._measured
 
     def advance(self, t: int, commands: Array) -> Array:
         """Advance by a control period, under commands (K, m). Returns the applied commands."""

@@ -153,13 +153,13 @@ def predict_tube(
         )
     counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
     trials = sample_loop(loop.model, law, loop.limits, surroundings, counted, samples, seed) if samples else None
-    shown, estimate = trials.moments if late and trials else loop.moments(), None
+    moments, estimate = trials.moments if late and trials else loop.moments(), None
     model, n = loop.model, loop.model.n
     if not late and loop.filter_gain is not None:
-        joint, guess = shown.covariance, slice(n + model.lagging, 2 * n + model.lagging)
+        joint, guess = moments.covariance, slice(n + model.lagging, 2 * n + model.lagging)
         both = joint[:, :n, guess]
         estimate = joint[:, :n, :n] + joint[:, guess, guess] - both - both.transpose(0, 2, 1)
-    mean, covariance, across = shown.mean[:, :n], shown.covariance[:, :n, :n], shown.across[:, :n, :n]
+    mean, covariance, across = moments.mean[:, :n], moments.covariance[:, :n, :n], moments.across[:, :n, :n]
     chance, linear = collision_chance(plan.states + mean, covariance, across, surroundings)
     strays = None
     if trials is not None:
@@ -168,7 +168,7 @@ def predict_tube(
         strays = float((trials.farthest > STRAY * widest).mean())
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,
-        across=across, estimate_covariance=estimate, command=shown.command, saturation=shown.saturation,
+        across=across, estimate_covariance=estimate, command=moments.command, saturation=moments.saturation,
         step_chance=chance, linear_chance=float(linear), strays=strays,
         collision_chance=float(linear) if trials is None else trials.chance(float(linear)),
         samples=0 if trials is None else len(trials.collided),

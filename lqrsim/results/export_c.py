@@ -341,26 +341,27 @@ def _rows(
     """The rows of main.c, with Python's commands for random measurements, and the tolerance of each control (m,)."""
     rng, rows = np.random.default_rng(0), []
     largest = np.zeros(len(law.control_coordinates))
+    filtered = isinstance(law, OutputFeedbackPolicy)
     periods = [0, 1, 1.5, law.steps // 2, law.steps - 1.25, law.steps - 1, law.steps, 2 * law.steps]
-    times = np.arange(12.0) if isinstance(law, OutputFeedbackPolicy) else np.abs(periods)
-    z = law.start() if isinstance(law, OutputFeedbackPolicy) else law.nominal[0]
+    times = np.arange(12.0) if filtered else np.abs(periods)
+    z = law.start() if filtered else law.nominal[0]
     expected = values.get("expected", law.nominal)
     # A filter interprets the spread of its measurements as fast motion, so the spread is smaller here.
-    spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if "expected" in values else 1)
+    spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if filtered else 1)
     for place, period in enumerate(times):
         t, k = float(period) * law.dt, min(int(period), law.steps - 1)
-        shown = expected[k] + spread * rng.standard_normal(len(space))
+        measured = expected[k] + spread * rng.standard_normal(len(space))
         for i in space.angles:
-            shown[i] += 2 * np.pi * rng.integers(-1, 2)
-        shown = shown.astype(dtype).astype(np.float64)
-        lost = isinstance(law, OutputFeedbackPolicy) and place % 5 == 3
+            measured[i] += 2 * np.pi * rng.integers(-1, 2)
+        measured = measured.astype(dtype).astype(np.float64)
+        lost = filtered and place % 5 == 3
         state = z
-        if isinstance(law, OutputFeedbackPolicy):
-            command, z = law.step(z, None if lost else shown, t)
+        if filtered:
+            command, z = law.step(z, None if lost else measured, t)
         else:
-            command, state = law(shown, t, interpolate=interpolate), shown
+            command, state = law(measured, t, interpolate=interpolate), measured
         rows.append(
-            f"    {{{t!r}, {int(lost)}, {_list(map(repr, shown.tolist()))}, {_list(map(repr, command.tolist()))}}},"
+            f"    {{{t!r}, {int(lost)}, {_list(map(repr, measured.tolist()))}, {_list(map(repr, command.tolist()))}}},"
         )
         sums = np.abs(values["gain"][k]) @ (np.abs(state) + np.abs(law.nominal[k])) + np.abs(values["planned"][k])
         largest = np.maximum(largest, sums)

@@ -312,8 +312,8 @@ class ClosedLoop:
                 np.tile(rows[step], (self.trials, 1)) for rows in (self.whole.states, self.whole.controls)
             )
             self.effects.follow(step, states, controls)
-            shown = states if self._readings is None else self._readings.follow(step, states, self._held(step))
-            self.controller_run.control(step, shown)
+            observed = states if self._readings is None else self._readings.follow(step, states, self._held(step))
+            self.controller_run.control(step, observed)
         self.step, self.measured = 0, self.measure(0)
 
     def period(self) -> bool:
@@ -340,11 +340,11 @@ class ClosedLoop:
     def decide(self, step: int, measured: Array) -> Array:
         """The controller's commands (K, m); if it fails, the plan's controls."""
         shape = self.trials, len(self._names)
-        shown, knot = measured, self.knot + step
+        observed, knot = measured, self.knot + step
         if self._readings is not None:
-            shown = self._readings.arriving(knot, self.states, measured, None if step else self._held(knot))
+            observed = self._readings.arriving(knot, self.states, measured, None if step else self._held(knot))
         try:
-            commands = _checked_commands(self.controller_run.control(knot, shown), shape)
+            commands = _checked_commands(self.controller_run.control(knot, observed), shape)
             failed = _not_finite(commands)
             first = np.argmin(np.isfinite(commands), axis=1)
             reasons = {
