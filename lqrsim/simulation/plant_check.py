@@ -158,14 +158,13 @@ def check_plant(
     with unlogged():
         for _ in range(samples):
             state, control = region.draw(rng)
-            if simulator is not None:
-                compared.append(_in_simulator(simulator, plant, state, control, round(waiting), period))
-                continue
-            sample, touched = _sample(plant, data, state, control, round(waiting), period)
+            if simulator is None:
+                sample, touched = _sample(plant, data, state, control, round(waiting), period)
+                touching.update(sorted(touched))
+            else:
+                sample = _in_simulator(simulator, plant, state, control, round(waiting), period)
             compared.append(sample)
-            touching.update(sorted(touched))
-    check = _worst_of(compared, robot, period, tolerance, touching)
-    return check if simulator is None else replace(check, simulator=simulator.name)
+    return _worst_of(compared, plant, period, tolerance, touching)
 
 
 class _Sample(NamedTuple):
@@ -323,17 +322,18 @@ def _in_simulator(
 
 
 def _worst_of(
-    samples: list[_Sample], robot: Robot, period: float, tolerance: float, touching: Counter[tuple[str, str]]
+    samples: list[_Sample], plant: Plant, period: float, tolerance: float, touching: Counter[tuple[str, str]]
 ) -> PlantCheck:
     """The result over all samples, with the sample in which the worst state has its largest error."""
     errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in samples])
     changes = np.array([np.abs(sample.predicted - sample.before) for sample in samples])
-    space, first = robot.dynamics.state_coordinates, samples[0]
+    space, first = plant.robot.dynamics.state_coordinates, samples[0]
     check = PlantCheck(
         names=space.names, units=space.units, errors=errors.max(axis=0), changes=changes.max(axis=0), period=period,
         state=first.before, control=first.control, simulated=first.simulated, predicted=first.predicted,
         tolerance=tolerance, samples=len(samples),
         contacts=tuple((*pair, count) for pair, count in touching.most_common()),
+        simulator="MuJoCo" if plant.simulator is None else plant.simulator.name,
     )  # fmt: skip
     worst = samples[int(errors[:, check.names.index(check.worst)].argmax())]
     return replace(
