@@ -218,7 +218,7 @@ class _Search:
             problem = replace(problem, constraints=(*problem.constraints, *clearances))
             # The first plan may cut through obstacles: a solve from it would choose the route by chance.
             start = None if second else base.solution.trajectory
-        solution = smooth(problem, start=start) if start is not None else smooth(problem)
+        solution = smooth(problem, start=start)
         if not solution.success and start is not None:
             solution = smooth(problem)
         if not solution.success and self.plans:
