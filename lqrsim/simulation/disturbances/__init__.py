@@ -79,11 +79,7 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     have their own states, because its MJCF describes their lag. In a liquid there are currents in place of turbulence.
     """
     strength = PRESETS[check_name("preset", name, PRESETS)]
-    return [
-        disturbance.scaled(strength)
-        for disturbance in _light(plant)
-        if _can_have(plant, disturbance) and _acts(disturbance)
-    ]
+    return [disturbance.scaled(strength) for disturbance in _light(plant) if _affects(disturbance, plant)]
 
 
 def _light(plant: Plant) -> list[Disturbance]:
@@ -112,14 +108,10 @@ def _light(plant: Plant) -> list[Disturbance]:
     ]
 
 
-def _acts(disturbance: Disturbance) -> bool:
-    """Whether it is not zero for this robot, as a share of the weight is where there is no gravity."""
-    return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(np.asarray(disturbance.std)))
-
-
-def _can_have(plant: Plant, disturbance: Disturbance) -> bool:
+def _affects(disturbance: Disturbance, plant: Plant) -> bool:
+    """Whether the plant can have it, and it is not zero for its robot, as a share of the weight is without gravity."""
     try:
         disturbance.check(plant)
     except InputError:
         return False
-    return True
+    return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(np.asarray(disturbance.std)))
