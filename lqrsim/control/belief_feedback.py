@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lqrsim.annotations import checked
-from lqrsim.control.controllers import Controller, ControllerRun, evaluator
+from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.belief import Belief
@@ -80,7 +80,7 @@ class BeliefRun(ControllerRun):
     """
 
     def __init__(self, law: BeliefFeedback, trials: int) -> None:
-        self._law, self._evaluate = law, evaluator(law.solution.policy)
+        self._law, self._feedback = law, Feedback(law.solution.policy)
         self._read = np.tile(law.solution.trajectory.states[0], (trials, 1))  # at the last knot whose readings arrived
         self._commands, self._known, self._record = list[Array](), list[Array](), list[Array]()
 
@@ -89,7 +89,7 @@ class BeliefRun(ControllerRun):
         return np.array(self._record)
 
     def control(self, step: int, measured: Array) -> Array:
-        policy, belief = self._law.solution.policy, self._law.belief
+        belief = self._law.belief
         readings, late = measured[:, : belief.readings], belief.sensors.delay
         self._known.append(measured[:, belief.readings :])
         if not step:
@@ -102,5 +102,5 @@ class BeliefRun(ControllerRun):
             now = belief.corrected(now, command, np.full_like(readings, np.nan))
         now[:, belief.known] = self._known[step]
         self._record.append(now)
-        self._commands.append(self._evaluate(policy, min(step, policy.steps - 1), now))
+        self._commands.append(self._feedback.control(step, now))
         return self._commands[-1]
