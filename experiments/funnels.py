@@ -20,7 +20,7 @@ from replan.delay import firm
 from runner import FolderSettings, Result, at_most, between, counting, interval, opening, run, table
 
 import lqrsim as ls
-from lqrsim.stress.funnels import find_level, fresh, smallest_test
+from lqrsim.stress.funnels import find_level, run_test, smallest_test
 from lqrsim.stress.statistics import compare, paired_difference
 from lqrsim.stress.statistics import rate as rate_of
 
@@ -93,7 +93,7 @@ def coverage(config: Config) -> dict[str, Any]:
     refused = 0
     for number in range(config.repetitions):
         drawn = np.random.default_rng([config.seed, number, 1]).random(2 * test.trials)
-        failed, _ = fresh(lambda level, which, drawn=drawn: drawn[which] < config.rate, 1.0, test)
+        failed, _ = run_test(lambda level, which, drawn=drawn: drawn[which] < config.rate, 1.0, test)
         refused += failed > test.failures
     return {
         "known": right, "test": interval(_percent(refused, config.repetitions)), "trials": test.trials,

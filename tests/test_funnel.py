@@ -38,13 +38,13 @@ from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress import funnels
 from lqrsim.stress.funnels import (
     BATCH,
-    NEAR,
+    PILOT_ACCURACY,
     FoundLevel,
     LevelTest,
     find_level,
-    fresh,
     lowest_rate,
     points_of,
+    run_test,
     smallest_test,
 )
 from lqrsim.stress.statistics import rate as rate_of
@@ -188,7 +188,7 @@ def test_a_level_is_tested_by_trials_of_its_own(trials: int, data: st.DataObject
         ran.extend(numbers.tolist())
         return ~np.isin(numbers, [trials + number for number in bad])
 
-    failed, done = fresh(runs, 1.0, LevelTest(trials, allowed, allowed))
+    failed, done = run_test(runs, 1.0, LevelTest(trials, allowed))
     assert ran == list(range(trials, trials + done))
     assert failed == sum(number < done for number in bad)
     last = sorted(bad)[allowed] if len(bad) > allowed else trials - 1
@@ -330,8 +330,8 @@ class TestLevels:
         found = self.find(lambda level: 1 / (1 + (level / 20) ** 4), seed=2)
         test = smallest_test(0.9, 0.95, 5)
         drawn = np.sort([np.random.default_rng([2, number]).random() for number in range(test.trials)])
-        edge = 20 * (1 / drawn[test.trials - test.aim - 1] - 1) ** 0.25  # where one more than that fails
-        assert edge / NEAR <= found.pilot <= edge
+        edge = 20 * (1 / drawn[test.trials - test.pilot_failures - 1] - 1) ** 0.25  # where one more than that fails
+        assert edge / PILOT_ACCURACY <= found.pilot <= edge
         assert found.level in (0.7 * found.pilot, 0.9 * found.pilot, found.pilot)
 
     def test_no_level(self) -> None:

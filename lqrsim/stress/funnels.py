@@ -36,12 +36,12 @@ from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.versions import versions
 
 KNOTS = 5  # default number of knots
-FAR = 2.0**20  # largest level, relative to the first level that is tried
-DRAWN = 2**31  # number of the random stream for a trial's start; disturbances use the first streams
-SHARES = (0.7, 0.9, 1.0)  # fractions of the pilot's level, in the order in which they are tested
-NEAR = 1.04  # the pilot's accuracy: ratio of a level with too many failures to its result
-HALVINGS = 40  # number of steps down after which the pilot gives up
-FEW = 64  # trials of the pilot's coarse search
+LEVEL_RANGE = 2.0**20  # largest level, relative to the first level that is tried
+START_STREAM = 2**31  # number of the random stream for a trial's start; disturbances use the first streams
+TESTED_FRACTIONS = (0.7, 0.9, 1.0)  # of the pilot's level, in the order in which they are tested
+PILOT_ACCURACY = 1.04  # ratio of a level with too many failures to the pilot's level
+MOST_STEPS_DOWN = 40  # after which the pilot gives up
+COARSE_TRIALS = 64  # trials of the pilot's coarse search
 BATCH = 512  # trials that are simulated together
 MOST_TRIALS = 1_000_000
 
@@ -57,7 +57,11 @@ class LevelTest:
 
     trials: int
     failures: int  # allowed failures
-    aim: int  # allowed failures in the pilot: fewer, for a level that just passes it fails half of its tests
+
+    @property
+    def pilot_failures(self) -> int:
+        """Allowed failures in the pilot: fewer, for a level that just passes it fails half of its tests."""
+        return (2 * self.failures) // 3
 
 
 @checked
@@ -81,7 +85,7 @@ def smallest_test(
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if proves(middle) else (middle, high)
-    return LevelTest(high, failures, (2 * failures) // 3)
+    return LevelTest(high, failures)
 
 
 def lowest_rate(successes: int, trials: int, confidence: float) -> float:
@@ -113,31 +117,32 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
         the reason.
     """
     pilot = _Pilot(runs, test)
-    aimed = pilot.level(min(guess, largest), largest)
-    if aimed == 0:
+    pilot_level = pilot.level(min(guess, largest), largest)
+    if pilot_level == 0:
         failed = pilot.failures(0.0, test.trials)
-        if failed > test.aim:
+        if failed > test.pilot_failures:
             reason = (
                 f"even when they begin on the plan, {failed} of {test.trials} trials fail; to prove a rate of {rate:g},"
-                f" at most {test.aim} may fail"
+                f" at most {test.pilot_failures} may fail"
             )
         else:
             reason = "too many trials fail at all levels that were tried, down to the smallest"
         return FoundLevel(0.0, 0, 0, reason, 0.0, pilot.simulated)
-    passed, stopped, simulated = (0.0, 0, 0), "", pilot.simulated
-    for level in dict.fromkeys(min(share * aimed, largest) for share in SHARES):
-        failed, done = fresh(runs, level, test)
-        simulated += done
+    passed, reason, simulated = (0.0, 0, 0), "", pilot.simulated
+    for level in dict.fromkeys(min(fraction * pilot_level, largest) for fraction in TESTED_FRACTIONS):
+        failed, trials = run_test(runs, level, test)
+        simulated += trials
         if failed > test.failures:
             allowed = f"at most {test.failures} of {test.trials} may fail"
-            stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}; {allowed}"
+            reason = f"{failed} of {trials} fresh trials fail at level {level:.4g}; {allowed}"
             break
         passed = level, test.trials, test.trials - failed
-    beyond = f"levels beyond {largest:.4g} were not tried" if passed[0] == largest else ""
-    return FoundLevel(*passed, beyond if passed[0] else stopped, aimed, simulated)
+    if passed[0]:
+        reason = f"levels beyond {largest:.4g} were not tried" if passed[0] == largest else ""
+    return FoundLevel(*passed, reason, pilot_level, simulated)
 
 
-def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
+def run_test(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
     """Run the test's own trials, which the pilot has not used. Returns the number of failures and the number of trials.
 
     It stops as soon as too many trials have failed.
@@ -153,23 +158,23 @@ def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
 class _Pilot:
     """The search for a level. It saves trials by assuming that a trial that succeeds also succeeds at all lower levels.
 
-    If this is wrong, the level is less accurate. The fresh trials do not rely on the assumption.
+    If this is wrong, the level is less accurate. The test's own trials do not rely on the assumption.
     """
 
     def __init__(self, runs: Runs, test: LevelTest) -> None:
         self.runs, self.test, self.simulated = runs, test, 0
-        self._good = np.full(test.trials, -np.inf)  # the largest level at which each trial has succeeded
-        self._bad = np.full(test.trials, np.inf)  # the smallest level at which each trial has failed
+        self._succeeded = np.full(test.trials, -np.inf)  # the largest level at which each trial has succeeded
+        self._failed = np.full(test.trials, np.inf)  # the smallest level at which each trial has failed
 
     def failures(self, level: float, trials: int) -> int:
         """Number of failures at a level among the first `trials` trials."""
-        unknown = np.flatnonzero((self._good[:trials] < level) & (self._bad[:trials] > level))
+        unknown = np.flatnonzero((self._succeeded[:trials] < level) & (self._failed[:trials] > level))
         for first in range(0, len(unknown), BATCH):
             numbers = unknown[first : first + BATCH]
             succeeded = self.runs(level, numbers)
-            self._good[numbers[succeeded]], self._bad[numbers[~succeeded]] = level, level
+            self._succeeded[numbers[succeeded]], self._failed[numbers[~succeeded]] = level, level
         self.simulated += len(unknown)
-        return int(np.sum(self._bad[:trials] <= level))
+        return int(np.sum(self._failed[:trials] <= level))
 
     def level(self, guess: float, largest: float) -> float:
         """The largest level that seems to pass; 0 if there is none.
@@ -177,37 +182,38 @@ class _Pilot:
         A few trials find the rough level, then all trials run there. At lower levels only the trials that failed run
         again.
         """
-        test = self.test
-        few = min(FEW, test.trials)
-        allowed = max(int(np.ceil(2 * test.aim * few / test.trials)), 2 if few < test.trials else test.aim)
-        high = self._last(lambda level: self.failures(level, few) <= allowed, guess, largest, factor=2.0)
-        if high == 0:
-            return 0.0
-        return self._last(lambda level: self.failures(level, test.trials) <= test.aim, high, largest, factor=1.2)
+        all_trials, allowed = self.test.trials, self.test.pilot_failures
+        few = min(COARSE_TRIALS, all_trials)
+        of_few = max(int(np.ceil(2 * allowed * few / all_trials)), 2 if few < all_trials else allowed)
+        rough = self._largest_with(of_few, few, guess, largest, factor=2.0)
+        return 0.0 if rough == 0 else self._largest_with(allowed, all_trials, rough, largest, factor=1.2)
 
-    @staticmethod
-    def _last(good: Callable[[float], bool], guess: float, largest: float, *, factor: float) -> float:
-        """The largest good level, by steps of the factor and bisection; 0 if none is found."""
+    def _largest_with(self, allowed: int, trials: int, guess: float, largest: float, *, factor: float) -> float:
+        """The largest level with at most the allowed failures, by steps of the factor and bisection; 0 if none."""
+
+        def passes(level: float) -> bool:
+            return self.failures(level, trials) <= allowed
+
         low = high = guess
-        if good(guess):
+        if passes(guess):
             while low < largest:
                 high = min(factor * low, largest)
-                if not good(high):
+                if not passes(high):
                     break
                 low = high
             else:
                 return largest
         else:
-            for _ in range(HALVINGS):
+            for _ in range(MOST_STEPS_DOWN):
                 low = high / factor
-                if good(low):
+                if passes(low):
                     break
                 high = low
             else:
                 return 0.0
-        while high > NEAR * low:
+        while high > PILOT_ACCURACY * low:
             middle = float(np.sqrt(low * high))
-            low, high = (middle, high) if good(middle) else (low, middle)
+            low, high = (middle, high) if passes(middle) else (low, middle)
         return low
 
 
@@ -256,7 +262,7 @@ def funnel(
     Raises:
       KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
     """
-    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
+    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
     plan, policy, tell = solution.trajectory, solution.policy, progress or (lambda done, total, text: None)
     space = policy.state_coordinates
     starts, names, test = level_test(
@@ -267,14 +273,16 @@ def funnel(
     for knot in starts:
         if flat(shapes[knot]):
             raise InputError(f"shape: got an ellipsoid that is flat at knot {knot}, want other knots, states or shape")
+    # Errors of the start must be zero here; others are refused.
+    acting = (disturbance for disturbance in runner.disturbances if not isinstance(disturbance, InitialStateError))
     none = np.zeros(len(starts), dtype=np.int64)
     family = "cost_to_go" if shape is None else "tube" if isinstance(shape, Tube) else "given"
     blank = Funnel(
         plan=plan, state_coordinates=space, control_coordinates=policy.control_coordinates, states=names, shape=shapes,
         family=family, knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
         reasons=("",) * len(starts), simulated=0, policy_digest=runner.law.digest, goal_radius=runner.radius,
-        disturbances=runner.described, versions=versions(), rate=rate, confidence=confidence, seed=seed,
-        options={"failures": failures, "largest": largest},
+        disturbances=tuple(disturbance.describe(plant) for disturbance in acting), versions=versions(), rate=rate,
+        confidence=confidence, seed=seed, options={"failures": failures, "largest": largest},
     )  # fmt: skip
     levels: list[FoundLevel] = []
 
@@ -294,8 +302,10 @@ def funnel(
         run = 0
         for done, knot in enumerate(starts):
             last = f", level {levels[-1].level:.3g} at the one before" if levels else ""
-            guess = _reach(plant, space.position, chosen, shapes[knot])
-            end = min(_half_turn(solution, chosen, shapes[knot]), guess * FAR if largest is None else largest)
+            guess = _radius_level(plant, space.position, chosen, shapes[knot])
+            highest = min(
+                _half_turn_level(solution, chosen, shapes[knot]), guess * LEVEL_RANGE if largest is None else largest
+            )
 
             def runs(
                 level: float, numbers: npt.NDArray[np.intp], knot: int = knot, done: int = done, last: str = last
@@ -303,10 +313,9 @@ def funnel(
                 nonlocal run
                 tell(done, len(starts), f"trying level {level:.3g} at knot {knot}{last}; {run:,} trials")
                 run += len(numbers)
-                points = points_of(numbers, seed, len(chosen))
-                return runner.reached(blank.states_at(knot, points, level), knot, seed, numbers)
+                return runner.reached(blank, knot, level, numbers)
 
-            levels.append(find_level(runs, test, guess=guess, largest=end, rate=rate))
+            levels.append(find_level(runs, test, guess=guess, largest=highest, rate=rate))
         tell(len(starts), len(starts), f"level {levels[-1].level:.3g} at knot {starts[-1]}; {run:,} trials")
     return so_far()
 
@@ -377,7 +386,7 @@ def check_funnel(
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
       seed: seed of all random numbers; it must differ from the funnel's, because the trials must be new.
     """
-    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
+    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
         raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
     between = check_array("between", between, (2,)).tolist()
@@ -385,16 +394,12 @@ def check_funnel(
         raise InputError(f"between: got {excerpt(between)}, want two shares of the level, in order, from 0 on")
     if seed == funnel.seed:
         raise InputError(f"seed: got {seed}, the funnel's own, want another one, for new trials")
-    checks, size = [], len(funnel.states)
+    checks = []
     for knot, level in zip(funnel.knots.tolist(), funnel.levels.tolist(), strict=True):
         if level == 0:
             continue
-        parts = []
-        for first in range(0, trials, BATCH):
-            numbers = np.arange(first, min(first + BATCH, trials))
-            starts = funnel.states_at(knot, points_of(numbers, seed, size, between), level)
-            parts.append(runner.reached(starts, knot, seed, numbers))
-        reached = np.concatenate(parts)
+        batches = (np.arange(first, min(first + BATCH, trials)) for first in range(0, trials, BATCH))
+        reached = np.concatenate([runner.reached(funnel, knot, level, numbers, between) for numbers in batches])
         checks.append(FunnelCheck(knot, level, rate_of(int(reached.sum()), trials), reached))
     return tuple(checks)
 
@@ -402,39 +407,40 @@ def check_funnel(
 def points_of(numbers: npt.NDArray[np.intp], seed: int, size: int, between: tuple[float, float] = (0.0, 1.0)) -> Array:
     """A point for each trial from its own random stream, uniform by volume between two balls about 0, (K, size)."""
     points = np.empty((len(numbers), size))
-    low, high = (share**size for share in between)
+    low, high = (radius**size for radius in between)
     for row, trial in enumerate(numbers.tolist()):
-        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, DRAWN))))
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, START_STREAM))))
         direction = rng.standard_normal(size)
         points[row] = direction / np.linalg.norm(direction) * (low + (high - low) * rng.random()) ** (1 / size)
     return points
 
 
 class _Trials:
-    """Runs trials from states at a knot; see `simulate_from`."""
+    """Runs trials of a seed from states in the ellipsoids of a funnel; see `simulate_from`."""
 
     def __init__(
         self, plant: Plant, solution: Solution, disturbances: Sequence[Disturbance | Noise],
-        controller: ControllerLike | None, near: tuple[float | None, float | None], threads: int | None,
+        controller: ControllerLike | None, goal: tuple[float | None, float | None], threads: int | None, seed: int,
     ) -> None:  # fmt: skip
-        self.plant, self.solution = plant, solution
+        self.plant, self.solution, self.seed = plant, solution, seed
         self.law, _ = as_controller(controller, solution, plant.robot.dynamics)
         self.disturbances = as_disturbances(disturbances)
         # The tolerance of a goal without a position is relative to the range of the whole plan, not of its rest.
         self.target = Target(solution.policy.state_coordinates, solution.goal, solution.trajectory.states)
-        self.radius = self.target.radius(plant.robot.radius, *near)
-        self.options: Mapping[str, Any] = {"goal_radius": near[0], "goal_tolerance": near[1], "frames": False,
+        self.radius = self.target.radius(plant.robot.radius, *goal)
+        self.options: Mapping[str, Any] = {"goal_radius": goal[0], "goal_tolerance": goal[1], "frames": False,
                                            "contacts": False, "threads": check_threads(threads)}  # fmt: skip
 
-    @property
-    def described(self) -> tuple[str, ...]:
-        """The disturbances that act, in words. Errors of the start must be zero here; others are refused."""
-        acting = (disturbance for disturbance in self.disturbances if not isinstance(disturbance, InitialStateError))
-        return tuple(disturbance.describe(self.plant) for disturbance in acting)
+    def reached(
+        self, funnel: Funnel, knot: int, level: float, numbers: npt.NDArray[np.intp],
+        between: tuple[float, float] = (0.0, 1.0),
+    ) -> npt.NDArray[np.bool_]:  # fmt: skip
+        """Whether the trials with these numbers (K,) reach the goal, (K,); they begin at a knot of the funnel.
 
-    def reached(self, states: Array, knot: int, seed: int, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-        """Whether the trials with these numbers (K,), begun in the states (K, n), reach the goal, (K,)."""
-        streams = seeded(seed)
+        Their states are uniform by volume between two multiples of the level.
+        """
+        states = funnel.states_at(knot, points_of(numbers, self.seed, len(funnel.states), between), level)
+        streams = seeded(self.seed)
         run = simulate_from(
             self.plant, self.solution, states, knot=knot, disturbances=self.disturbances, controller=self.law,
             generators=lambda trial, stream: streams(int(numbers[trial]), stream), **self.options,
@@ -453,8 +459,9 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
     if shape is None:
         if solution.cost_to_go is None:
             raise InputError(f"shape: got none and no cost-to-go ({solution.status.name}), want shape=")
-        curve = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
-        return np.array([_inverse(hessian) for hessian in curve])
+        hessians = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
+        inverses = [np.zeros_like(hessian) if flat(hessian) else inverse_of(hessian) for hessian in hessians]
+        return np.array([0.5 * (inverse + inverse.T) for inverse in inverses])
     if isinstance(shape, Tube):
         if not np.array_equal(shape.plan.states, plan.states):
             raise InputError("shape: got a tube of another plan, want a tube of the solution")
@@ -464,29 +471,21 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
     return np.broadcast_to(check_symmetric("shape", covariance), (knots, n, n))[:, chosen][:, :, chosen]
 
 
-def _inverse(curve: Array) -> Array:
-    """Inverse of a Hessian (d, d); zero if it does not describe an ellipsoid."""
-    if flat(curve):
-        return np.zeros_like(curve)
-    inverse = inverse_of(curve)
-    return 0.5 * (inverse + inverse.T)
-
-
-def _reach(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Array) -> float:
+def _radius_level(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Array) -> float:
     """The level at which the position deviates by the robot's radius; 1 without a position or a radius."""
     rows = [chosen.index(i) for i in position if i in chosen]
     widest = float(np.sqrt(max((shape[i, i] for i in rows), default=0.0)))
     return plant.robot.radius / widest if widest > 0 and plant.robot.radius > 0 else 1.0
 
 
-def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
+def _half_turn_level(solution: Solution, chosen: list[int], shape: Array) -> float:
     """The level at which an angle deviates by half a turn; a larger ellipsoid contains some states twice."""
     space = solution.policy.state_coordinates
     turning = [[i, i + 1, i + 2] for i in space.rotation_vectors]
     groups = [[i] for i in space.angles] + [[i for i in rotation if i not in space.angles] for rotation in turning]
-    end = np.inf
+    levels = [np.inf]
     for group in groups:
         rows = [chosen.index(i) for i in group if i in chosen]
         if rows:
-            end = min(end, np.pi / float(np.sqrt(np.linalg.eigvalsh(shape[np.ix_(rows, rows)])[-1])))
-    return end
+            levels.append(np.pi / float(np.sqrt(np.linalg.eigvalsh(shape[np.ix_(rows, rows)])[-1])))
+    return min(levels)
