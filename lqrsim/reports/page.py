@@ -1,7 +1,6 @@
 """The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
 
 import base64
-import contextlib
 import json
 import os
 import tempfile
@@ -15,7 +14,6 @@ from typing import Annotated, Any
 
 import jinja2
 import numpy as np
-from matplotlib.axes import Axes
 from PIL import Image
 
 from lqrsim.annotations import Bounds, Progress, checked
@@ -43,31 +41,8 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 Curves = Mapping[str, Mapping[float, Array]]  # policy -> strength -> low, middle and high
 
 
-def plot_success(curves: Curves, path: Path) -> Path:
-    """Write a figure of each policy's success in percent over strength, with a band; returns its path."""
-    with _over_strength(curves, path, "trials that reached their goal (%)") as axes:
-        axes.set(ylim=(-3, 103), yticks=np.linspace(0, 100, 6))
-    return path
-
-
-def plot_errors(curves: Curves, path: Path, *, label: str) -> Path:
-    """Write a figure of three quantiles over strength for each policy; logarithmic if they span decades."""
-    disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
-    known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
-    decades = len(known) > 0 and known.max() > 100 * known.min()
-    if decades:  # undisturbed errors are tiny, and would take up most of a logarithmic axis
-        curves = {name: {at: band for at, band in curve.items() if at > 0} for name, curve in curves.items()}
-    with _over_strength(curves, path, label) as axes:
-        if decades:
-            axes.set_yscale("log")
-        else:
-            axes.set_ylim(bottom=0)
-    return path
-
-
-@contextlib.contextmanager
-def _over_strength(curves: Curves, path: Path, label: str) -> Iterator[Axes]:
-    """A figure of curves of policies over strength, which get ticks and a legend when the block ends."""
+def plot_curves(curves: Curves, path: Path, label: str, **scale: Any) -> Path:
+    """Write a figure of a band over strength for each policy, with these properties of its vertical axis."""
     with style.figure(path, size=SIZE) as figure:
         axes = figure.add_subplot()
         axes.set(xlabel="strength", ylabel=label)
@@ -82,22 +57,33 @@ def _over_strength(curves: Curves, path: Path, label: str) -> Iterator[Axes]:
                 strengths, value, linestyle=line, color=colour, marker=marker, markersize=3 + 1.3 * wide,
                 linewidth=0.8 + 0.4 * wide, markerfacecolor="white", label=policy, clip_on=False,
             )  # fmt: skip
-        yield axes
+        axes.set(**scale)
         ticks = sorted({round(float(x), 12) for of_strength in curves.values() for x in of_strength})
         if len(ticks) <= 8:
             axes.set_xticks(ticks)
         axes.margins(x=0.02)
         figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=min(len(curves), 4), handlelength=3)
         figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * -(-len(curves) // 4)))
+    return path
 
 
-Trials = list[analysis.Trial]
+def plot_errors(curves: Curves, path: Path, label: str) -> Path:
+    """Write a figure of three quantiles over strength for each policy; logarithmic if they span decades."""
+    disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
+    known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
+    if not len(known) or known.max() <= 100 * known.min():
+        return plot_curves(curves, path, label, ylim=(0, None))
+    # Undisturbed errors are tiny, and would take up most of a logarithmic axis.
+    curves = {name: {at: band for at, band in curve.items() if at > 0} for name, curve in curves.items()}
+    return plot_curves(curves, path, label, yscale="log")
+
+
 LARGEST = 1_500_000  # bytes, largest video
 SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
 FPS = 15
 
 
-def videos_of_worst(results: Results, worst: Sequence[Trials], count: int, folder: Path) -> Iterator[Any]:
+def videos_of_worst(results: Results, worst: Sequence[list[analysis.Trial]], count: int, folder: Path) -> Iterator[Any]:
     """A remark on all videos, and then each video."""
     first = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
     chosen, problem = [trial for trial in first if trial is not None][:count], ""
@@ -193,7 +179,7 @@ def report(
 
 
 def _text_and_tables(
-    results: Results, table: analysis.Table, worst: Sequence[Trials], scenario: Scenario
+    results: Results, table: analysis.Table, worst: Sequence[list[analysis.Trial]], scenario: Scenario
 ) -> dict[str, Any]:
     campaign, unit = results.campaign, tracking_unit(scenario.problem.dynamics.state_coordinates)
     finished = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
@@ -275,13 +261,13 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
     policies = list(dict.fromkeys(cell.policy for cell in table if cell.sweep == name))
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     curves = {policy: analysis.degradation(table, policy, name) for policy in policies}
-    shares, errors = dict[str, dict[float, Array]](), dict[str, dict[float, Array]]()
+    rates, errors = dict[str, dict[float, Array]](), dict[str, dict[float, Array]]()
     for policy, points in curves.items():
         bands = [(point.cell.strength, point.band) for point in points]
-        shares[policy] = {at: 100 * np.array([band.low, band.value, band.high]) for at, band in bands}
+        rates[policy] = {at: 100 * np.array([band.low, band.value, band.high]) for at, band in bands}
         errors[policy] = {point.cell.strength: analysis.quantiles(table[point.cell], "rms") for point in points}
 
-    def told(curves: Curves, spec: str, unit: str = "") -> str:
+    def in_words(curves: Curves, spec: str, unit: str = "") -> str:
         """The middles of curves, in words."""
         texts = {name: [f"{curve[at][1]:{spec}}{unit} at {at:g}" for at in curve] for name, curve in curves.items()}
         return "; ".join(f"{name}: {', '.join(middles)}" for name, middles in texts.items())
@@ -291,15 +277,21 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
         "words": _describe(campaign.sweeps[name], scenario),
         "figures": [
             _picture(
-                plot_success(shares, folder / "success.png"),
+                plot_curves(
+                    rates,
+                    folder / "success.png",
+                    "trials that reached their goal (%)",
+                    ylim=(-3, 103),
+                    yticks=np.linspace(0, 100, 6),
+                ),
                 caption="Trials that reached their goal over the strength of the disturbances, 95 % bands.",
-                alt=f"Success over strength. {told(shares, '.0f', ' %')}.",
+                alt=f"Success over strength. {in_words(rates, '.0f', ' %')}.",
             ),
             _picture(
-                plot_errors(errors, folder / "errors.png", label=f"tracking error, rms ({unit})"),
+                plot_errors(errors, folder / "errors.png", f"tracking error, rms ({unit})"),
                 caption="Root mean square of a trial's distance from the plan, until it ends or collides: median, and"
                 " from 5 to 95 % of the trials.",
-                alt=f"Median tracking error ({unit}) over strength. {told(errors, '.2g')}.",
+                alt=f"Median tracking error ({unit}) over strength. {in_words(errors, '.2g')}.",
             ),
         ],
         "success": success_table(name, curves),
@@ -342,11 +334,10 @@ def breaks_table(table: analysis.Table) -> PageTable:
     return PageTable("Where policies break", ("policy", "sweep", "at strength", "success there"), rows)
 
 
-def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
-    """A number with its interval, if the interval has a width."""
-    if one.low == one.high:
-        return f"{scale * one.value:.1f}{unit}"
-    return f"{scale * one.value:.1f} ({scale * one.low:.1f} to {scale * one.high:.1f}){unit}"
+def _percent(rate: Estimate, unit: str = " %") -> str:
+    """A rate with its interval, if the interval has a width."""
+    interval = "" if rate.low == rate.high else f" ({100 * rate.low:.1f} to {100 * rate.high:.1f})"
+    return f"{100 * rate.value:.1f}{interval}{unit}"
 
 
 def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
@@ -383,13 +374,12 @@ def failure_table(table: analysis.Table) -> PageTable:
         hit = [f"{obstacle} {count}" for (_, obstacle), count in modes.items() if obstacle]
         more = f", and {len(hit) - 4} more" if len(hit) > 4 else ""
         if modes:
-            rows.append([*_cell_names(cell), str(len(outcomes)), *map(str, counts), ", ".join(hit[:4]) + more])
+            rows.append([
+                cell.policy, cell.sweep, f"{cell.strength:g}", str(len(outcomes)), *map(str, counts),
+                ", ".join(hit[:4]) + more,
+            ])  # fmt: skip
     head = ("policy", "sweep", "strength", "trials", *kinds, "collided with")
     return PageTable("Failures by how they ended, and the obstacles that were hit most", head, rows)
-
-
-def _cell_names(cell: Cell) -> list[str]:
-    return [cell.policy, cell.sweep, f"{cell.strength:g}"]
 
 
 def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]:
@@ -412,7 +402,7 @@ def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]
     return [PageTable(sweep, head, rows) for sweep, rows in tables.items()]
 
 
-def worst_trials(table: analysis.Table) -> list[Trials]:
+def worst_trials(table: analysis.Table) -> list[list[analysis.Trial]]:
     """The worst trials of each policy and sweep, by breaking strength, alternating between policies."""
     order = [(point.policy, point.sweep) for point in analysis.breaks(table, below=BROKEN_BELOW)]
     turns = zip_longest(*([group for group in order if group[0] == policy] for policy in policies(table)))
@@ -424,12 +414,12 @@ def worst_trials(table: analysis.Table) -> list[Trials]:
     ]
 
 
-def worst_table(worst: Sequence[Trials], unit: str) -> PageTable:
+def worst_table(worst: Sequence[list[analysis.Trial]], unit: str) -> PageTable:
     """The worst trials of each policy and sweep; `unit` is the unit of tracking errors."""
     rows = [
         [
-            *_cell_names(trial.cell), str(trial.trial), trial.outcome, trial.obstacle, f"{trial.ended:.2f}",
-            f"{trial.clearance:.3f}", f"{trial.worst:.3f}",
+            trial.cell.policy, trial.cell.sweep, f"{trial.cell.strength:g}", str(trial.trial), trial.outcome,
+            trial.obstacle, f"{trial.ended:.2f}", f"{trial.clearance:.3f}", f"{trial.worst:.3f}",
         ]
         for trials in worst
         for trial in trials
@@ -447,10 +437,10 @@ def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) 
     strengths = sorted({point.cell.strength for point in points})
     of_cell = {(point.cell.policy, point.cell.strength): point for point in points}
 
-    def share(point: analysis.Success | None) -> str:
+    def entry(point: analysis.Success | None) -> str:
         if point is None:
             return "not run"
         return f"{point.reached}/{point.trials}, {'deterministic: 1 run' if point.alike else _percent(point.exact)}"
 
-    rows = [[f"{s:g}", *(share(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
+    rows = [[f"{s:g}", *(entry(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
     return PageTable(f"{sweep}: trials that reached their goal", ("strength", *curves), rows)
