@@ -21,7 +21,7 @@ from lqrsim.cli import main
 from lqrsim.commands.options import stated
 from lqrsim.commands.reliability import Break, Rare
 from lqrsim.scenarios.solutions import remarks
-from lqrsim.stress.policies import solve
+from lqrsim.stress.policies import solve_policies
 from lqrsim.verify.checks import ran_policy_of
 from lqrsim.view import viewer
 
@@ -168,7 +168,7 @@ def test_the_other_commands_run_it_too(
 
 def test_a_solution_of_ilqr_is_that_of_the_policy_ilqr(differential_drive: ls.Scenario) -> None:
     begun = ls.ilqr(differential_drive.problem, max_iterations=3)
-    found = solve(("smooth", "ilqr"), differential_drive, given=begun)
+    found = solve_policies(("smooth", "ilqr"), differential_drive, given=begun)
     np.testing.assert_array_equal(found["ilqr"].trajectory.states, begun.trajectory.states)
     np.testing.assert_array_equal(
         found["smooth"].trajectory.states, ls.smooth(differential_drive.problem).trajectory.states

@@ -160,7 +160,7 @@ def test_an_mjcf_is_certified_and_stressed_without_naming_it_again(
     assert "as certified, to the last bit" in capsys.readouterr().out
     results = ls.stress.Results(tmp_path / "run")
     assert "--scenario" not in (*report, *results.command_of("report").split())
-    assert results.resolved.problem.digest == problem.resolved.problem.digest
+    assert results.campaign.resolved.problem.digest == problem.resolved.problem.digest
 
 
 def test_solve_and_simulate_on_the_command_line(

@@ -60,7 +60,7 @@ def test_printed_commands_run_as_printed(
     printed = sorted(set(re.findall(r"<code>(lqrsim .*?)</code>", page)))
     results = Results(folder, scenario=reference)
     roundabout = Path("runs") / ".." / ".." / elsewhere.name / "own file.py:shorter,steps=8"
-    assert Results(folder, scenario=str(roundabout)).resolved.problem.steps == 8
+    assert Results(folder, scenario=str(roundabout)).campaign.resolved.problem.steps == 8
     with pytest.raises(ls.InputError, match=r"which .* was run on"):
         Results(folder, scenario="../own file.py:shorter,steps=8")
     assert results.command in printed

@@ -146,7 +146,7 @@ class Export:
             )
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
             named = self.scenario or results.manifest["campaign"]["scenario"]
-            _ = results.resolved  # raises an exception if that is code which was not named
+            _ = results.campaign  # raises an exception if that is code which was not named
         else:
             if self.cell:
                 raise ls.InputError(f"--cell: got {self.cell[0]} with {self.source}, want the folder of a stress test")

@@ -108,7 +108,7 @@ def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.
         first = next((point for point in points if point.exact.high < below), None)
         strength, exact = (None, None) if first is None else (first.cell.strength, first.exact)
         breaking_points.append(BreakingPoint(policy, sweep, below, strength, exact))
-    return sorted(breaking_points, key=lambda one: np.inf if one.strength is None else one.strength)
+    return sorted(breaking_points, key=lambda point: np.inf if point.strength is None else point.strength)
 
 
 @dataclass(frozen=True)
@@ -162,17 +162,18 @@ def compared(
     return compared
 
 
-def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes, *, paired: bool) -> Comparison:
-    rates, rms, both, only_first, only_second = (success(first, one), success(second, other)), None, 0, None, None
+def _compared(first: Cell, second: Cell, of_first: Outcomes, of_second: Outcomes, *, paired: bool) -> Comparison:
+    rates = success(first, of_first), success(second, of_second)
+    rms, both, only_first, only_second = None, 0, None, None
     if paired:
-        if not np.array_equal(one.trial, other.trial):
+        if not np.array_equal(of_first.trial, of_second.trial):
             raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
-        pairs = statistics.compare(succeeded(one), succeeded(other))
+        pairs = statistics.compare(succeeded(of_first), succeeded(of_second))
         only_first, only_second, p_value = pairs.only_first, pairs.only_second, pairs.p_value
-        difference = statistics.paired_difference(only_first, only_second, len(one))
-        joint = succeeded(one) & succeeded(other)
+        difference = statistics.paired_difference(only_first, only_second, len(of_first))
+        joint = succeeded(of_first) & succeeded(of_second)
         both = int(joint.sum())
-        rms = statistics.mean(one.rms[joint] - other.rms[joint]) if both > 1 else None
+        rms = statistics.mean(of_first.rms[joint] - of_second.rms[joint]) if both > 1 else None
     else:
         difference, p_value = statistics.independent_difference(*((rate.reached, rate.trials) for rate in rates))
     if all(rate.alike for rate in rates):  # the difference of two runs
@@ -241,4 +242,4 @@ def worst(table: Table, count: Count = 10) -> list[Trial]:
                 *(float(values[row]) for values in (outcomes.ended, outcomes.clearance, outcomes.worst)),
             )
             ranked.append((tuple(float(key[row]) for key in keys), trial))
-    return [trial for _, trial in sorted(ranked, key=lambda one: one[0])[:count]]
+    return [trial for _, trial in sorted(ranked, key=lambda pair: pair[0])[:count]]

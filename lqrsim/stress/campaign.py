@@ -139,8 +139,9 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
-    fixed = {(cell.sweep, cell.strength): True for cell in campaign.cells}
-    for cell in campaign.cells:
+    deterministic = list[tuple[str, float]]()
+    for cell in {(cell.sweep, cell.strength): cell for cell in campaign.cells}.values():
+        drew_nothing = True
         for disturbance in campaign.disturbances(cell):
             generator = np.random.default_rng(campaign.seed)
             untouched, known = generator.bit_generator.state, _is_packaged(type(disturbance))
@@ -152,7 +153,9 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
             except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
                 _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
                 known = False
-            fixed[cell.sweep, cell.strength] &= known and generator.bit_generator.state == untouched
+            drew_nothing &= known and generator.bit_generator.state == untouched
+        if drew_nothing:
+            deterministic.append((cell.sweep, cell.strength))
     if {*policies.DESIGNED} & {*campaign.policies}:
         policies.design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
@@ -163,7 +166,7 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
-    return [pair for pair, drew_nothing in fixed.items() if drew_nothing]
+    return deterministic
 
 
 def _is_packaged(kind: type[Disturbance]) -> bool:
@@ -185,7 +188,7 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         _check_same_campaign(specification, files.read_manifest(folder), folder)
         return
     design, hashes = campaign.design_disturbances, {}
-    solutions = policies.solve(campaign.policies, scenario, design, given)
+    solutions = policies.solve_policies(campaign.policies, scenario, design, given)
     for policy in {*policies.DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
         policies.make_controller(policies.POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
     for policy, solution in solutions.items():

@@ -211,31 +211,20 @@ class RareFailures:
         done, requested = len(self.splitting.repetitions), self.options["repetitions"]
         return f"after {done} of {requested} repetitions" if done < requested else ""
 
-    @property
-    def plain_trials(self) -> float | None:
-        """Number of plain trials with the same standard error; None if all repetitions agree."""
-        plain = self.splitting.plain_trials
-        return plain if np.isfinite(plain) else None
-
     def summary(self) -> str:
         """The probability with its interval; the number of simulated trials; what splitting may miss; if stopped."""
-        lines = [self.splitting.summary()]
-        if self._may_miss:
-            lines.append(
-                f"splitting may miss failures by draws with few values, as of {self._may_miss}; rare_failures(keep=0)"
-                " counts failures"
-            )
-        return "\n".join([f"stopped {self.stopped}", *lines] if self.stopped else lines)
-
-    __str__ = summary
-
-    @property
-    def _may_miss(self) -> str:
-        """The disturbances whose draws have few values, if there were levels between no failure and failures."""
-        score = self.problem.score
+        score, lines = self.problem.score, [f"stopped {self.stopped}"] if self.stopped else []
+        lines.append(self.splitting.summary())
         drawn = zip(self.problem.disturbances, score.sizes, strict=True)
         few = [disturbance.describe(score.plant) for disturbance, size in drawn if disturbance.discrete and size]
-        return "; ".join(few) if len(self.splitting.levels) > 1 else ""
+        if few and len(self.splitting.levels) > 1:
+            lines.append(
+                f"splitting may miss failures by draws with few values, as of {'; '.join(few)}; rare_failures(keep=0)"
+                " counts failures"
+            )
+        return "\n".join(lines)
+
+    __str__ = summary
 
     @checked
     def typical(self, count: Count = 8) -> Array:
@@ -265,9 +254,8 @@ class RareFailures:
         findings = {
             "probability": estimate.value, "low": estimate.low, "high": estimate.high,
             "confidence": estimate.confidence, "standard_error": result.standard_error,
-            "repetitions": result.repetitions.tolist(),
-            "levels": result.levels.tolist(), "moves": result.step_sizes.tolist(), "simulations": result.simulations,
-            "plain_trials": self.plain_trials, "failures": len(result.scores),
+            "repetitions": result.repetitions, "levels": result.levels, "moves": result.step_sizes,
+            "simulations": result.simulations, "plain_trials": result.plain_trials, "failures": len(result.scores),
         }  # fmt: skip
         settings, score = {**self.options, "shown": shown}, self.problem.score
         write_json(self.problem, score.solution, folder / "rare.json", settings, findings, self.stopped)
@@ -347,12 +335,10 @@ def certify(
         differences += [
             f"repetition {i}: got {got!r}, want {want!r}" for i, (got, want) in enumerate(pairs) if got != want
         ]
-        ends = (
-            (estimate.value, estimate.low, estimate.high),
-            (certificate.probability, certificate.low, certificate.high),
-        )
-        if count == certified and ends[0] != ends[1]:
-            differences.append(f"probability with its interval: got {ends[0]}, want {ends[1]}")
+        got = estimate.value, estimate.low, estimate.high
+        want = certificate.probability, certificate.low, certificate.high
+        if count == certified and got != want:
+            differences.append(f"probability with its interval: got {got}, want {want}")
     return Recheck(certificate, measured, tuple(differences), changes)
 
 
@@ -406,10 +392,9 @@ class SmallestFailure:
         folder, point = check_path("folder", folder, "the path of a folder"), self.point
         findings = {
             "distance": point.distance, "first_order_probability": point.first_order_probability,
-            "history": point.history.tolist(), "left": None if np.isnan(point.remaining) else point.remaining,
-            "converged": point.converged, "simulations": self.simulations, "shares": self.shares,
-            "sizes": self.problem.score.sizes, "largest": [vars(effect) for effect in self.largest],
-            "numbers": point.numbers.tolist(),
+            "history": point.history, "left": point.remaining, "converged": point.converged,
+            "simulations": self.simulations, "shares": self.shares, "sizes": self.problem.score.sizes,
+            "largest": self.largest, "numbers": point.numbers,
         }  # fmt: skip
         score = self.problem.score
         write_json(self.problem, score.solution, folder / "break.json", self.options, findings, self.stopped)

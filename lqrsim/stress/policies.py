@@ -40,7 +40,7 @@ POLICY_KINDS = {
     "ilqr": PolicyKind(solver="ilqr"),
     "open_loop": PolicyKind(),
     "replan": PolicyKind(controller="replan"),
-    "track": PolicyKind(designed=True),  # `solve` puts the tracking law into its solution
+    "track": PolicyKind(designed=True),  # `solve_policies` puts the tracking law into its solution
     "offset_free": PolicyKind(controller="offset_free", designed=True),
     "track_per_cell": PolicyKind(controller="track", per_cell=True),
     "offset_free_per_cell": PolicyKind(controller="offset_free", per_cell=True),
@@ -78,7 +78,7 @@ def design_uncertainty(scenario: Scenario, design: Design = None) -> Uncertainty
         raise InputError(f"design_disturbances: {error}") from None
 
 
-def solve(
+def solve_policies(
     policies: Sequence[str],
     scenario: Scenario,
     design: Design = None,

@@ -17,13 +17,12 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.campaign_files import SOLUTION_FILE, Damaged, Table, digest_of_solution, read, read_manifest
 from lqrsim.stress.data_table import DataTable, Entry, fraction_format
-from lqrsim.stress.outcome_table import Outcomes
+from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
 from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.study import Campaign, Cell, Shard
@@ -65,11 +64,6 @@ class Results:
         scenario = resolve(stated["scenario"], registered_only=self._scenario is None)
         given = None if self.manifest["solution"] is None else self.folder / SOLUTION_FILE
         return Campaign.from_json(stated, scenario, given)
-
-    @property
-    def resolved(self) -> Scenario:
-        """The campaign's scenario. Raises InputError as `campaign` does."""
-        return self.campaign.resolved
 
     @cached_property
     def trials(self) -> Trials:
@@ -127,7 +121,8 @@ class Results:
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
-        lines += [*self.manifest["remarks"], *self._designs(), *self.plans(), *self.came_to_nothing(), *self.hints()]
+        designs = (f"{policy}: {text}" for policy, text in self.designs().items())
+        lines += [*self.manifest["remarks"], *designs, *self.plans(), *self.came_to_nothing(), *self.hints()]
         return "\n".join(lines)
 
     def rates(self) -> DataTable:
@@ -150,7 +145,7 @@ class Results:
         notes = [
             f"{campaign['scenario']}, seed {campaign['seed']}; success: the fraction of trials that reached the goal",
             f"low, high: exact (Clopper-Pearson) interval of {100 * CONFIDENCE:g} %; none if all trials are one run",
-            *self._designs(),
+            *(f"{policy}: {text}" for policy, text in self.designs().items()),
         ]
         if missing := sum(count for _, _, count in self.missing):
             notes.append(f"not finished: {missing} of {campaign['trials'] * len(self.cells)} trials are missing")
@@ -174,9 +169,6 @@ class Results:
             elif kind.per_cell:
                 designs[policy] = "designed anew for the disturbances of each cell, at their strength"
         return designs
-
-    def _designs(self) -> list[str]:
-        return [f"{policy}: {text}" for policy, text in self.designs().items()]
 
     def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or a diverged filter."""
@@ -325,7 +317,7 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
     """
     shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
     was = {name: column[trial - shard.first] for name, column in results.table(shard).items()}
-    now = results.trials.outcomes(again).columns()
+    now = outcomes(again, results.trials.scenario.problem).columns()
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"
         for name, value in now.items()
@@ -421,13 +413,8 @@ def _table(pairs: Sequence[analysis.Comparison], notes: Sequence[str], *, paired
     for pair in pairs:
         first, second = pair.rates
         tested = not np.isnan(pair.p_value)
-        trials: dict[str, Entry] = {"first trials": first.trials, "second trials": second.trials}
-        disagreements: dict[str, Entry] = {}
-        if paired:
-            trials, disagreements = (
-                {"trials": first.trials},
-                {"only first": pair.only_first, "only second": pair.only_second},
-            )
+        trials = {"trials": first.trials} if paired else {"first trials": first.trials, "second trials": second.trials}
+        disagreements = {"only first": pair.only_first, "only second": pair.only_second} if paired else {}
         rows.append({
             "sweep": pair.first.sweep, "strength": pair.first.strength,
             "policy": " against ".join(dict.fromkeys((pair.first.policy, pair.second.policy))), **trials,

@@ -33,7 +33,7 @@ from lqrsim.stress.policies import (
     design_disturbances,
     impossible_policies,
     make_controller,
-    solve,
+    solve_policies,
 )
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
@@ -170,7 +170,7 @@ class Study(Setup):
         design = None if design is None else design_disturbances(scenario, design)
         # Whoever has a Solution at hand knows of which problem it is.
         remark = not isinstance(self.solution, Solution)
-        solution = solve((policy,), scenario, design, self.given, remark=remark)[policy]
+        solution = solve_policies((policy,), scenario, design, self.given, remark=remark)[policy]
         controller = make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)
         plant = scenario.with_duration_of(solution).plant()
         return {"plant": plant, "solution": solution, "controller": controller, **goal}

@@ -15,7 +15,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.stress.campaign_files import Table, pack
-from lqrsim.stress.outcome_table import COLUMNS, Outcomes, outcomes
+from lqrsim.stress.outcome_table import COLUMNS, outcomes
 from lqrsim.stress.policies import POLICY_KINDS, make_controller
 from lqrsim.stress.study import Campaign, Cell, Shard
 
@@ -50,14 +50,10 @@ class Trials:
         options: dict[str, Any] = {"frames": False, "contacts": False, "threads": 1}
         first = next(iter(self.solutions.values()))
         law = make_controller("feedback", self.scenario, first)
-        self.outcomes(simulate(self.plant, first, controller=law, **options))
+        outcomes(simulate(self.plant, first, controller=law, **options), self.scenario.problem)
         filters = [cell for cell in self.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
         for cell in filters[:1]:  # its filter is also compiled
             simulate(self.plant, self.solutions[cell.policy], controller=self._controller(cell), **options)
-
-    def outcomes(self, rollout: Rollout) -> Outcomes:
-        """The outcomes of a rollout's trials, with the cost of the scenario's problem."""
-        return outcomes(rollout, self.scenario.problem)
 
     def table(self, shard: Shard, batch: int) -> Table:
         """The rows of a shard, simulated in batches. If a batch fails, its trials are run again one by one."""
@@ -74,7 +70,7 @@ class Trials:
     def _rows(self, cell: Cell, first: int, count: int) -> Table:
         try:
             rollout = self.run(cell, first, count, frames=False, contacts=False)
-            table = self.outcomes(rollout).columns()
+            table = outcomes(rollout, self.scenario.problem).columns()
         except Exception as error:  # a disturbance or a scenario may raise anything; it counts as failed trials
             return _failed_rows(first, count, format_error(error))
         reasons = np.array(rollout.reasons, dtype=np.str_)
