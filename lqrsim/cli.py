@@ -114,8 +114,11 @@ def _run(arguments: list[str]) -> int:
     try:
         if isinstance(command, str):
             raise InputError(command)
-        if not _has_folder():
-            raise InputError("working folder: got one that was removed, want one that exists: change to another")
+        try:
+            os.getcwd()
+        except OSError:
+            want = "one that exists: change to another"
+            raise InputError(f"working folder: got one that was removed, want {want}") from None
         with process.interruptible():
             try:
                 return console.run(command, NAMES[type(command)])
@@ -134,15 +137,6 @@ def _run(arguments: list[str]) -> int:
         return 2
     finally:
         logger.removeHandler(notices)
-
-
-def _has_folder() -> bool:
-    """Whether the working folder exists, to which relative paths refer."""
-    try:
-        os.getcwd()
-    except OSError:
-        return False
-    return True
 
 
 def _memory_limit() -> int:

@@ -551,7 +551,7 @@ def test_a_name_that_is_not_utf_8_is_refused_before_the_work(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lqrsim.commands.console.solve", None)
+    monkeypatch.setattr("lqrsim.commands.console.solve_and_print", None)
     assert main([*command.split(), "--out", os.fsdecode(b"b\xff")]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -679,6 +679,6 @@ def test_many_iterations_are_not_many_lines(
         return solution
 
     monkeypatch.setattr("lqrsim.scenarios.solutions.solve", solve)
-    console.solve(scenario)
+    console.solve_and_print(scenario)
     rows = [int(line.split()[0]) for line in capsys.readouterr().out.splitlines() if line.split()[0].isdecimal()]
     assert rows == [*range(1, 100), *range(100, 1000, 10), *range(1000, 2001, 100)]

@@ -92,12 +92,12 @@ def test_what_is_never_hit_gets_no_more_room(own: str, hardened: HardenedPlan) -
     search, rng = _Search(stated(own), CHANCE, {}), np.random.default_rng(3)
     names = search.names
     for _ in range(50):
-        search.near, hit = rng.uniform(1.0, 9.0, len(names)), str(rng.choice(names))
+        search.deviations, hit = rng.uniform(1.0, 9.0, len(names)), str(rng.choice(names))
         last = replace(hardened.rounds[0], hit={hit: 1.0}, strays=0.0)
         wanted = search.wanted(last)
         others = np.array(names) != hit
-        assert (wanted[others] <= search.near[others]).all()
-        assert wanted[~others] > search.near[~others]  # its measured probability is more than the request
+        assert (wanted[others] <= search.deviations[others]).all()
+        assert wanted[~others] > search.deviations[~others]  # its measured probability is more than the request
     without = ls.stress.harden(stated(f"{own},pillar=0"), **FEW, rounds=2)
     assert without.rounds[-1].cost == pytest.approx(hardened.rounds[-1].cost, rel=1e-3)
 
@@ -108,7 +108,7 @@ def test_the_room_is_that_of_the_normal_distribution(own: str, hardened: Hardene
     rng, search = np.random.default_rng(seed), _Search(stated(own), CHANCE, {})
     wrong, measured = rng.uniform(0.6, 1.5), rng.uniform(0.02, 0.08)
     count = len(search.names)
-    search.near = np.full(count, wrong * norm.isf(measured))
+    search.deviations = np.full(count, wrong * norm.isf(measured))
     first = hardened.rounds[0]
     assert first.rare is not None
     splitting = first.rare.splitting

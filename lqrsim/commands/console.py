@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import lqrsim as ls
 from lqrsim import process
@@ -35,13 +35,7 @@ _OPTIONS = {
 }
 
 
-class Runnable(Protocol):
-    """A command; `run` returns the exit code."""
-
-    def run(self) -> int: ...
-
-
-def run(command: Runnable, name: str) -> int:
+def run(command: Any, name: str) -> int:
     """Run a command. With `--json` it prints one JSON object, even for bad input, and everything else to stderr.
 
     Returns:
@@ -140,8 +134,8 @@ def keeping(write: Callable[[Any], object]) -> Iterator[None]:
         raise
 
 
-def solve(scenario: "ls.Scenario", solver: str = "smooth", **options: object) -> "ls.Solution":
-    """Solve a scenario; print iterations as they end, then the status. The options are the solver's options.
+def solve_and_print(scenario: "ls.Scenario", solver: str = "smooth", **options: object) -> "ls.Solution":
+    """Solve a scenario; print iterations as they end, then the status. The options are the solver's.
 
     Of the hundredth to the thousandth iteration every tenth is printed, then every hundredth, and so on.
     """

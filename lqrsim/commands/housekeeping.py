@@ -56,7 +56,7 @@ class Demo:
         for reference, scenario in scenarios.items():
             folder = self.out / folder_name(scenario)
             console.say(f"\n== {reference}: {scenario.summary}")
-            solution = replace(console.solve(scenario), scenario=from_anywhere(reference))
+            solution = replace(console.solve_and_print(scenario), scenario=from_anywhere(reference))
             console.save(solution, folder / "solution.npz")
             tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
             if remark:

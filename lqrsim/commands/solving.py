@@ -110,7 +110,7 @@ class Solve:
         scenario = replace(scenario, problem=problem, start=self._start(scenario))
         reference = from_anywhere(self.scenario)
         try:
-            solved = console.solve(scenario, self.solver, **options)
+            solved = console.solve_and_print(scenario, self.solver, **options)
         except KeyboardInterrupt as stop:
             if (best := getattr(stop, "solution", None)) is not None:  # a file of its own: solution.npz may be better
                 console.say(console.summary_of(best))

@@ -188,7 +188,9 @@ class View:
         else:
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
-            solution = console.solve(scenario) if self.solution is None else self._given(scenario, self.solution)
+            solution = (
+                console.solve_and_print(scenario) if self.solution is None else self._given(scenario, self.solution)
+            )
             scenario = scenario.with_duration_of(solution)
             plant = scenario.plant()
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)

@@ -81,7 +81,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
     def reset(self, *, seed: Seed | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin an episode; see the class."""
         super().reset(seed=seed)
-        episode = self._begin(seed, self.np_random, options, 1, frames=True, threads=1)
+        episode = self._begin(seed, self.np_random, options)
         return episode.observations[0], self._info(episode)
 
     def step(self, action: npt.ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -178,12 +178,11 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
     ) -> None:
         self.num_envs = num_envs
         self.task = Task(scenario, solution, disturbances, strength, actions)
-        self.single_action_space, self.single_observation_space = (
-            self.task.action_space(), self.task.observation_space(),
-        )  # fmt: skip
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._frames, self._threads = frames, threads
+        self.single_action_space = self.task.action_space()
+        self.single_observation_space = self.task.observation_space()
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._trials, self._frames, self._threads = num_envs, frames, threads
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin all episodes. Raises InputError for more than one seed, or an invalid option."""
@@ -194,8 +193,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         if mask is not None and not shaped("options: reset_mask", mask, (self.num_envs,)).all():
             raise InputError("options: reset_mask: got a part of the episodes, want all: they begin together")
         super().reset(seed=seed)
-        count, frames, threads = self.num_envs, self._frames, self._threads
-        episode = self._begin(seed, self.np_random, options, count, frames=frames, threads=threads)
+        episode = self._begin(seed, self.np_random, options)
         return episode.observations, self._info(episode)
 
     def step(self, actions: npt.ArrayLike) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:

@@ -175,6 +175,9 @@ class Resettable:
     """Base class of `Environment` and `VectorEnvironment`: a task, and its current episode."""
 
     task: Task
+    _trials: int = 1  # of an episode
+    _frames: bool = True
+    _threads: int | None = 1
     _seed: int | None = None
     _next_trial = 0
     _episode: "Episode | None" = None
@@ -187,20 +190,17 @@ class Resettable:
         """The current episode so far, as `simulate` records it, for `render`, `outcomes` and `save`."""
         return self._current().rollout()
 
-    def _begin(
-        self, seed: int | None, random: np.random.Generator, options: Any, count: int, *, frames: bool,
-        threads: int | None,
-    ) -> "Episode":  # fmt: skip
-        """Begin an episode of `count` trials: the first ones of a seed, or those after the last episode."""
+    def _begin(self, seed: int | None, random: np.random.Generator, options: Any) -> "Episode":
+        """Begin an episode: the first trials of a seed, or those after the last episode."""
         if seed is not None:
             self._seed, self._next_trial = seed, 0
         elif self._seed is None:
             self._seed = int(random.integers(2**63))
         assert self._seed is not None
         first, disturbances = self.task.trials(self._next_trial, options)
-        settings = {"seed": self._seed, "first_trial": first, "frames": frames, "threads": threads}
-        self._episode = Episode(self.task, disturbances, count, **settings)
-        self._next_trial = first + count
+        settings = {"seed": self._seed, "first_trial": first, "frames": self._frames, "threads": self._threads}
+        self._episode = Episode(self.task, disturbances, self._trials, **settings)
+        self._next_trial = first + self._trials
         return self._episode
 
     def _current(self) -> "Episode":

@@ -15,7 +15,6 @@ trials are then run, and the exact upper bound of their count decides.
 
 import os
 from dataclasses import asdict, dataclass, replace
-from itertools import count
 from math import ceil, log, log1p
 from typing import Annotated, Any
 
@@ -77,8 +76,8 @@ class HardeningRound:
         if self.rare is None:
             bound = f"none of {self.unfailing:,} trials failed, so at most {self.probability.high:.2g} of them do"
             return f"cost {self.cost:.6g}, no failure found{f': {bound}' if self.unfailing else ''}"
-        ranked = sorted(self.hit.items(), key=lambda one: -one[1])
-        parts = [f"{100 * share:.0f} % hit {name}" for name, share in ranked if share >= 0.005]
+        ranked = sorted(self.hit.items(), key=lambda hit: -hit[1])
+        parts = [f"{100 * fraction:.0f} % hit {name}" for name, fraction in ranked if fraction >= 0.005]
         parts += [f"{100 * self.strays:.0f} % leave the plan for good"] if self.strays >= 0.005 else []
         return f"cost {self.cost:.6g}, probability of failure {self.rare.probability:.2g}: {', '.join(parts)}"
 
@@ -183,18 +182,7 @@ def harden(
         particles = 250 if chance < COUNTED else max(20, ceil(FAILING / chance))
     seed = problem.seed if seed is None else seed
     options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}
-    search, say = _Search(problem, chance, options), report or (lambda line: None)
-    seeds, total = count(seed), 2 * rounds * repetitions
-
-    def measure(solution: Solution, what: str) -> RareFailures | NoFailure:
-        used = next(seeds)
-        begun = repetitions * (used - seed)
-
-        def tell(done: int, _: int, text: str) -> None:
-            if progress is not None:
-                progress(begun + done, total, f"{what}: {text}")
-
-        return search.failures(solution, used, tell)
+    search, say = _Search(problem, chance, options, progress), report or (lambda line: None)
 
     def so_far(_: object) -> HardenedPlan | None:
         return search.result(f"stopped after {len(search.rounds)} of {rounds} plans") if search.rounds else None
@@ -204,12 +192,10 @@ def harden(
             label = f"plan {len(search.rounds) + 1}"
             if not search.rounds:
                 say(replace(problem, solution=solution).summary())
-            search.add(solution, measure(solution, label))
+            search.rounds.append(search.measure(solution, label))
             say(f"{label}: {search.rounds[-1]}")
             if search.enough():
-                again = measure(solution, f"{label} again")
-                search.rounds.pop()  # only now, so that Ctrl-C keeps it
-                search.add(solution, again)
+                search.rounds[-1] = search.measure(solution, f"{label} again")
                 say(f"{label} again, with fresh random numbers: {search.rounds[-1]}")
                 if search.enough():
                     break
@@ -219,98 +205,85 @@ def harden(
 class _Search:
     """The plans so far."""
 
-    def __init__(self, problem: ReliabilityProblem, chance: float, options: dict[str, int]) -> None:
+    def __init__(
+        self, problem: ReliabilityProblem, chance: float, options: dict[str, int], progress: TextProgress | None = None
+    ) -> None:
         check_name("problem: policy", problem.policy, POLICIES)
         if problem.failure != "collision":
             raise InputError(f"problem: failure: got {problem.failure!r}, want 'collision', which more room prevents")
         scenario = problem.resolved
         if scenario.problem.duration is not None:
             raise InputError(f"problem: got {problem.scenario}, whose duration is free, want a fixed one")
-        self.asked, self.chance, self.options = problem, chance, options
-        self.scenario, self.stated, design = scenario, scenario.problem, problem.design_disturbances
+        self.problem, self.chance, self.options, self.progress = problem, chance, options, progress
+        self.scenario, design = scenario, problem.design_disturbances
         uncertainty = uncertainty_of(scenario.plant(), problem.disturbances)  # also refuses sets that there are not
         self.uncertainty = uncertainty if design is None else design_uncertainty(scenario, design)
-        self.surroundings = Surroundings.of(self.stated, self.uncertainty.obstacles)
+        self.surroundings = Surroundings.of(scenario.problem, self.uncertainty.obstacles)
         self.names = [obstacle.name for shape in self.surroundings.shapes for obstacle in shape.world.obstacles]
         self.rounds: list[HardeningRound] = []
+        self.measurements = 0
         self.ended = ""  # why there is no next plan
 
-    def law(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
-        name = self.asked.policy if self.asked.policy in DESIGNED else "feedback"
-        law = make_controller(name, self.scenario, solution, design=self.asked.design_disturbances)
+    def controller(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
+        name = self.problem.policy if self.problem.policy in DESIGNED else "feedback"
+        law = make_controller(name, self.scenario, solution, design=self.problem.design_disturbances)
         assert isinstance(law, OffsetFree | AffinePolicy)
         return law
 
     def next(self) -> Solution | None:
         """The next plan; None if there is none."""
+        stated = self.scenario.problem
         if not self.rounds:
-            return self.asked.given or self.first()
+            if self.problem.given is not None:
+                return self.problem.given
+            plan = smooth_chance_constrained(stated, self.uncertainty, chance=self.chance, controller=self.controller)
+            if not plan.solution.success:
+                got = f"{self.problem.scenario} ({plan.solution.status.name})"
+                raise InputError(f"problem: got no plan for {got}, want one that can be solved")
+            return plan.solution
         last = self.rounds[-1]
         if last.rare is None:  # nothing tells where the plan needs more room
             return None
         if not any(name in last.hit for name in self.names):
             self.ended = f"all failing runs leave the plan for good, which more room does not prevent; {REMEDY}"
             return None
-        more = self.wanted(last) - self.near
-        for share in (1.0, 0.5, 0.25):  # as much of it as there is room for
-            clearances = self.surroundings.keep_away(np.maximum(self.near + share * more, 0.0) * self.std)
-            problem = replace(self.stated, constraints=(*self.stated.constraints, *clearances))
+        more = self.wanted(last) - self.deviations
+        for fraction in (1.0, 0.5, 0.25):  # as much of it as there is room for
+            deviations = np.maximum(self.deviations + fraction * more, 0.0)
+            clearances = self.surroundings.keep_away(deviations * self.std)
+            problem = replace(stated, constraints=(*stated.constraints, *clearances))
             solution = smooth(problem, start=last.solution.trajectory)
             if solution.success:
                 return solution
         self.ended = "there is no plan with more room; allow a higher chance, or another route"
         return None
 
-    def first(self) -> Solution:
-        plan = smooth_chance_constrained(self.stated, self.uncertainty, chance=self.chance, controller=self.law)
-        if not plan.solution.success:
-            got = plan.solution.status.name
-            raise InputError(f"problem: got no plan for {self.asked.scenario} ({got}), want one that can be solved")
-        return plan.solution
-
     def wanted(self, last: HardeningRound) -> Array:
         """The numbers of standard deviations (O,) that the next plan keeps from each obstacle."""
         assert last.rare is not None
-        hit, near = np.array([last.hit.get(name, 0.0) for name in self.names]), np.maximum(self.near, 1.0)
+        hit, kept = np.array([last.hit.get(name, 0.0) for name in self.names]), np.maximum(self.deviations, 1.0)
         critical, chance = hit > 0, last.rare.probability.value
         # The runs that leave the plan for good take their part of the request.
         left = max(self.chance - chance * last.strays, 0.1 * self.chance)
         quantile = -ndtri(AIM * left / critical.sum())
         measured = -ndtri(np.clip(chance * hit[critical], 1e-300, 0.4))
-        wanted = np.minimum(near, quantile * (near[critical] / measured).max())
-        wanted[critical] = near[critical] * np.clip(quantile / measured, LESS, MORE)
+        wanted = np.minimum(kept, quantile * (kept[critical] / measured).max())
+        wanted[critical] = kept[critical] * np.clip(quantile / measured, LESS, MORE)
         return wanted
 
-    def failures(self, solution: Solution, seed: int, progress: TextProgress) -> RareFailures | NoFailure:
-        """The failures of a plan; the NoFailure if none is found, also by enough trials, unless these are too many."""
-        options: dict[str, Any] = {name: self.options[name] for name in ("particles", "repetitions")} | {"seed": seed}
-        keep = 0.0 if self.chance * options["particles"] >= FAILING else 0.1
-        problem = replace(self.asked, solution=solution)
-        try:
-            return problem.rare_failures(**options, keep=keep, progress=progress)
-        except NoFailure as none:
-            # Without a failure among so many trials, the exact upper bound is at most the chance.
-            needed = ceil(log((1 - CONFIDENCE) / 2) / log1p(-self.chance))
-            if none.trials >= needed or needed > MOST_COUNTED:
-                return none
-        options["particles"] = max(20, ceil(needed / options["repetitions"]))
-        try:
-            return problem.rare_failures(**options, keep=0.0, progress=progress)
-        except NoFailure as none:
-            return none
-
-    def add(self, solution: Solution, measured: RareFailures | NoFailure) -> None:
-        """Add a plan with its failures, and see how it fails."""
+    def measure(self, solution: Solution, label: str) -> HardeningRound:
+        """A plan with its failures. Its clearances are those from which `next` begins."""
+        measured = self._failures(solution, label)
         rare, unfailing = (None, measured.trials) if isinstance(measured, NoFailure) else (measured, 0)
-        plan, place = solution.trajectory, list(self.surroundings.place)
+        problem, plan, place = self.scenario.problem, solution.trajectory, list(self.surroundings.place)
         # Trials of the model, which take long, are needed for moments with a latency or a delay alone.
         samples = None if self.uncertainty.latency or self.uncertainty.delay else 0
-        law = self.law(self.stated, solution)
-        tube = predict_tube(self.stated, solution, self.uncertainty, law, samples=samples)
+        law = self.controller(problem, solution)
+        tube = predict_tube(problem, solution, self.uncertainty, law, samples=samples)
         spread = self.surroundings.spread(plan.states + tube.mean, tube.covariance, tube.across)
         # Least planned clearance of each obstacle in predicted standard deviations, (O,), and these, (T+1, O).
-        self.near, self.std = (spread.mean / spread.std).min(axis=0), spread.std
-        cost = float(costs_of(self.stated, plan.states[None], plan.controls[None])[0])
+        self.deviations, self.std = (spread.mean / spread.std).min(axis=0), spread.std
+        cost = float(costs_of(problem, plan.states[None], plan.controls[None])[0])
         hit, strays = dict[str, float](), 0.0
         if rare is not None:
             run = rare.problem.score.rollout(rare.typical(SHOWN), frames=False)
@@ -319,9 +292,32 @@ class _Search:
             hits = np.array(run.obstacles)[(distances <= STRAY * widest) & (np.array(run.outcome) == "collided")]
             hit = {str(name): float(np.sum(hits == name)) / run.trials for name in np.unique(hits)}
             strays = 1 - len(hits) / run.trials
-        self.rounds.append(
-            HardeningRound(solution=solution, cost=cost, rare=rare, hit=hit, strays=strays, unfailing=unfailing)
-        )
+        return HardeningRound(solution=solution, cost=cost, rare=rare, hit=hit, strays=strays, unfailing=unfailing)
+
+    def _failures(self, solution: Solution, label: str) -> RareFailures | NoFailure:
+        """The failures of a plan; the NoFailure if none is found, also by enough trials, unless these are too many."""
+        repetitions, particles = self.options["repetitions"], self.options["particles"]
+        seed, begun = self.options["seed"] + self.measurements, self.measurements * repetitions
+        self.measurements += 1
+        problem = replace(self.problem, solution=solution)
+
+        def tell(done: int, _: int, text: str) -> None:
+            if self.progress is not None:
+                self.progress(begun + done, 2 * self.options["rounds"] * repetitions, f"{label}: {text}")
+
+        options: dict[str, Any] = {"repetitions": repetitions, "seed": seed, "progress": tell}
+        keep = 0.0 if self.chance * particles >= FAILING else 0.1
+        try:
+            return problem.rare_failures(**options, particles=particles, keep=keep)
+        except NoFailure as none:
+            # Without a failure among so many trials, the exact upper bound is at most the chance.
+            needed = ceil(log((1 - CONFIDENCE) / 2) / log1p(-self.chance))
+            if none.trials >= needed or needed > MOST_COUNTED:
+                return none
+        try:
+            return problem.rare_failures(**options, particles=max(20, ceil(needed / repetitions)), keep=0.0)
+        except NoFailure as none:
+            return none
 
     def enough(self) -> bool:
         """Whether the last plan's failures are surely as rare as requested."""
@@ -349,6 +345,6 @@ class _Search:
         measured = [(plan.probability.high if plan.rare is None else plan.probability.value) for plan in self.rounds]
         chosen = int(np.argmin(measured)) if reason else len(self.rounds) - 1
         return HardenedPlan(
-            problem=self.asked, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,
+            problem=self.problem, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,
             reason=reason,
         )  # fmt: skip

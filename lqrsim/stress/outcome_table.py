@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Count, checked
-from lqrsim.errors import Array, InputError, check_shape, excerpt, keep, numbers_of
+from lqrsim.errors import Array, InputError, check_shape, excerpt, keep
 from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
@@ -38,7 +38,7 @@ class Outcomes:
       deterministic: whether the trials drew nothing, so that all are the same run.
     """
 
-    trial: npt.NDArray[np.int64]
+    trial: Annotated[npt.NDArray[np.int64], "K"]
     outcome: npt.NDArray[np.str_]
     obstacle: npt.NDArray[np.str_]
     ended: Column
@@ -55,16 +55,11 @@ class Outcomes:
     _want = "Outcomes, such as results.outcomes(cell)"
 
     def __post_init__(self) -> None:
-        trial = numbers_of("Outcomes: trial", self.trial)
-        check_shape("Outcomes: trial", trial, self.cost.shape)
-        if not ((trial >= 0) & (trial == np.floor(trial)) & (trial < 2**63)).all():
-            raise InputError(f"Outcomes: trial: got {excerpt(self.trial)}, want whole numbers >= 0")
-        keep(self, trial=trial.astype(np.int64))
         for field in ("outcome", "obstacle"):
             value, name = getattr(self, field), f"Outcomes: {field}"
             if not isinstance(value, np.ndarray) or value.dtype.kind != "U":
                 raise InputError(f"{name}: got {excerpt(value)}, want an array of texts")
-            check_shape(name, value, trial.shape)
+            check_shape(name, value, self.trial.shape)
             keep(self, **{field: value.copy()})
         if not np.isin(self.outcome, OUTCOMES).all():
             raise InputError(f"Outcomes: outcome: got {excerpt(self.outcome)}, want each one of {', '.join(OUTCOMES)}")
