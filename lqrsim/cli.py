@@ -182,10 +182,10 @@ def _parse(arguments: list[str]) -> Any:
             raise
     # The first line is the title; a rule follows it where stdout is not UTF-8. Another rule precedes the hints.
     lines = [line.strip("│╭╮╰╯ ") for line in printed.getvalue().splitlines()[1:]]
-    said = [line for line in lines if line]
-    if said and not said[0].strip("─-"):
-        del said[0]
-    text = " ".join(itertools.takewhile(lambda line: line.strip("─-"), said))
+    message = [line for line in lines if line]
+    if message and not message[0].strip("─-"):
+        del message[0]
+    text = " ".join(itertools.takewhile(lambda line: line.strip("─-"), message))
     text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
     return text or "got arguments that cannot be parsed"
 

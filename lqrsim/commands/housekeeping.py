@@ -66,8 +66,8 @@ class Demo:
             world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)
             if solution.cost_to_go is not None:
                 path = folder / "policy.png"
-                shown = {"world": world, "radius": radius, "tube": tube, "belief": belief}
-                console.wrote(ls.view.plot_policy(solution, path, **shown))
+                options = {"world": world, "radius": radius, "tube": tube, "belief": belief}
+                console.wrote(ls.view.plot_policy(solution, path, **options))
             if not solution.success:
                 failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
             runs = dict[str, ls.Rollout]()
@@ -144,7 +144,7 @@ class Cache:
             return 0
         items = disk_cache.items()
         groups = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)
-        for kind, alike in sorted(((kind, list(group)) for kind, group in groups), key=lambda one: -one[1][0].used):
+        for kind, alike in sorted(((kind, list(group)) for kind, group in groups), key=lambda pair: -pair[1][0].used):
             used = time.strftime("%Y-%m-%d %H:%M", time.localtime(alike[0].used))
             count = f" ({len(alike)} items)" if len(alike) > 1 else ""
             console.say(f"{sum(item.size for item in alike) / 1e6:8.2f} MB  last used {used}  {kind}{count}")

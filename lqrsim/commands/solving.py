@@ -129,8 +129,8 @@ class Solve:
                 console.say(remark)
             world, robot = scenario.scene.world, scenario.robot
             radius, dynamics = robot.shape.get("radius", 0.0), scenario.problem.dynamics
-            shown = {"tube": tube, "belief": dynamics if isinstance(dynamics, Belief) else None}
-            console.wrote(ls.view.plot_policy(solution, self.figure, world=world, radius=radius, **shown))
+            options = {"tube": tube, "belief": dynamics if isinstance(dynamics, Belief) else None}
+            console.wrote(ls.view.plot_policy(solution, self.figure, world=world, radius=radius, **options))
         return 0 if solution.success else 1
 
     def _start(self, scenario: "ls.Scenario") -> "StartLike":
@@ -210,8 +210,8 @@ class Simulate:
         controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
         named = [disturbance for name in self.disturbances for disturbance in disturbance_set(name, scenario)]
         disturbances = [*(disturbance.scaled(self.strength) for disturbance in named), *self._single_disturbances()]
-        plant, near = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
-        options = stated(self, ls.simulate, controller=controller, disturbances=disturbances, **near)
+        plant, goal = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
+        options = stated(self, ls.simulate, controller=controller, disturbances=disturbances, **goal)
         with console.progress("simulating", "step") as progress:
             rollout = ls.simulate(plant, solution, progress=progress, **options)
         console.say(rollout.summary())

@@ -299,6 +299,6 @@ class Episode:
         return seen
 
     def _near_plan(self, states: Array) -> Array:
-        near = np.array(states, order="C")[None]
-        turn_to_nearest(self._loop.state_coordinates, near, self._plan.states[self._loop.step][None])
-        return near[0]
+        turned = np.array(states, order="C")[None]
+        turn_to_nearest(self._loop.state_coordinates, turned, self._plan.states[self._loop.step][None])
+        return turned[0]

@@ -49,12 +49,12 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
     If a process dies, another one runs its shard again. The trials of a shard count as failed if its process dies three
     times, or if it exceeds the time limit.
     """
-    mine, alive, ending = threading.local(), set[_Worker](), threading.Event()  # mine: of this thread
+    local, alive, ending = threading.local(), set[_Worker](), threading.Event()
 
     def run(shard: Shard) -> bytes:
         died = failed_starts = 0
         while not ending.is_set():
-            worker, late = getattr(mine, "worker", None) or _Worker(job), False
+            worker, late = getattr(local, "worker", None) or _Worker(job), False
             alive.add(worker)
             if ending.is_set():  # perhaps nobody has seen that it is alive
                 worker.process.kill()
@@ -67,9 +67,9 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
                 worker.process.join(5.0)
                 reason = f"its worker ended {ATTEMPTS} times, at last with {_exit(worker.process.exitcode)}"
             else:
-                mine.worker = worker
+                local.worker = worker
                 return file
-            mine.worker = None
+            local.worker = None
             alive.discard(worker)
             worker.end()
             if worker.process.exitcode == _RUNS_THE_SCRIPT:
@@ -179,11 +179,11 @@ def _worker_environment() -> contextlib.AbstractContextManager[None]:
     Without the latter, importing MuJoCo starts a process that looks for GLFW. That process would outlive a worker that
     is stopped meanwhile, and complain that nobody reads its result.
     """
-    ours = dict.fromkeys([f"{name}_NUM_THREADS" for name in _ONE_THREAD], "1")
+    variables = dict.fromkeys([f"{name}_NUM_THREADS" for name in _ONE_THREAD], "1")
     glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)
     if glfw is not None and sys.platform != "win32":  # on Windows it starts no process
-        ours["PYGLFW_LIBRARY"] = glfw._name
-    return process.environment(**ours)
+        variables["PYGLFW_LIBRARY"] = glfw._name
+    return process.environment(**variables)
 
 
 @contextlib.contextmanager
@@ -245,8 +245,9 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
     )
     try:
         while True:
-            room = 2 * max(1, sum(client.nthreads().values())) - len(submitted)  # one running, one waiting for each
-            for shard in itertools.islice(waiting, max(0, room)):
+            # One running and one waiting for each worker.
+            free_slots = 2 * max(1, sum(client.nthreads().values())) - len(submitted)
+            for shard in itertools.islice(waiting, max(0, free_slots)):
                 submitted[client.submit(_task, job, shard, key=f"{job.run}-{shard.file}")] = shard
             if not submitted:
                 return

@@ -325,8 +325,8 @@ def certify(
         particles=certificate.particles, repetitions=count, keep=certificate.keep, seed=seed, report=report,
         progress=progress,
     )  # fmt: skip
-    fresh = f"seed {seed} (was {certificate.seed})" if seed not in (None, certificate.seed) else ""
-    changes, estimate = fresh or changed(certificate.versions), measured.probability
+    reseeded = f"seed {seed} (was {certificate.seed})" if seed not in (None, certificate.seed) else ""
+    changes, estimate = reseeded or changed(certificate.versions), measured.probability
     if changes:
         if estimate.low > certificate.high or certificate.low > estimate.high:
             differences.append(f"probability: got {estimate:.2g}, want an interval that overlaps")

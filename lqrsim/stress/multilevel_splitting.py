@@ -134,18 +134,17 @@ def failure_probability(
     done: list[tuple[Array, Array, Array]] = []
 
     def so_far() -> SplittingResult | None:
-        shares = np.array([fractions for fractions, _, _ in done])
-        if len(done) < 2 or not shares.prod(axis=1).any():
+        fractions = np.array([of_levels for of_levels, _, _ in done])
+        if len(done) < 2 or not (estimates := fractions.prod(axis=1)).any():
             return None
-        estimates = shares.prod(axis=1)
         error = float(estimates.std(ddof=1) / np.sqrt(len(done)))
         failures, scores = (np.concatenate([repetition[i] for repetition in done]) for i in (1, 2))
-        interval = _estimate(shares, particles, batches)
+        interval = _estimate(fractions, particles, batches)
         return SplittingResult(interval, error, estimates, levels, step_sizes, counted.evaluations, failures, scores)
 
     with keeping(lambda _: so_far()):
         for number, key in enumerate(keys):
-            estimates = [shares.prod() for shares, _, _ in done]
+            estimates = [fractions.prod() for fractions, _, _ in done]
             tell(number, repetitions, f"{np.mean(estimates):.2g}" if estimates else "")
             rng = np.random.default_rng(key)
             done.append(splitting.repetition(levels, step_sizes, batches, rng))
@@ -163,19 +162,19 @@ def check_keep(keep: float, particles: int) -> None:
         raise InputError(f"keep: got {keep:g}, want a finite number >= {2 / particles:g}, or 0")
 
 
-def _estimate(shares: Array, particles: int, batches: Sequence[int]) -> Estimate:
+def _estimate(fractions: Array, particles: int, batches: Sequence[int]) -> Estimate:
     """The mean of the estimates with its interval, from the fractions (R, levels) of batches of particles at levels."""
     from scipy import stats
 
-    count, levels = shares.shape
+    count, levels = fractions.shape
     if levels == 1:
         vectors = particles * batches[0]
-        return rate(round(float(shares.sum()) * vectors), count * vectors)
-    estimates = shares.prod(axis=1)
+        return rate(round(float(fractions.sum()) * vectors), count * vectors)
+    estimates = fractions.prod(axis=1)
     mean = float(estimates.mean())
     # Repetitions may agree by chance. Their spread is at least the spread of independent particles at each level.
-    reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
-    typical = shares.sum(axis=0) / reached.sum(axis=0)
+    reached = np.column_stack([np.ones(count), fractions[:, :-1]]).cumprod(axis=1) > 0
+    typical = fractions.sum(axis=0) / reached.sum(axis=0)
     least = np.sqrt(np.sum((1 - typical) / typical / np.array(batches)) / particles)
     deviation = max(estimates.std(ddof=1) / mean, least)
     half_width = float(stats.t.ppf(0.5 + CONFIDENCE / 2, count - 1) * deviation / np.sqrt(count))
@@ -245,28 +244,28 @@ class _Splitting:
         levels, step_sizes, batches = list[float](), list[float](), list[int]()
         b, enough = 0.5, min(ABOVE, int(keep * self.particles))
         while len(levels) < most_levels:
-            level, drawn = min(float(np.quantile(scores, 1 - keep, method="inverted_cdf")), 0.0), 1
+            level, batch_count = min(float(np.quantile(scores, 1 - keep, method="inverted_cdf")), 0.0), 1
             on_level(level)
             above = scores > level
             # Later vectors are copies, a few of which may always tie.
             tie = not levels and np.sum(scores == level) > 1 and above.sum() < enough
             if tie or not above.any():
                 survivors = [(vectors[above], scores[above])]
-                while sum(len(some) for _, some in survivors) < enough and drawn < MOST_BATCHES:
+                while sum(len(kept) for _, kept in survivors) < enough and batch_count < MOST_BATCHES:
                     on_level(level)
                     # As many vectors again, from the distribution above the last level.
                     vectors, scores = self.move(vectors, scores, levels[-1], b, rng) if levels else self.draw(rng)
-                    above, drawn = scores > level, drawn + 1
+                    above, batch_count = scores > level, batch_count + 1
                     survivors.append((vectors[above], scores[above]))
                 vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
             if not len(scores):
-                tied = drawn * self.particles
+                tied = batch_count * self.particles
                 raise NoFailure(
                     f"score: got scores that tie at {level:g} after {len(levels)} levels, and none of {tied:,} above"
                     " it: the score does not tell which vectors are nearer to failing",
                     0 if levels else tied,
                 )
-            batches.append(drawn)
+            batches.append(batch_count)
             if level == 0:
                 return np.array([*levels, 0.0]), np.array(step_sizes), batches
             vectors, scores = self.resample(vectors, scores, level, rng)
@@ -285,7 +284,7 @@ class _Splitting:
         self, levels: Array, step_sizes: Array, batches: Sequence[int], rng: np.random.Generator
     ) -> tuple[Array, Array, Array]:
         """The fraction above each level, 0 once no vector is left; and the failures with their scores."""
-        vectors, scores, shares = np.zeros((0, self.size)), np.zeros(0), np.zeros(len(levels))
+        vectors, scores, fractions = np.zeros((0, self.size)), np.zeros(0), np.zeros(len(levels))
         for number, level in enumerate(levels):
             survivors: list[tuple[Array, Array]] = []
             for _ in range(batches[number]):
@@ -298,7 +297,7 @@ class _Splitting:
                 above = moved_scores > level
                 survivors.append((moved[above], moved_scores[above]))
             vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
-            shares[number] = len(scores) / (self.particles * batches[number])
-            if shares[number] == 0:
+            fractions[number] = len(scores) / (self.particles * batches[number])
+            if fractions[number] == 0:
                 break
-        return shares, vectors, scores
+        return fractions, vectors, scores

@@ -116,9 +116,9 @@ class Results:
             if success is None:
                 continue
             exact, reached = success.exact, f"{success.reached}/{success.trials}"
-            share = f"{100 * exact.value:5.1f} [{100 * exact.low:5.1f}, {100 * exact.high:5.1f}]"
-            share = f"{reached:>13} {'deterministic: 1 run' if success.alike else share}"
-            line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
+            rate = f"{100 * exact.value:5.1f} [{100 * exact.low:5.1f}, {100 * exact.high:5.1f}]"
+            rate = f"{reached:>13} {'deterministic: 1 run' if success.alike else rate}"
+            line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {rate:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
@@ -202,9 +202,9 @@ class Results:
         campaign, lines = self.manifest["campaign"], []
         for policy in self.manifest["policies"]:
             solution = self.solution(policy)
-            near, radius = (campaign["goal_radius"], campaign["goal_tolerance"]), solution.goal_radius
-            if near != (None, None):
-                radius = solution.target.radius(None, *near)
+            goal_options, radius = (campaign["goal_radius"], campaign["goal_tolerance"]), solution.goal_radius
+            if goal_options != (None, None):
+                radius = solution.target.radius(None, *goal_options)
             lines += [f"{policy}: {line}" for line in solution.target.of_plan(radius)]
         return lines
 

@@ -115,12 +115,12 @@ def smooth_safest(
     compared = [ComparedPlan(start, solution, reached(solution, 0)) for start, solution in plans]
     compared.sort(key=lambda plan: (-int(plan.successes.sum()), plan.solution.cost))
     best = compared[0].solution
-    fresh = int(reached(best, trials).sum())
-    return SafestPlan(solution=best, compared=tuple(compared), reached=rate_of(fresh, trials))
+    successes = int(reached(best, trials).sum())
+    return SafestPlan(solution=best, compared=tuple(compared), reached=rate_of(successes, trials))
 
 
-def _same(one: Solution, other: Solution) -> bool:
+def _same(first: Solution, second: Solution) -> bool:
     """Whether two plans are the same within SAME."""
-    deviation = one.policy.state_coordinates.difference(one.trajectory.states, other.trajectory.states)
-    scale = np.maximum(np.ptp(other.trajectory.states, axis=0), 1e-9)
+    deviation = first.policy.state_coordinates.difference(first.trajectory.states, second.trajectory.states)
+    scale = np.maximum(np.ptp(second.trajectory.states, axis=0), 1e-9)
     return bool((np.abs(deviation) <= SAME * scale).all())

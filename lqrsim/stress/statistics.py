@@ -97,11 +97,11 @@ def paired_difference(
         # quadratic.
         linear = (2 * trials - surplus) * difference - different
         constant = -only_second * difference * (1 - difference)
-        share = (np.sqrt(max(linear**2 - 8 * trials * constant, 0.0)) - linear) / (4 * trials)
-        variance = trials * max(2 * share + difference * (1 - difference), 0.0)
+        fraction = (np.sqrt(max(linear**2 - 8 * trials * constant, 0.0)) - linear) / (4 * trials)
+        variance = trials * max(2 * fraction + difference * (1 - difference), 0.0)
         return bool((surplus - trials * difference) ** 2 <= z * z * variance)
 
-    low, high = (_last(accepted, surplus / trials, end) for end in (-1.0, 1.0))
+    low, high = (_last_accepted(accepted, surplus / trials, end) for end in (-1.0, 1.0))
     return Estimate(surplus / trials, low, high, confidence)
 
 
@@ -124,7 +124,7 @@ def independent_difference(first: tuple[int, int], second: tuple[int, int]) -> t
     return Estimate(value, low, high), float(test.pvalue)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> float:
+def _last_accepted(accepted: Callable[[float], bool], inside: float, outside: float) -> float:
     """The last accepted number between `inside` and `outside`, by bisection down to rounding."""
     for _ in range(60):
         middle = (inside + outside) / 2

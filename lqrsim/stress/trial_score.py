@@ -73,8 +73,8 @@ class PrescribedDraws:
                 raise InputError("choice: got p and replace=False, want one of the two")
             order = np.argsort(self.random(len(options)))
             return options[order[: 1 if size is None else int(np.prod(size))]].reshape(() if size is None else size)[()]
-        shares = np.full(len(options), 1 / len(options)) if p is None else np.asarray(p, dtype=np.float64)
-        which = np.searchsorted(np.cumsum(shares), self.random(size), side="right")
+        probabilities = np.full(len(options), 1 / len(options)) if p is None else np.asarray(p, dtype=np.float64)
+        which = np.searchsorted(np.cumsum(probabilities), self.random(size), side="right")
         return options[np.minimum(which, len(options) - 1)]
 
     def __getattr__(self, name: str) -> Any:

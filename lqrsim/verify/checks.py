@@ -126,9 +126,9 @@ def verify_run(
         body, place = rollout.balls.tracked
     geom = _tracked_geom(model, body, place)
     times, rows = frames_at_states(rollout, trial)
-    around = _corners(model, geom, rollout.frames[trial, rows])
+    box = _corners(model, geom, rollout.frames[trial, rows])
     makers = {"top": cameras.top, "side": cameras.side}
-    views = [makers[name](rollout, around=around) for name in cameras.measuring(rollout.plane)]
+    views = [makers[name](rollout, around=box) for name in cameras.measuring(rollout.plane)]
     measured: list[Array] = []
     offsets: list[Array] = []
     thickness, curved = _thickness(model, geom, rollout.frames[trial, rows], views)
@@ -150,8 +150,8 @@ def verify_run(
     name = model.geom(geom).name or f"a geom of {model.body(int(model.geom_bodyid[geom])).name}"
     others = [check_plan(rollout, solution)]
     if thickness < THIN:
-        said = f"{finer * thickness:.2g} pixels where it is thinnest, want {THINNEST:g} or more"
-        others.append(Criterion("thickness", finer * thickness >= THINNEST, said))
+        detail = f"{finer * thickness:.2g} pixels where it is thinnest, want {THINNEST:g} or more"
+        others.append(Criterion("thickness", finer * thickness >= THINNEST, detail))
     return compare(
         describe(rollout, trial),
         f"the silhouette of {name} in {size[0]} x {size[1]} pixels from {' and '.join(view.name for view in views)},"
@@ -287,8 +287,8 @@ def mask_middle(mask: npt.NDArray[np.bool_]) -> Array:
 def marker_centre(image: npt.NDArray[np.uint8], radius: float) -> Array:
     """The centre (2,), column and row, of the green mark of this radius in pixels; NaN if it is hidden."""
     red, green, blue = np.moveaxis(image.astype(np.int16), 2, 0)
-    share = ((green - np.maximum(red, blue)) / 255 - EMPTY) / (FULL - EMPTY)
-    rows, columns = np.nonzero(share > 0.5)
+    greenness = ((green - np.maximum(red, blue)) / 255 - EMPTY) / (FULL - EMPTY)
+    rows, columns = np.nonzero(greenness > 0.5)
     if not len(rows):
         return np.full(2, np.nan)
     # The median ignores stray pixels; then the mean is taken within the rim of the mark.
@@ -296,7 +296,7 @@ def marker_centre(image: npt.NDArray[np.uint8], radius: float) -> Array:
     area = 0.0
     for _ in range(3):
         (left, up), (right, down) = np.maximum(centre - reach, 0).astype(int), (centre + reach + 1).astype(int)
-        part = np.clip(share[up:down, left:right], 0, 1)
+        part = np.clip(greenness[up:down, left:right], 0, 1)
         x, y = np.arange(left, left + part.shape[1]) + 0.5, np.arange(up, up + part.shape[0]) + 0.5
         weights = part * ((x - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 <= reach**2)
         area = weights.sum()
@@ -371,19 +371,19 @@ def verify_video(
     times = metadata.times()[:count]
     seen, apart = triangulate(views, measured[:count], plane)
     areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
-    drawn, _ = frames_at_states(rollout, trial)
-    moved = frame_positions(rollout, trial, model, drawn) - state_positions(rollout, trial, drawn)
-    worst, most = np.linalg.norm(moved, axis=1).max(), RECORD_BOUND * rollout.radius
+    drawn_times, _ = frames_at_states(rollout, trial)
+    differences = frame_positions(rollout, trial, model, drawn_times) - state_positions(rollout, trial, drawn_times)
+    worst, most = np.linalg.norm(differences, axis=1).max(), RECORD_BOUND * rollout.radius
     shows = f"the video shows {', '.join(metadata.runs)}, this run is {digest}"
     timed = len(measured) == metadata.frames and off < 1 / float(metadata.rate) / 4
     counted = f"got {len(measured)}, want the {metadata.frames} that were written"
     marked = f"{min(areas):.0f} pixels in the pane where it is smallest, want {FEWEST_PIXELS} or more"
-    said = f"frames and states at most {1e3 * worst:.2f} mm apart, want {1e3 * most:.2f} at most"
+    detail = f"frames and states at most {1e3 * worst:.2f} mm apart, want {1e3 * most:.2f} at most"
     others = (
         Criterion("run", digest in metadata.runs, shows),
         Criterion("frames", timed, f"{counted}; at most {1e3 * off:.1f} ms from their times"),
         Criterion("mark", min(areas) >= FEWEST_PIXELS, marked),
-        Criterion("record", bool(worst <= most), said),
+        Criterion("record", bool(worst <= most), detail),
         check_plan(rollout, solution),
     )
     named = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))

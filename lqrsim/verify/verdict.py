@@ -34,19 +34,19 @@ def diagnose(
             return f"{name} is mirrored"
     offset = error.mean(axis=0)
     late = float((error * velocity).sum() / max((velocity**2).sum(), 1e-12))
-    split, ahead = _change_point(error, velocity)
+    split, jump = _change_point(error, velocity)
     candidates: list[tuple[Array, str]] = []
     if _lengths(offset) > bound / 2:
         moved = np.round(1e3 * offset).astype(int).tolist()
         candidates.append((error - offset, f"a camera is off: it moves the robot by {moved} mm"))
     if abs(late) > interval / 4:
-        shown = positions_at(times, actual, times[numbers] + late)
-        candidates.append((where - shown, f"pictures show the run {_in_frames(late, interval)}"))
-    if abs(ahead) > interval / 4 and split > FEW_FRAMES:  # otherwise the whole video is late or early
-        shown = positions_at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
-        said = "left out" if ahead > 0 else "shown twice"
-        said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(ahead, interval)}"
-        candidates.append((where - shown, said))
+        expected = positions_at(times, actual, times[numbers] + late)
+        candidates.append((where - expected, f"pictures show the run {_in_frames(late, interval)}"))
+    if abs(jump) > interval / 4 and split > FEW_FRAMES:  # otherwise the whole video is late or early
+        expected = positions_at(times, actual, times[numbers] + jump * (np.arange(len(numbers)) >= split))
+        said = "left out" if jump > 0 else "shown twice"
+        said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(jump, interval)}"
+        candidates.append((where - expected, said))
     if candidates:
         residual, said = min(candidates, key=lambda candidate: _quantile_95(candidate[0]))
         if _quantile_95(residual) <= 2 * bound:
