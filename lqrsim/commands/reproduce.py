@@ -36,14 +36,6 @@ ScriptResult = dict[str, Any]  # output of a script of experiments/ with --json
 _START = "import sys; from lqrsim.process import run_script; run_script(sys.argv[1:])"
 
 
-@dataclass(frozen=True)
-class Failure:
-    """A failed script."""
-
-    script: str
-    code: int
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
     """Reproduce the paper's results and check its statements.
@@ -79,16 +71,16 @@ class Reproduce:
         earlier = (
             _saved(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
         )
-        results, failures, begun = dict[str, ScriptResult](), list[Failure](), time.monotonic()
+        results, failures, begun = dict[str, ScriptResult](), dict[str, int](), time.monotonic()
         with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
             for name in chosen:
                 bar.set_postfix_str(name)
                 clock = time.monotonic()
                 outcome = _run(name, out, quick=self.quick)
                 seconds = time.monotonic() - clock
-                if isinstance(outcome, Failure):
-                    failures.append(outcome)
-                    console.say(f"{name}: FAILED with exit code {outcome.code} after {seconds:.0f} s; see above")
+                if isinstance(outcome, int):
+                    failures[name] = outcome
+                    console.say(f"{name}: FAILED with exit code {outcome} after {seconds:.0f} s; see above")
                 else:
                     results[name] = outcome | {"seconds": round(seconds), "machine": description()}
                     console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
@@ -108,9 +100,9 @@ class Reproduce:
             console.wrote(out / "results.md")
             console.wrote(out / "results.json")
             console.result(**saved)
-        for failure in failures:
-            console.say(f"FAILED {failure.script}: exit code {failure.code}")
-        console.result(failures=failures)
+        for name, code in failures.items():
+            console.say(f"FAILED {name}: exit code {code}")
+        console.result(failures=[{"script": name, "code": code} for name, code in failures.items()])
         return 1 if failures else 0
 
 
@@ -128,8 +120,11 @@ def _saved(file: Path, *, quick: bool) -> dict[str, Any]:
     return saved
 
 
-def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
-    """Run a script in its own process, so that scripts do not affect each other. Returns its result."""
+def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | int:
+    """Run a script in its own process, so that scripts do not affect each other. Returns its result, or exit code.
+
+    An exception, such as that of Ctrl-C, stops it, with time to remove unfinished files.
+    """
     script = EXPERIMENTS / f"{name}.py"
     command = [sys.executable, "-c", _START, script, "--json", "--out", out, *(["--quick"] if quick else [])]
     below = os.environ | {"TQDM_POSITION": "1"}  # its bars go below ours
@@ -137,13 +132,17 @@ def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
         try:
             printed, _ = running.communicate()
         except BaseException:
-            _end(running)
+            running.terminate()
+            try:
+                running.wait(TIDYING)
+            except subprocess.TimeoutExpired:
+                running.kill()
             raise
     try:
-        return json.loads(printed) if running.returncode == 0 else Failure(name, running.returncode)
+        return json.loads(printed) if running.returncode == 0 else running.returncode
     except ValueError:
         sys.stderr.write(f"{name}: printed something that is not its result:\n{printed[:1000]}\n")
-        return Failure(name, running.returncode)
+        return running.returncode
 
 
 def _skipped(result: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, str]]:
@@ -153,15 +152,6 @@ def _skipped(result: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, s
             yield from value.items() if isinstance(value, Mapping) else [(part, value)]
         elif isinstance(value, Mapping):
             yield from _skipped(value, key)
-
-
-def _end(running: subprocess.Popen[str]) -> None:
-    """Stop a script, with time to remove unfinished files. Ctrl-C may have stopped it already."""
-    running.terminate()
-    try:
-        running.wait(TIDYING)
-    except subprocess.TimeoutExpired:
-        running.kill()
 
 
 def results_page(saved: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as packaged
 from itertools import zip_longest
@@ -83,34 +83,29 @@ SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small eno
 FPS = 15
 
 
-def videos_of_worst(results: Results, worst: Sequence[list[analysis.Trial]], count: int, folder: Path) -> Iterator[Any]:
-    """A remark on all videos, and then each video."""
-    first = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
-    chosen, problem = [trial for trial in first if trial is not None][:count], ""
-    if not chosen:
-        yield "No videos were requested." if count == 0 else "There is no trial to render."
-        return
+def _videos_note(requested: int, shown: int) -> tuple[str, str]:
+    """A remark on the videos, and the reason why this machine cannot draw them; empty if it can."""
+    if not shown:
+        return "No videos were requested." if requested == 0 else "There is no trial to render.", ""
     try:
         gl.bind()
     except InputError as error:
-        problem = str(error)
-        yield f"There are none, for this machine cannot draw pictures: {problem}"
-    else:
-        yield (
-            "The worst trial of each policy and sweep, alternating between policies, repeated from its number alone."
-            " Line: the plan; trace: the path, coloured by tracking error."
-        )
-    for trial in chosen:
-        command = results.command_of("replay", "--cell", str(trial.cell), "--trial", str(trial.trial))
-        title = f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}"
-        outcome = f"{trial.outcome} with {trial.obstacle}" if trial.obstacle else trial.outcome
-        label = f"{title}: {outcome} after {trial.ended:.2f} s, least clearance {trial.clearance:.3f} m."
-        video = {"label": label, "command": command, "data": "", "problem": problem}
-        yield video if problem else video | _video(results, trial, title, folder)
+        return f"There are none, for this machine cannot draw pictures: {error}", str(error)
+    return (
+        "The worst trial of each policy and sweep, alternating between policies, repeated from its number alone."
+        " Line: the plan; trace: the path, coloured by tracking error."
+    ), ""
 
 
-def _video(results: Results, trial: analysis.Trial, title: str, folder: Path) -> dict[str, Any]:
-    """The video as text, or the reason why there is none."""
+def _video(results: Results, trial: analysis.Trial, problem: str, folder: Path) -> dict[str, Any]:
+    """The video of a trial as text, unless there is a problem, with its label and the command that repeats it."""
+    command = results.command_of("replay", "--cell", str(trial.cell), "--trial", str(trial.trial))
+    title = f"{trial.cell.policy}, {trial.cell.sweep} at strength {trial.cell.strength:g}, trial {trial.trial}"
+    outcome = f"{trial.outcome} with {trial.obstacle}" if trial.obstacle else trial.outcome
+    label = f"{title}: {outcome} after {trial.ended:.2f} s, least clearance {trial.clearance:.3f} m."
+    video = {"label": label, "command": command, "data": "", "problem": problem}
+    if problem:
+        return video
     from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
 
     try:
@@ -118,10 +113,10 @@ def _video(results: Results, trial: analysis.Trial, title: str, folder: Path) ->
         for width, height in SIZES:
             path = render(rollout, folder / "video.mp4", titles=[title], size=(width, height), fps=FPS)
             if path.stat().st_size <= LARGEST:
-                return {"data": base64_text(path), "width": width, "height": height}
+                return video | {"data": base64_text(path), "width": width, "height": height}
     except InputError as error:
-        return {"problem": str(error)}
-    return {"problem": f"it takes more than {LARGEST / 1e6:g} MB."}
+        return video | {"problem": str(error)}
+    return video | {"problem": f"it takes more than {LARGEST / 1e6:g} MB."}
 
 
 def base64_text(path: Path) -> str:
@@ -164,11 +159,12 @@ def report(
             _sweep(name, table, scenario, results.campaign, Path(folder)) for name in results.campaign.sweeps
         ]
         tell(2, parts)
-        rendered = videos_of_worst(results, worst, videos, Path(folder))
-        page["videos_note"] = next(rendered)
+        worst_of_each = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
+        shown = [trial for trial in worst_of_each if trial is not None][:videos]
+        page["videos_note"], problem = _videos_note(videos, len(shown))
         page["videos"] = []
-        for number, video in enumerate(rendered):
-            page["videos"].append(video)
+        for number, trial in enumerate(shown):
+            page["videos"].append(_video(results, trial, problem, Path(folder)))
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(packaged("lqrsim.reports").joinpath("page.html.j2").read_text(encoding="utf-8"))

@@ -261,11 +261,9 @@ def _digest_of_runs(scenario: Scenario) -> str:
 
 def _code(campaign: Campaign) -> dict[str, str | None]:
     """The hash of the file that defines each of the user's disturbances; None if no file defines it."""
-    used = (*campaign.sweeps.values(), campaign.design_disturbances or ())
-    hashes: dict[str, str | None] = {}
-    for kind in sorted(
-        {type(disturbance) for disturbance in itertools.chain(*used)}, key=lambda kind: kind.__qualname__
-    ):
+    used = itertools.chain(*campaign.sweeps.values(), campaign.design_disturbances or ())
+    kinds, hashes = {type(disturbance) for disturbance in used}, dict[str, str | None]()
+    for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
         if not _is_packaged(kind):
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
             hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())

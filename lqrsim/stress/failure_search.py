@@ -146,18 +146,8 @@ class ReliabilityProblem(Study):
             )
 
         def result(point: DesignPoint) -> SmallestFailure:
-            simulations = score.simulations - before
-            rollout = score.rollout(point.numbers[None], frames=False)
-            ends = np.cumsum(score.sizes)[:-1]
-            return SmallestFailure(
-                problem=self,
-                point=point,
-                simulations=simulations,
-                disturbances=tuple(rollout.disturbances),
-                shares=tuple(float(part @ part) / point.distance**2 for part in np.split(point.numbers, ends)),
-                largest=tuple(largest_effects(rollout)),
-                options={"seed": seed, "rounds": rounds, "particles": particles},
-            )
+            options = {"seed": seed, "rounds": rounds, "particles": particles}
+            return SmallestFailure(self, point, score.simulations - before, options)
 
         with keeping(lambda done: result(done) if isinstance(done, DesignPoint) else None):
             first = failure_probability(
@@ -349,10 +339,19 @@ class SmallestFailure:
     problem: ReliabilityProblem
     point: DesignPoint
     simulations: int  # number of trials, including the splitting before the search
-    disturbances: tuple[str, ...]  # in words
-    shares: tuple[float, ...]  # the fraction of each in the squared distance
-    largest: tuple[LargestEffect, ...]  # disturbances of the trial in physical units
     options: Mapping[str, int]  # `seed`, `rounds` and `particles`
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """The fraction of each disturbance in the squared distance."""
+        ends = np.cumsum(self.problem.score.sizes)[:-1]
+        parts = np.split(self.point.numbers, ends)
+        return tuple(float(part @ part) / self.point.distance**2 for part in parts)
+
+    @cached_property
+    def largest(self) -> list[LargestEffect]:
+        """The largest disturbances of the trial in physical units."""
+        return largest_effects(self.problem.score.rollout(self.point.numbers[None], frames=False))
 
     @property
     def stopped(self) -> str:
@@ -376,9 +375,10 @@ class SmallestFailure:
             f"first-order estimate: one trial in {rounded(1 / max(probability, 1e-300))} fails"
             f" (reliability {1 - probability:.6g}); `lqrsim rare` measures the probability"
         )
-        parts = zip(self.shares, self.problem.score.sizes, self.disturbances, strict=True)
-        lines += [f"{100 * share:6.1f} % of the squared distance: {words} ({count:,} numbers)"
-                  for share, count, words in parts if count]  # fmt: skip
+        score = self.problem.score
+        parts = zip(self.shares, score.sizes, score.disturbances, strict=True)
+        lines += [f"{100 * share:6.1f} % of the squared distance: {kind.describe(score.plant)} ({count:,} numbers)"
+                  for share, count, kind in parts if count]  # fmt: skip
         lines += [
             f"largest {effect.what}: {effect.size:.3g} {effect.unit}".rstrip() + f" at {effect.time:.2f} s"
             for effect in self.largest
