@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 
+LINE_EVERY = 10.0  # s between lines of progress where there is no terminal
+
 # The result that the running command prints with `--json`; None without.
 _RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
 
@@ -190,8 +192,8 @@ class Progress:
     The first call starts the clock: preparations before it, such as compiling, do not count.
     """
 
-    def __init__(self, what: str, unit: str, every: float) -> None:
-        self._what, self._unit, self._every = what, unit, every
+    def __init__(self, what: str, unit: str) -> None:
+        self._what, self._unit = what, unit
         self._watched = sys.stderr.isatty()
         self._bar: tqdm[Any] | None = None
         self._begun = self._last_line = 0.0
@@ -208,8 +210,8 @@ class Progress:
                 say(f"{done} of {total} {self._unit}s are done, {total - done} to go")
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(done - self._bar.n)
-        last = done == total and now - self._begun > self._every
-        if self._watched or not (now - self._last_line > self._every or last):
+        last = done == total and now - self._begun > LINE_EVERY
+        if self._watched or not (now - self._last_line > LINE_EVERY or last):
             return
         self._last_line = now
         line = f"{self._what}: {done} of {total} {self._unit}s"
@@ -223,6 +225,6 @@ class Progress:
             self._bar.close()
 
 
-def progress(what: str, unit: str, every: float = 10.0) -> contextlib.AbstractContextManager[Progress]:
-    """Progress during a block; a line every few seconds if there is no terminal."""
-    return contextlib.closing(Progress(what, unit, every))
+def progress(what: str, unit: str) -> contextlib.AbstractContextManager[Progress]:
+    """Progress during a block."""
+    return contextlib.closing(Progress(what, unit))

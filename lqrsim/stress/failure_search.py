@@ -110,9 +110,9 @@ class ReliabilityProblem(Study):
         check_keep(keep, particles)
         seed = self.seed if seed is None else seed
         options: dict[str, Any] = {"seed": seed, "particles": particles, "repetitions": repetitions, "keep": keep}
-        score = self._begin(report)
+        score, level = self._begin(report)
         with keeping(lambda done: None if done is None else RareFailures(self, done, options)):
-            splitting = failure_probability(score, score.size, level=self._level(report), progress=progress, **options)
+            splitting = failure_probability(score, score.size, level=level, progress=progress, **options)
         return RareFailures(self, splitting, options)
 
     @checked
@@ -137,7 +137,7 @@ class ReliabilityProblem(Study):
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
         seed = self.seed if seed is None else seed
-        score = self._begin(report)
+        score, level = self._begin(report)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
             raise InputError(
@@ -151,23 +151,18 @@ class ReliabilityProblem(Study):
 
         with keeping(lambda done: result(done) if isinstance(done, DesignPoint) else None):
             first = failure_probability(
-                score, score.size, particles=particles, keep=0.2, repetitions=2, level=self._level(report), seed=seed
+                score, score.size, particles=particles, keep=0.2, repetitions=2, level=level, seed=seed
             )
             point = smallest_failure(
                 score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
             )
         return result(point)
 
-    def _begin(self, report: Report | None) -> TrialScore:
-        """Report the summary, and return the score."""
-        if report is not None:
-            report(self.summary())
-        return self.score
-
-    def _level(self, report: Report | None) -> Callable[[float], object] | None:
-        """A callback that reports a level of the score with its unit."""
+    def _begin(self, report: Report | None) -> tuple[TrialScore, Callable[[float], object] | None]:
+        """Report the summary. Returns the score, and a function that reports a level of it with its unit."""
         if report is None:
-            return None
+            return self.score, None
+        report(self.summary())
         unit = "m" if len(self.score.plant.world) else self.score.solution.target.unit
         last, when = math.nan, 0.0
 
@@ -180,7 +175,7 @@ class ReliabilityProblem(Study):
                 when = now
             last = level
 
-        return report_level
+        return self.score, report_level
 
 
 @dataclass(frozen=True, eq=False)

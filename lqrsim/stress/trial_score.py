@@ -184,16 +184,13 @@ class TrialScore:
         draws = [_CountedDraws() for _ in self.disturbances]
         usual = self._simulate(1, lambda trial, stream: draws[stream], frames=False)
         self.sizes = tuple(stream.used for stream in draws)
-        self.first = self._first(_departure(usual.clearance[0])) if self.failure in (collision_score, miss_score) else 0
-
-    def _first(self, departure: int) -> int:
-        """The first knot whose clearance counts, at most `departure`."""
-        if not (departure and self.size):
-            return 0
-        numbers = np.random.default_rng(0).standard_normal((PROBES, self.size))
-        clearance = self.rollout(numbers, frames=False).clearance[:, :departure]
-        steady = clearance.mean(axis=0) > STEADY * clearance.std(axis=0)
-        return departure if steady.all() else int(steady.argmin())
+        own = self.failure in (collision_score, miss_score)
+        self.first = _departure(usual.clearance[0]) if own and self.size else 0
+        if self.first:
+            numbers = np.random.default_rng(0).standard_normal((PROBES, self.size))
+            clearance = self.rollout(numbers, frames=False).clearance[:, : self.first]
+            steady = clearance.mean(axis=0) > STEADY * clearance.std(axis=0)
+            self.first = self.first if steady.all() else int(steady.argmin())
 
     @property
     def size(self) -> int:
@@ -223,12 +220,8 @@ class TrialScore:
         Their `seed` means nothing.
         """
         vectors = check_array("numbers", numbers, (None, self.size))
-        ends = np.cumsum((0, *self.sizes))
-
-        def draws_of(trial: int, stream: int) -> PrescribedDraws:
-            return PrescribedDraws(vectors[trial, ends[stream] : ends[stream + 1]])
-
-        return self._simulate(len(vectors), draws_of, frames=frames)
+        parts = np.split(vectors, np.cumsum(self.sizes)[:-1], axis=1)  # of each disturbance
+        return self._simulate(len(vectors), lambda trial, stream: PrescribedDraws(parts[stream][trial]), frames=frames)
 
     def _simulate(self, trials: int, generators: Callable[[int, int], PrescribedDraws], *, frames: bool) -> Rollout:
         named = ("disturbances", "controller", "goal_radius", "goal_tolerance", "contacts", "threads")
