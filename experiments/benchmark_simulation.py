@@ -26,7 +26,7 @@ from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
 from lqrsim.machine import processors
-from lqrsim.stress.outcome_table import outcomes
+from lqrsim.stress.analysis import outcomes
 
 LEAST = 0.85  # of raw, one thread
 LEAST_WITH_FILTER = 0.8  # with `OffsetFree`

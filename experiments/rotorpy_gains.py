@@ -21,7 +21,7 @@ from runner import Result, Settings, at_most, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.simulation.disturbances import preset
-from lqrsim.stress.outcome_table import Outcomes, outcomes
+from lqrsim.stress.analysis import Outcomes, outcomes
 
 # Position gain and damping: horizontally, of the attitude, and vertically.
 HORIZONTAL = (6.5, 10.0, 15.0, 22.0), (0.6, 0.8, 1.1)

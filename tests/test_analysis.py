@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 import lqrsim as ls
 from lqrsim.stress import statistics
-from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
-from lqrsim.stress.outcome_table import Outcomes
+from lqrsim.stress.analysis import Outcomes, breaks, comparisons, degradation, modes, quantiles, success, worst
 from lqrsim.stress.study import Cell
 
 

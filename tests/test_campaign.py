@@ -27,10 +27,10 @@ from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
-from lqrsim.stress import trials
+from lqrsim.stress import executors
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.campaign_files import Damaged, unpack
-from lqrsim.stress.results import Results, differences, replay
+from lqrsim.stress.results import Results, Trials, differences, replay
 from lqrsim.stress.study import Campaign, Cell
 
 OWN = """
@@ -219,7 +219,7 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
-    monkeypatch.setattr(trials.Job, "work", never)
+    monkeypatch.setattr(executors.Job, "work", never)
     run_campaign(CAMPAIGN, reference.folder)
     run_campaign(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
     assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
@@ -364,11 +364,11 @@ def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pyte
         def control(self, step: int, measured: Array) -> Array:
             return np.where(step == 20, np.nan, self.sane.control(step, measured))
 
-    def mad(own: trials.Trials, cell: Cell) -> Controller | ls.AffinePolicy:
+    def mad(own: Trials, cell: Cell) -> Controller | ls.AffinePolicy:
         plain = own.solutions[cell.policy].policy
         return Mad(plain) if cell.policy == "open_loop" else plain
 
-    monkeypatch.setattr(trials.Trials, "_controller", mad)
+    monkeypatch.setattr(Trials, "_controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
     nan = Cell("open_loop", "scenario", 1.0)
     assert results.tally(nan)["error"] > 15  # the others collide before

@@ -10,7 +10,7 @@ from lqrsim.disturbances import ForceNoise, MeasurementNoise, Push
 from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.simulation.plant import Plant
-from lqrsim.stress.outcome_table import outcomes
+from lqrsim.stress.analysis import outcomes
 
 
 @pytest.fixture(scope="module")

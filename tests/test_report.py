@@ -15,8 +15,8 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.disturbances import ControlNoise, ForceNoise, MeasurementNoise
 from lqrsim.reports.page import report
+from lqrsim.stress.analysis import Outcomes
 from lqrsim.stress.campaign import run_campaign
-from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.results import Results
 from lqrsim.stress.study import Campaign, Cell
 from lqrsim.view import gl

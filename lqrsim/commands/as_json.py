@@ -64,7 +64,7 @@ def of_rollout(rollout: "ls.Rollout", problem: "ls.Problem | None" = None) -> Ob
     Args:
       problem: the problem, for the costs; without it, or with another horizon, there are no costs.
     """
-    from lqrsim.stress.outcome_table import outcomes
+    from lqrsim.stress.analysis import outcomes
 
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         problem = None

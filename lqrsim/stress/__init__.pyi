@@ -1,3 +1,5 @@
+from .analysis import Outcomes as Outcomes
+from .analysis import outcomes as outcomes
 from .campaign import run_campaign as run_campaign
 from .design_point import smallest_failure as smallest_failure
 from .failure_search import FailureCertificate as FailureCertificate
@@ -8,8 +10,6 @@ from .funnels import check_funnel as check_funnel
 from .hardening import harden as harden
 from .multilevel_splitting import NoFailure as NoFailure
 from .multilevel_splitting import failure_probability as failure_probability
-from .outcome_table import Outcomes as Outcomes
-from .outcome_table import outcomes as outcomes
 from .results import Results as Results
 from .results import compare as compare
 from .results import replay as replay

@@ -32,7 +32,6 @@ from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors, policies
 from lqrsim.stress.results import Results
 from lqrsim.stress.study import Campaign, Shard
-from lqrsim.stress.trials import Job
 from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
@@ -88,7 +87,7 @@ def run_campaign(
                     " or another folder"
                 )
             results.trials.warm_up()  # done here first, so that the workers find everything compiled
-        job = Job.of(results.trials, results.manifest, batch)
+        job = executors.Job.of(results.trials, results.manifest, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
         tell(done, total)

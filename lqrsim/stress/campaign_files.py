@@ -30,7 +30,7 @@ from lqrsim.annotations import Line, checked
 from lqrsim.errors import LONGEST, InputError, excerpt
 from lqrsim.results.archive import Other, blamed, canonical, parse, replacing, sha256
 from lqrsim.results.solution import Solution
-from lqrsim.stress.outcome_table import COLUMNS
+from lqrsim.stress.analysis import COLUMNS
 from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Shard
 
 _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows

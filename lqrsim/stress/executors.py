@@ -18,16 +18,21 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Generator, Iterator
+import uuid
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
 from lqrsim import process
 from lqrsim.errors import InputError, format_error
-from lqrsim.stress.study import Shard
-from lqrsim.stress.trials import Job
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios.references import resolve
+from lqrsim.stress.campaign_files import pack
+from lqrsim.stress.results import Trials, failed_rows
+from lqrsim.stress.study import Campaign, Shard
 from lqrsim.versions import versions
 
 FinishedShards = Generator[tuple[Shard, bytes]]
@@ -41,6 +46,46 @@ _RUNS_THE_SCRIPT = 79  # exit code of a worker that, by importing the caller's s
 _GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
 _starting = threading.Lock()  # the environment is that of all threads
 _serving = False  # whether this process is a worker that has imported the caller's script
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Everything that a worker needs for a campaign."""
+
+    campaign: Mapping[str, Any]  # as in its manifest
+    digest: str  # of the manifest
+    solutions: Mapping[str, Solution]  # by policy
+    batch: int
+    # An identifier that differs in every run, even of the same campaign.
+    run: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
+
+    @classmethod
+    def of(cls, trials: Trials, manifest: Mapping[str, Any], batch: int) -> "Job":
+        """The job of running these trials elsewhere. Its solutions lack the logs of their solves."""
+        unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
+        solutions = {policy: replace(solution, **unused) for policy, solution in trials.solutions.items()}
+        return cls(manifest["campaign"], manifest["digest"], solutions, batch)
+
+    def prepare(self) -> Trials:
+        """The trials of this job, kept in this process until there is another job."""
+        if self.run not in _prepared:
+            _prepared.clear()
+            campaign = Campaign.from_json(self.campaign, resolve(self.campaign["scenario"]))
+            trials = Trials(campaign, self.solutions)
+            trials.warm_up()
+            _prepared[self.run] = trials
+        return _prepared[self.run]
+
+    def work(self, shard: Shard, trials: Trials | None = None) -> bytes:
+        """Run a shard in this process, with these trials if given. Returns its file."""
+        return pack((trials or self.prepare()).table(shard, self.batch), shard, self.digest)
+
+    def failed(self, shard: Shard, reason: str) -> bytes:
+        """The file of a shard that could not be run: each of its trials is an error with this reason."""
+        return pack(failed_rows(shard.first, shard.count, reason), shard, self.digest)
+
+
+_prepared: dict[str, Trials] = {}  # trials of the last job that this process worked for
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:
