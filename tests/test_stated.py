@@ -25,7 +25,7 @@ from lqrsim.stress.policies import (
     POLICIES,
     POLICY_KINDS,
     make_controller,
-    solve,
+    solve_policies,
 )
 
 LIGHT = (
@@ -120,7 +120,7 @@ def test_by_default_the_preset_in_the_middle_is_stated(
     for policy in DESIGNED:
         digests = []
         for stated in (None, moderate):
-            solution, name = solve((policy,), differential_drive, stated)[policy], POLICY_KINDS[policy].controller
+            solution, name = solve_policies((policy,), differential_drive, stated)[policy], POLICY_KINDS[policy].controller
             digests.append(make_controller(name, differential_drive, solution, design=stated).digest)
         assert digests[0] == digests[1]
 

@@ -222,44 +222,40 @@ class Episode:
         self.task, self.seed, self.first = task, seed, first_trial
         dynamics = task.plant.robot.dynamics
         self._commanded = Commanded(spaces_of(dynamics), count)
-        self._loop = ClosedLoop(
+        self.loop = ClosedLoop(
             plant=task.plant, plan=task.solution, disturbances=disturbances, controller=self._commanded,
             seed=seed, trials=count, first_trial=first_trial, frames=frames, threads=threads,
             **task.scenario.near_enough(),
         )  # fmt: skip
-        self._costs, self._plan = task.costs, self._loop.trajectory
-        self._loop.begin()
+        self._costs, self._plan = task.costs, self.loop.trajectory
+        self.loop.begin()
         self.ended = np.zeros(count, dtype=bool)
         self.outcomes = np.full(count, "", dtype=object)  # empty while an episode is running
-        self._last, self._ended_at = self._observe(), np.zeros((2, count), dtype=bool)
+        self._terminated, self._truncated = np.zeros((2, count), dtype=bool)
+        self._observations = self._observe()
 
     @property
     def observations(self) -> Array:
         """The current observations, (K, n+1)."""
-        return self._last.copy()
+        return self._observations.copy()
 
     @property
     def time(self) -> float:
-        return self._loop.step * self._plan.dt
+        return self.loop.step * self._plan.dt
 
     @property
     def states(self) -> Array:
         """The current true states, (K, n), angles in the representative nearest the plan."""
-        return self._near_plan(self._loop.states)
+        return self._near_plan(self.loop.states)
 
     @property
     def clearance(self) -> Array:
         """Current signed distance to the nearest obstacle minus the robot's radius, (K,), in metres."""
-        return self._loop.collisions.clearance.copy()
-
-    @property
-    def frames(self) -> Array:
-        """MuJoCo's current qpos, (K, nq)."""
-        return self._loop.physics.frame()
+        return self.loop.collisions.clearance.copy()
 
     def advance(self, controls: Array) -> tuple[Array, Array, Flags, Flags]:
         """Run a control period with controls (K, m): observations (K, n+1), rewards, terminations, truncations."""
-        loop, step, states = self._loop, self._loop.step, self.states
+        loop, step, states = self.loop, self.loop.step, self.states
         self._commanded.commands = controls
         with unlogged():
             loop.period()
@@ -268,37 +264,37 @@ class Episode:
         running = ~self.ended
         lost = loop.records.over(loop.step)
         collided = np.isfinite(loop.collisions.at)
-        over = loop.step == self._plan.steps
-        self._ended_at[0, running] = (lost | collided)[running]
-        self._ended_at[1, running] = over & ~(lost | collided)[running]
+        at_horizon = loop.step == self._plan.steps
+        self._terminated[running] = (lost | collided)[running]
+        self._truncated[running] = at_horizon & ~(lost | collided)[running]
         rewards = np.zeros(len(running))
         rewards[running] = -self._costs.stage(step, states, loop.records.applied[:, step])[running]
-        ending = self._ended_at.any(axis=0) & running
+        ending = (self._terminated | self._truncated) & running
         if ending.any():
             # A trial that has become unstable has no valid state; use the previous state.
             last = np.where(lost[:, None], states, self.states)
             rewards[ending] -= self._costs.final(last, loop.records.applied[:, step])[ending]
-        self._last[running] = self._observe(lost)[running]
+        self._observations[running] = self._observe(lost)[running]
         self.ended |= ending
         if ending.any():
             first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
             early = np.where(collided & first, "collided", "diverged").astype(object)
-            self.outcomes[ending] = (np.array(self.rollout().outcome, dtype=object) if over else early)[ending]
-        return self.observations, rewards, self._ended_at[0].copy(), self._ended_at[1].copy()
+            self.outcomes[ending] = (np.array(self.rollout().outcome, dtype=object) if at_horizon else early)[ending]
+        return self.observations, rewards, self._terminated.copy(), self._truncated.copy()
 
     def rollout(self) -> Rollout:
         """The records so far, in the form of `simulate`; NaN from now on."""
-        return self._loop.so_far()
+        return self.loop.so_far()
 
     def _observe(self, lost: Flags | None = None) -> Array:
         """Measured states, and time as a fraction of the horizon; for unstable trials the last valid states."""
-        loop, plan = self._loop, self._plan
+        loop, plan = self.loop, self._plan
         seen = np.column_stack([self._near_plan(loop.measured), np.full(len(loop.measured), loop.step / plan.steps)])
         if lost is not None:
-            seen[lost, :-1] = self._last[lost, :-1]
+            seen[lost, :-1] = self._observations[lost, :-1]
         return seen
 
     def _near_plan(self, states: Array) -> Array:
         turned = np.array(states, order="C")[None]
-        turn_to_nearest(self._loop.state_coordinates, turned, self._plan.states[self._loop.step][None])
+        turn_to_nearest(self.loop.state_coordinates, turned, self._plan.states[self.loop.step][None])
         return turned[0]

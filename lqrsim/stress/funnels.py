@@ -66,7 +66,7 @@ class LevelTest:
 
 @checked
 def smallest_test(
-    rate: Chance, confidence: Chance, failures: Annotated[int, Bounds(at_least=0, at_most=10_000)]
+    rate: Chance, confidence: Confidence, failures: Annotated[int, Bounds(at_least=0, at_most=10_000)]
 ) -> LevelTest:
     """The test with the fewest trials that proves the rate with the given confidence if `failures` trials fail."""
 
@@ -89,9 +89,10 @@ def smallest_test(
 
 
 def lowest_rate(successes: int, trials: int, confidence: float) -> float:
-    """The exact one-sided lower bound of a success rate: the bound of a two-sided interval with less confidence."""
-    if confidence < 0.5:  # there is no such two-sided interval
-        raise InputError(f"confidence: got {confidence:g}, want a number >= 0.5")
+    """The exact one-sided lower bound of a success rate: the bound of a two-sided interval with less confidence.
+
+    From a confidence of 0.5 on; for less there is no such interval.
+    """
     return rate_of(successes, trials, confidence=max(2 * confidence - 1, 1e-12)).low
 
 

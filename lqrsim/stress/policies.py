@@ -141,11 +141,10 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
     if isinstance(scenario.problem.dynamics, Belief):
         others = (name for name, kind in POLICY_KINDS.items() if kind.controller != "feedback" or kind.designed)
         impossible |= dict.fromkeys(others, "which is of states, while the scenario is planned in belief space")
-    replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
-    if replanned is not None:
-        stated = scenario.with_duration_of(replanned).problem
-        if replanned.problem_digest != stated.digest:
-            other = solving.difference(replanned, stated)
+    if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver:
+        stated = scenario.with_duration_of(given).problem
+        if given.problem_digest != stated.digest:
+            other = solving.difference(given, stated)
             impossible["replan"] = (
                 f"which re-plans the scenario's problem, while the solution is of another problem{other}"
             )

@@ -440,24 +440,27 @@ def compare(
       with low and high; p, adjusted for the number of rows (Holm, 1979). With different seeds, first trials and second
       trials take the place of trials, only first and only second. Failure rates differ by as much, the other way round.
     """
-    first_results = first if isinstance(first, Results) else Results(first)
-    second_results = first_results if second is None else second if isinstance(second, Results) else Results(second)
-    chosen = policies or ()
+    opened = [
+        campaign if isinstance(campaign, Results) else Results(campaign)
+        for campaign in ([first] if second is None else [first, second])
+    ]
+    results, chosen = (opened[0], opened[-1]), policies or ()
+    manifests = [campaign.manifest for campaign in results]
+    campaigns = [manifest["campaign"] for manifest in manifests]
     if len(chosen) != 2 and (second is None or policies is not None):
         raise InputError(f"policies: got {excerpt(policies)}, want two policies, or another campaign to compare with")
-    for policy, results in zip(chosen, (first_results, second_results), strict=False):
-        check_name("policies", policy, results.manifest["campaign"]["policies"])
+    for policy, campaign in zip(chosen, campaigns, strict=False):
+        check_name("policies", policy, campaign["policies"])
     matches = (
         (cell, Cell(chosen[1] if chosen else cell.policy, cell.sweep, cell.strength))
-        for cell in first_results.cells
+        for cell in results[0].cells
         if not chosen or cell.policy == chosen[0]
     )
-    pairs = [pair for pair in matches if pair[1] in second_results.cells]
+    pairs = [pair for pair in matches if pair[1] in results[1].cells]
     if not pairs:
         raise InputError(
-            f"second: got cells from {second_results.cells[0]} to {second_results.cells[-1]}, want some of the first's"
+            f"second: got cells from {results[1].cells[0]} to {results[1].cells[-1]}, want some of the first's"
         )
-    campaigns = first_results.manifest["campaign"], second_results.manifest["campaign"]
     for sweep in dict.fromkeys(cell.sweep for cell, _ in pairs):
         if campaigns[0]["sweeps"][sweep] != campaigns[1]["sweeps"][sweep]:
             raise InputError(f"second: got other disturbances in the sweep {excerpt(sweep)}, want those of the first")
@@ -468,23 +471,17 @@ def compare(
     trials = [campaign["trials"] for campaign in campaigns]
     counts = [min(trials)] * 2 if paired else trials
     firsts, seconds = (
-        {pair[side]: results.outcomes(pair[side]).first(counts[side]) for pair in pairs}
-        for side, results in enumerate((first_results, second_results))
+        {pair[side]: results[side].outcomes(pair[side]).first(counts[side]) for pair in pairs} for side in (0, 1)
     )
     comparisons = analysis.compared(pairs, firsts, seconds, paired=paired)
+    of = [f"{policy} of " for policy in chosen] or ["", ""]
+    notes = [f"first: {of[0]}{results[0].folder}; second: {of[1]}{results[1].folder}"]
+    differ = [name for name in _SETTINGS if campaigns[0][name] != campaigns[1][name]]
+    differ += [name for name in _FIELDS if manifests[0][name] != manifests[1][name]]
+    notes += [f"they differ in {', '.join(differ)}"] if differ else []
     method = f"difference: first minus second; low, high: {100 * CONFIDENCE:g} % by {_METHOD[paired]}, adjusted (Holm)"
-    notes, fractions = [*_notes(first_results, second_results, chosen), method], fraction_format(max(counts))
-    return _table(comparisons, notes, paired=paired, fractions=fractions)
-
-
-def _notes(first: Results, second: Results, policies: Sequence[str]) -> list[str]:
-    """Lines that say what is compared, and in what else the two differ."""
-    of = [f"{policy} of " for policy in policies] or ["", ""]
-    notes = [f"first: {of[0]}{first.folder}; second: {of[1]}{second.folder}"]
-    first_manifest, second_manifest = first.manifest, second.manifest
-    differ = [name for name in _SETTINGS if first_manifest["campaign"][name] != second_manifest["campaign"][name]]
-    differ += [name for name in _FIELDS if first_manifest[name] != second_manifest[name]]
-    return [printable(note) for note in [*notes, *([f"they differ in {', '.join(differ)}"] if differ else [])]]
+    notes = [*map(printable, notes), method]
+    return _table(comparisons, notes, paired=paired, fractions=fraction_format(max(counts)))
 
 
 def _table(pairs: Sequence[analysis.Comparison], notes: Sequence[str], *, paired: bool, fractions: str) -> DataTable:
