@@ -215,11 +215,10 @@ class SimulatedRobot:
             _wait(lambda: all(matched() for matched in everyone), self._patience, lambda: "got no controller")
             self._met = True
         values = dict(zip(self._names, vectors_of("state", state, len(self._names)).tolist(), strict=True))
-        pose = functools.partial(node.odometry, turns_about=self._turns_about)
-        messages = [(out, (pose if kind == "Odometry" else node.joints)) for kind, out in self._outlets.items()]
         begun = time.monotonic()
-        for outlet, compose in messages:
-            outlet.write(compose(values, t))
+        for kind, outlet in self._outlets.items():
+            of_odometry = kind == "Odometry"
+            outlet.write(node.odometry(values, t, self._turns_about) if of_odometry else node.joints(values, t))
         _wait(lambda: inlet.wait(SLICE), self._patience, lambda: "got no command")
         self.round_trips.append(time.monotonic() - begun)
         (message,) = inlet.receive()
@@ -295,7 +294,7 @@ class _Inlet:
     ) -> None:  # fmt: skip
         renamed = _renamed(states, names)
         self._wanted = dict(zip(renamed, range(len(states)), strict=True))
-        self._of_odometry = functools.partial(_of_odometry, turns_about=_turns_about(states, renamed))
+        self._turns_about = _turns_about(states, renamed)
         self._topics, self._lacking = topics, {name for name, i in self._wanted.items() if states.names[i] in needed}
         known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
         if self._lacking - known:
@@ -335,7 +334,8 @@ class _Inlet:
         for kind, reader in self._readers.items():
             for message in reader.receive():
                 try:
-                    values = (self._of_odometry if kind == "Odometry" else _of_joints)(message)
+                    of_odometry = kind == "Odometry"
+                    values = _of_odometry(message, self._turns_about) if of_odometry else _of_joints(message)
                     used = values.keys() & self._wanted.keys()
                     self._known[kind] |= used
                     if missing := self._known[kind] - used:

@@ -194,8 +194,8 @@ def success(cell: Cell, outcomes: Outcomes) -> Success:
 def alike(cell: Cell, outcomes: Outcomes) -> bool:
     """Whether there are several trials, and all are the same run: nothing was drawn, as at strength 0.
 
-    Equal outcomes alone are no reason: losses may be so rare that no trial has one. Trials of which nothing was
-    simulated are no runs, and trials that differ, though nothing was drawn, are not the same run.
+    Equal outcomes do not show it: random trials may end alike. Trials that were not simulated do not count, nor do
+    trials that differ although nothing was drawn.
     """
     if len(outcomes) < 2 or np.isnan(outcomes.ended).any():
         return False
@@ -239,7 +239,7 @@ def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of two cells on the same trials; or on trials of their own, with None for what is of pairs."""
+    """A comparison of two cells on the same trials; or on different ones, with None for what needs pairs."""
 
     first: Cell
     second: Cell

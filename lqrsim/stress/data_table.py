@@ -174,7 +174,7 @@ def _lines(*lines: str) -> str:
 
 
 def _latex_number(text: str) -> str:
-    """In math, in which a minus sign is none of hyphens; 1e-05 as a power of ten."""
+    """In math mode, where a minus sign is no hyphen; 1e-05 as a power of ten."""
     digits, _, exponent = text.partition("e")
     return f"${digits} \\times 10^{{{int(exponent)}}}$" if exponent else f"${digits}$"
 

@@ -31,7 +31,7 @@ from lqrsim.stress.multilevel_splitting import CountedScore, Rounds, Score, fail
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
 DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than PROGRESS
 PROGRESS = 0.01  # fraction of the distance
-SPREAD = 0.5  # the length s of the steps of the pairs; each number of e is standard normal, over the root of the size
+SPREAD = 0.5  # s, where e is a standard normal vector divided by the root of its size
 TOLERANCE = 0.01  # share of the distance that may be left to gain
 GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of the grid
 

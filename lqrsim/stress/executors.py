@@ -101,7 +101,7 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
         while not ending.is_set():
             worker, late = getattr(local, "worker", None) or _Worker(job), False
             alive.add(worker)
-            if ending.is_set():  # perhaps nobody has seen that it is alive
+            if ending.is_set():  # it began too late to be killed with the others
                 worker.process.kill()
             try:
                 file = worker.run(shard, time_limit)
@@ -124,7 +124,7 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
                 raise InputError(f"workers: got processes that do not start ({reason}), want {_GUARD}")
             if late or died == ATTEMPTS:
                 return job.failed(shard, reason)
-        return b""  # for nobody
+        return b""  # nobody reads it
 
     threads = ThreadPoolExecutor(max(workers, 1))
     try:

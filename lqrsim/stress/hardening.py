@@ -4,8 +4,8 @@ The first plan has the requested chance of collision by prediction. Its failures
 disturbances, also those that no prediction includes. From the planned clearance of an obstacle, in predicted standard
 deviations, and the measured probability of hitting it follows how many of these deviations correspond to one quantile
 of the normal distribution. The next plan keeps as many of them as correspond to an equal part of the requested
-probability. Obstacles that are never hit need no more room than before; there the deviations count as wrong as where
-they are most wrong. The law is designed again for each plan.
+probability. Obstacles that are never hit get the largest of the others' corrections, but no more room than before. The
+law is designed again for each plan.
 
 Room does not help a robot that leaves its plan for good. Such failures are counted separately.
 
@@ -272,7 +272,7 @@ class _Search:
         return wanted
 
     def measure(self, solution: Solution, label: str) -> HardeningRound:
-        """A plan with its failures. Its clearances are those from which `next` begins."""
+        """A plan with its failures. The next plan begins with its clearances."""
         measured = self._failures(solution, label)
         rare, unfailing = (None, measured.trials) if isinstance(measured, NoFailure) else (measured, 0)
         problem, plan, place = self.scenario.problem, solution.trajectory, list(self.surroundings.place)

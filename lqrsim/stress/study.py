@@ -38,7 +38,7 @@ from lqrsim.stress.policies import (
 
 _MOST_FILES = 1_000_000  # largest number of shards in a folder
 
-OF_SCENARIO = "of the scenario"  # the kind of what is stored by its number
+OF_SCENARIO = "of the scenario"  # the kind of a disturbance that is stored by its number in the scenario
 
 Name = Annotated[str, Want("a name")]
 SetName = Annotated[str, Want("a name, such as 'light'")]

@@ -132,12 +132,12 @@ def miss_score(rollout: Rollout, *, first: Index = 0) -> Array:
     return np.maximum(collision_score(rollout, first=first), outside)
 
 
-PROBES = 32  # trials that show whether the disturbances can change the clearance of a departure
-STEADY = 20.0  # standard deviations between a clearance and a collision that tells nothing
+PROBES = 32  # trials that show how much the disturbances change the clearance while the robot leaves an obstacle
+STEADY = 20.0  # a clearance of more of its standard deviations does not show which trials are near a collision
 
 
 def _departure(clearance: Array) -> int:
-    """The knots (T+1,) before the clearance first falls by a tenth, if it is least there; else 0."""
+    """The number of knots until the clearance (T+1,) first falls by a tenth, if it is least before; else 0."""
     fallen = clearance < 0.9 * np.maximum.accumulate(clearance)
     first = int(fallen.argmax())
     return first if first and clearance[:first].min() <= clearance[first:].min() else 0
