@@ -36,8 +36,8 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 
-LATE = 3  # control periods without a state after which the controller stops
-SLICE = 0.05  # s, the interval at which a wait checks for signals
+LOST_AFTER = 3  # control periods without a state after which the controller stops
+WAIT_SLICE = 0.05  # s, the interval at which a wait checks for signals
 AXES = "xyz"
 # The states in an Odometry message, by name: velocities along the world's axes, rates along the body's.
 ODOMETRY = ("x", "y", "z", "vx", "vy", "vz", "rx", "ry", "rz", "wx", "wy", "wz", "heading")
@@ -111,7 +111,7 @@ def run(
     safe = check_array("safe", safe, (len(controls),))
     if (safe < controls.low).any() or (safe > controls.high).any():
         raise InputError(f"safe: got {excerpt(safe.tolist())}, want numbers from {controls.low} to {controls.high}")
-    longest = lost_after or (patience if lockstep else LATE * dt)
+    longest = lost_after or (patience if lockstep else LOST_AFTER * dt)
     if seconds is not None:
         steps = math.ceil(seconds / dt - 1e-9)
     needed = law.policy.measured_coordinates.names if isinstance(law, OutputFeedback) else states.names
@@ -219,7 +219,7 @@ class SimulatedRobot:
         for kind, outlet in self._outlets.items():
             of_odometry = kind == "Odometry"
             outlet.write(node.odometry(values, t, self._turns_about) if of_odometry else node.joints(values, t))
-        _wait(lambda: inlet.wait(SLICE), self._patience, lambda: "got no command")
+        _wait(lambda: inlet.wait(WAIT_SLICE), self._patience, lambda: "got no command")
         self.round_trips.append(time.monotonic() - begun)
         (message,) = inlet.receive()
         return check_array("command", message.data, (len(self._controls),))
@@ -315,7 +315,7 @@ class _Inlet:
         """Wait until each topic has a new message, or the time is over."""
         end = time.monotonic() + seconds
         for reader in self._readers.values():
-            while not reader.wait(SLICE) and time.monotonic() < end:
+            while not reader.wait(WAIT_SLICE) and time.monotonic() < end:
                 pass
 
     def matched(self) -> bool:

@@ -23,7 +23,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import console
 from lqrsim.stress import failure_search
-from lqrsim.stress.hardening import AIM, HardenedPlan, HardeningRound, _Search
+from lqrsim.stress.hardening import AIMED_FRACTION, HardenedPlan, HardeningRound, _Search
 from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import rate
 
@@ -116,7 +116,7 @@ def test_the_room_is_that_of_the_normal_distribution(own: str, hardened: Hardene
         first.rare, splitting=replace(splitting, probability=replace(splitting.probability, value=measured, low=0.0))
     )
     wanted = search.wanted(HardeningRound(solution=first.solution, cost=1.0, rare=rare, hit={"crate": 1.0}, strays=0.0))
-    assert norm.sf(wanted[search.names.index("crate")] / wrong) == pytest.approx(AIM * CHANCE)
+    assert norm.sf(wanted[search.names.index("crate")] / wrong) == pytest.approx(AIMED_FRACTION * CHANCE)
 
 
 @pytest.mark.parametrize(

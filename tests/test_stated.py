@@ -120,7 +120,8 @@ def test_by_default_the_preset_in_the_middle_is_stated(
     for policy in DESIGNED:
         digests = []
         for stated in (None, moderate):
-            solution, name = solve_policies((policy,), differential_drive, stated)[policy], POLICY_KINDS[policy].controller
+            solution = solve_policies((policy,), differential_drive, stated)[policy]
+            name = POLICY_KINDS[policy].controller
             digests.append(make_controller(name, differential_drive, solution, design=stated).digest)
         assert digests[0] == digests[1]
 

@@ -27,7 +27,7 @@ SCRIPTS = (
     "adaptive_quad_bench", "export_c",
 )  # fmt: skip
 
-TIDYING = 20.0  # s, time for a stopped script to remove unfinished files
+STOP_TIMEOUT = 20.0  # s, time for a stopped script to remove unfinished files
 VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}
 
 ScriptResult = dict[str, Any]  # output of a script of experiments/ with --json
@@ -134,7 +134,7 @@ def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | int:
         except BaseException:
             running.terminate()
             try:
-                running.wait(TIDYING)
+                running.wait(STOP_TIMEOUT)
             except subprocess.TimeoutExpired:
                 running.kill()
             raise

@@ -25,7 +25,7 @@ from lqrsim.scenarios.packaged import Scenario
 __all__ = ["Environment", "Expert", "VectorEnvironment", "make_env", "make_vec", "write_minari"]
 
 SCENARIOS = {"lqrsim/Quadrotor-v0": "quadrotor", "lqrsim/DifferentialDrive-v0": "differential_drive"}
-ANY = "lqrsim/Scenario-v0"
+ANY_SCENARIO = "lqrsim/Scenario-v0"
 
 
 def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any]:
@@ -36,7 +36,7 @@ def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any
         function, "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}".
       options: options of `Environment` and of `gymnasium.make`.
     """
-    return gymnasium.make(ANY, scenario=scenario, **options)
+    return gymnasium.make(ANY_SCENARIO, scenario=scenario, **options)
 
 
 def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
@@ -48,7 +48,7 @@ def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasi
     return VectorEnvironment(scenario, num_envs=num_envs, **options)
 
 
-for _name, _scenario in {**SCENARIOS, ANY: None}.items():
+for _name, _scenario in {**SCENARIOS, ANY_SCENARIO: None}.items():
     if _name not in gymnasium.registry:
         gymnasium.register(
             _name,

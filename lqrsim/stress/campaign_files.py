@@ -81,8 +81,8 @@ Table = dict[str, npt.NDArray[np.generic]]
 _KEY = b"lqrsim shard"
 _TEXTS = "outcome", "obstacle", "reason"
 _TYPES = dict.fromkeys((*COLUMNS, "reason"), pa.float64()) | {"trial": pa.int64()} | dict.fromkeys(_TEXTS, pa.string())
-_SNAPPY = 22  # bytes that come of one at most; of other compressions it may be tens of thousands
-_AT_ONCE = 1 << 26  # bytes of text that are unpacked before they are looked at
+_SNAPPY_RATIO = 22  # bytes that come of one at most; of other compressions it may be tens of thousands
+_TEXT_BYTES = 1 << 26  # bytes of text that are unpacked before they are looked at
 
 
 class Damaged(Exception):
@@ -157,7 +157,7 @@ def _texts(file: pq.ParquetFile, name: str, size: int) -> npt.NDArray[np.str_]:
     # In parts, of a column of `size` bytes: a text that rows have in common stands in the file once, and is unpacked
     # for each.
     column = list[str]()
-    for part in file.iter_batches(max(_AT_ONCE // (_SNAPPY * size + 1), 1), columns=[name], use_threads=False):
+    for part in file.iter_batches(max(_TEXT_BYTES // (_SNAPPY_RATIO * size + 1), 1), columns=[name], use_threads=False):
         texts = part.column(0).to_pylist()
         if (longest := max(map(len, texts), default=0)) > LONGEST:
             raise ValueError(f"a text of {longest} characters")

@@ -30,14 +30,14 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import names_code
 from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
-from lqrsim.stress.multilevel_splitting import MOST, Keep, SplittingResult, check_keep, failure_probability
+from lqrsim.stress.multilevel_splitting import MOST_REPEATS, Keep, SplittingResult, check_keep, failure_probability
 from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.study import Study, disturbances_as_json
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
 from lqrsim.versions import changed, versions
 
 FAILURES = {"collision": collision_score, "miss": miss_score}
-TIE_EVERY = 5.0  # s between reports while the pilot run draws more at a tie
+TIE_REPORT_EVERY = 5.0  # s between reports while the pilot run draws more at a tie
 Report = Annotated[Callable[[str], object], Want("a function of a line of text")]
 
 
@@ -88,7 +88,7 @@ class ReliabilityProblem(Study):
         self,
         *,
         particles: Annotated[int, Bounds(at_least=20)] = 250,
-        repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST)] = 10,
+        repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST_REPEATS)] = 10,
         keep: Keep = 0.1,
         seed: Seed | None = None,
         report: Report | None = None,
@@ -119,7 +119,7 @@ class ReliabilityProblem(Study):
     def smallest_failure(
         self,
         *,
-        rounds: Annotated[int, Bounds(at_least=1, at_most=MOST)] = 40,
+        rounds: Annotated[int, Bounds(at_least=1, at_most=MOST_REPEATS)] = 40,
         particles: Annotated[int, Bounds(at_least=20)] = 200,
         seed: Seed | None = None,
         report: Report | None = None,
@@ -170,7 +170,7 @@ class ReliabilityProblem(Study):
             nonlocal last, when
             now = time.monotonic()
             tie = ", where scores tie: drawing more" if level == last else ""
-            if not tie or now - when > TIE_EVERY:
+            if not tie or now - when > TIE_REPORT_EVERY:
                 report(f"level: {-level:.3g} {unit} from failing{tie}" if level < 0 else "level: failing")
                 when = now
             last = level
@@ -277,7 +277,7 @@ class Recheck:
 def certify(
     certificate: FailureCertificate,
     *,
-    repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST)] | None = None,
+    repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST_REPEATS)] | None = None,
     seed: Seed | None = None,
     scenario: str | None = None,
     report: Report | None = None,

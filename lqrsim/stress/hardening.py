@@ -42,12 +42,12 @@ from lqrsim.stress.policies import DESIGNED, design_uncertainty, make_controller
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 POLICIES = ("smooth", *DESIGNED)  # whose law can be designed for any plan, and predicted
-AIM = 0.5  # of the requested probability, so that the whole interval of the measured one is likely to be below it
-LESS, MORE = 0.8, 2.0  # limits of the factor on a number of standard deviations, from one plan to the next
-COUNTED = 5e-3  # requests from which failures are counted by default; smaller probabilities are cheaper by splitting
-FAILING = 10  # trials of each repetition that fail at the requested probability, if failures are counted
+AIMED_FRACTION = 0.5  # of the requested probability, so that the measured one's whole interval is likely to be below it
+LEAST_FACTOR, LARGEST_FACTOR = 0.8, 2.0  # on a number of standard deviations, from one plan to the next
+COUNTED_CHANCE = 5e-3  # requests from which failures are counted by default; for smaller ones splitting is cheaper
+FAILING_TRIALS = 10  # trials of each repetition that fail at the requested probability, if failures are counted
 MOST_COUNTED = 100_000  # trials that are run where splitting found no failure: about as many as two splittings
-SHOWN = 300  # failing runs that are run again, to see where they fail
+REPLAYED_FAILURES = 300  # failing runs that are run again, to see where they fail
 MOST_ROUNDS = 20
 REMEDY = "more range of the controls, less lag, or other tolerances may help"
 
@@ -179,7 +179,7 @@ def harden(
       KeyboardInterrupt: Ctrl-C; its `found` is the HardenedPlan after the rounds that are done, or None.
     """
     if particles is None:
-        particles = 250 if chance < COUNTED else max(20, ceil(FAILING / chance))
+        particles = 250 if chance < COUNTED_CHANCE else max(20, ceil(FAILING_TRIALS / chance))
     seed = problem.seed if seed is None else seed
     options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}
     search, say = _Search(problem, chance, options, progress), report or (lambda line: None)
@@ -265,10 +265,10 @@ class _Search:
         critical, chance = hit > 0, last.rare.probability.value
         # The runs that leave the plan for good take their part of the request.
         left = max(self.chance - chance * last.strays, 0.1 * self.chance)
-        quantile = -ndtri(AIM * left / critical.sum())
+        quantile = -ndtri(AIMED_FRACTION * left / critical.sum())
         measured = -ndtri(np.clip(chance * hit[critical], 1e-300, 0.4))
         wanted = np.minimum(kept, quantile * (kept[critical] / measured).max())
-        wanted[critical] = kept[critical] * np.clip(quantile / measured, LESS, MORE)
+        wanted[critical] = kept[critical] * np.clip(quantile / measured, LEAST_FACTOR, LARGEST_FACTOR)
         return wanted
 
     def measure(self, solution: Solution, label: str) -> HardeningRound:
@@ -286,7 +286,7 @@ class _Search:
         cost = float(costs_of(problem, plan.states[None], plan.controls[None])[0])
         hit, strays = dict[str, float](), 0.0
         if rare is not None:
-            run = rare.problem.score.rollout(rare.typical(SHOWN), frames=False)
+            run = rare.problem.score.rollout(rare.typical(REPLAYED_FAILURES), frames=False)
             distances = np.linalg.norm((run.states[:, -1] - plan.states[-1])[:, place], axis=1)
             widest = np.sqrt(np.linalg.eigvalsh(tube.position_covariance).max()) if place else np.inf
             hits = np.array(run.obstacles)[(distances <= STRAY * widest) & (np.array(run.outcome) == "collided")]
@@ -306,7 +306,7 @@ class _Search:
                 self.progress(begun + done, 2 * self.options["rounds"] * repetitions, f"{label}: {text}")
 
         options: dict[str, Any] = {"repetitions": repetitions, "seed": seed, "progress": tell}
-        keep = 0.0 if self.chance * particles >= FAILING else 0.1
+        keep = 0.0 if self.chance * particles >= FAILING_TRIALS else 0.1
         try:
             return problem.rare_failures(**options, particles=particles, keep=keep)
         except NoFailure as none:
@@ -332,7 +332,7 @@ class _Search:
             return (
                 f"splitting found no failure of plan {len(self.rounds)} but may have missed some, and"
                 f" {last.unfailing:,} trials without one prove at most {last.probability.high:.2g}; allow more"
-                f" particles: from {ceil(FAILING / self.chance):,} on failures are counted"
+                f" particles: from {ceil(FAILING_TRIALS / self.chance):,} on failures are counted"
             )
         after, strays = f"not after {len(self.rounds)} plans", last.strays
         if strays < 0.5:

@@ -33,14 +33,14 @@ from lqrsim.errors import Array, InputError, check_memory, shaped
 from lqrsim.process import keeping
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate, rounded
 
-MOST = 10_000  # largest number of repetitions, moves, levels and rounds
+MOST_REPEATS = 10_000  # largest number of repetitions, moves, levels and rounds
 Score = Annotated[Callable[[Array], Array], Want("a function of vectors (K, size)")]
 OnLevel = Annotated[Callable[[float], object], Want("a function of a level")]
-Rounds = Annotated[int, Bounds(at_least=1, at_most=MOST)]
-Repetitions = Annotated[int, Bounds(at_least=2, at_most=MOST)]
+Rounds = Annotated[int, Bounds(at_least=1, at_most=MOST_REPEATS)]
+Repetitions = Annotated[int, Bounds(at_least=2, at_most=MOST_REPEATS)]
 Keep = Annotated[float, Bounds(at_least=0.0, at_most=0.5)]
 ACCEPTANCE = 0.4  # fraction of accepted moves at which the pilot run aims
-ABOVE = 10  # vectors above a tie with which the pilot run goes on; their number then varies by a third
+ENOUGH_ABOVE_TIE = 10  # vectors above a tie with which the pilot run goes on; their number then varies by a third
 MOST_BATCHES = 64  # batches of vectors that the pilot run draws at a tie
 
 
@@ -242,7 +242,7 @@ class _Splitting:
         """Find the levels, the last of which is 0; the step size at all levels except the last; the batches at each."""
         vectors, scores = self.draw(rng)
         levels, step_sizes, batches = list[float](), list[float](), list[int]()
-        b, enough = 0.5, min(ABOVE, int(keep * self.particles))
+        b, enough = 0.5, min(ENOUGH_ABOVE_TIE, int(keep * self.particles))
         while len(levels) < most_levels:
             level, batch_count = min(float(np.quantile(scores, 1 - keep, method="inverted_cdf")), 0.0), 1
             on_level(level)

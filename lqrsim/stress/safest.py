@@ -20,7 +20,7 @@ from lqrsim.stress.funnels import MOST_TRIALS
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.statistics import rate as rate_of
 
-SAME = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
+SAME_PLAN = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
 
 
 @checked
@@ -120,7 +120,7 @@ def smooth_safest(
 
 
 def _same(first: Solution, second: Solution) -> bool:
-    """Whether two plans are the same within SAME."""
+    """Whether two plans are the same within SAME_PLAN."""
     deviation = first.policy.state_coordinates.difference(first.trajectory.states, second.trajectory.states)
     scale = np.maximum(np.ptp(second.trajectory.states, axis=0), 1e-9)
-    return bool((np.abs(deviation) <= SAME * scale).all())
+    return bool((np.abs(deviation) <= SAME_PLAN * scale).all())

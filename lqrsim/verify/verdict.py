@@ -94,8 +94,8 @@ def _quantile_95(vectors: Array) -> float:
     return float(np.quantile(_lengths(vectors), 0.95))
 
 
-HIDDEN = 0.05  # fraction of the frames in which the robot may be hidden
-SCALE = 0.002  # largest error of the scale
+HIDDEN_FRACTION = 0.05  # of the frames, in which the robot may be hidden
+SCALE_ERROR = 0.002  # largest, of the scale
 VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
 
@@ -189,15 +189,15 @@ def compare(
       interval: seconds between two frames; the shift must be less than a quarter of it.
     """
     good = np.asarray(np.isfinite(seen).all(axis=1))
-    detail = f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them"
-    tests = [*others, Criterion("seen", bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2, detail)]
+    detail = f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN_FRACTION):.0f} % of them"
+    tests = [*others, Criterion("seen", bool(good.mean() >= 1 - HIDDEN_FRACTION) and int(good.sum()) > 2, detail)]
     rms, worst, shift, scale, likely = np.nan, np.nan, np.nan, np.nan, "the robot is not in the pictures, or too small"
     if good.sum() > 2:
         error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
         distance = np.linalg.norm(error, axis=1)
         (shift, shift_error), (stretch, stretch_error) = _fit(error, velocity, actual[good])
         # A robot that hardly moves determines neither shift nor scale; the bound is then the uncertainty of the fit.
-        late, wide = max(interval / 4, 4 * shift_error), max(SCALE, 4 * stretch_error)
+        late, wide = max(interval / 4, 4 * shift_error), max(SCALE_ERROR, 4 * stretch_error)
         rms, worst, scale, when = _rms(distance), float(distance.max()), 1 + stretch, times[good][distance.argmax()]
         detail = f"at worst {1e3 * worst:.1f} mm off, at {when:.2f} s, want {1e3 * bound:.1f} at most"
         tests.append(Criterion("position", worst <= bound, detail))
