@@ -176,7 +176,7 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
 
 
 _MAGIC = b"PAR1"
-_DEEPEST = 20  # structures within each other; a footer has 7
+_DEEPEST = 21  # values within each other; a footer has fewer
 _BOOLEANS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _MAP, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, (9, 10), 11, 12
 
 
@@ -198,22 +198,13 @@ def _chunks(contents: bytes) -> list[list[_Chunk]]:
     length = int.from_bytes(contents[-8:-4], "little")
     if contents[-4:] != _MAGIC or not 0 < length <= len(contents) - 12:
         raise ValueError("no footer of parquet")
-    footer = _struct(io.BytesIO(contents[-8 - length : -8]), _DEEPEST)
+    footer = _value(io.BytesIO(contents[-8 - length : -8]), _STRUCT, _DEEPEST)
     columns = [[chunk[3] for chunk in group[1]] for group in footer[4]]
     return [[_Chunk(chunk[4], chunk[5], chunk[7]) for chunk in group] for group in columns]
 
 
-def _struct(data: io.BytesIO, depth: int) -> dict[int, Any]:
-    """The fields of a structure by their numbers."""
-    values, number = dict[int, Any](), 0
-    while head := data.read(1)[0]:
-        number = number + (head >> 4) if head >> 4 else _integer(data)
-        kind = head & 15
-        values[number] = kind == _BOOLEANS[0] if kind in _BOOLEANS else _value(data, kind, depth)
-    return values
-
-
 def _value(data: io.BytesIO, kind: int, depth: int) -> Any:
+    """A value of Thrift; of a structure its fields by their numbers."""
     if depth == 0:
         raise ValueError("structures too deep within each other")
     if kind in (*_BOOLEANS, _BYTE):
@@ -233,7 +224,12 @@ def _value(data: io.BytesIO, kind: int, depth: int) -> Any:
         kinds = data.read(1)[0] if (count := _unsigned(data)) else 0
         return [(_value(data, kinds >> 4, depth - 1), _value(data, kinds & 15, depth - 1)) for _ in range(count)]
     if kind == _STRUCT:
-        return _struct(data, depth - 1)
+        values, number = dict[int, Any](), 0
+        while head := data.read(1)[0]:
+            number = number + (head >> 4) if head >> 4 else _integer(data)
+            kind = head & 15
+            values[number] = kind == _BOOLEANS[0] if kind in _BOOLEANS else _value(data, kind, depth - 1)
+        return values
     raise ValueError(f"a field of kind {kind}")
 
 

@@ -110,7 +110,11 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
                 late = worker.ready
             except (EOFError, OSError):
                 worker.process.join(5.0)
-                reason = f"its worker ended {ATTEMPTS} times, at last with {_exit(worker.process.exitcode)}"
+                code = worker.process.exitcode
+                end = f"exit code {code}"
+                if code is not None and code < 0:
+                    end = f"signal {-code} ({signal.strsignal(-code)})"
+                reason = f"its worker ended {ATTEMPTS} times, at last with {end}"
             else:
                 local.worker = worker
                 return file
@@ -210,12 +214,6 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _exit(code: int | None) -> str:
-    if code is not None and code < 0:
-        return f"signal {-code} ({signal.strsignal(-code)})"
-    return f"exit code {code}"
 
 
 def _worker_environment() -> contextlib.AbstractContextManager[None]:
