@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from lqrsim import process
@@ -90,7 +90,9 @@ def _run(arguments: list[str]) -> int:
         with process.printing():
             print(f"usage: lqrsim COMMAND ...\n\n{DESCRIPTION.format(commands=lines)}")
         raise SystemExit(0)
-    with process.printing(), _wide_enough():
+    # With a few columns, help would never be completed.
+    too_narrow = shutil.get_terminal_size().columns < NARROWEST
+    with process.printing(), process.environment(**{"COLUMNS": str(NARROWEST)} if too_narrow else {}):
         command = _parse(arguments)
 
     if limit := _memory_limit():
@@ -152,16 +154,6 @@ def _memory_limit() -> int:
     return limit if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY else 0
 
 
-@contextlib.contextmanager
-def _wide_enough() -> Iterator[None]:
-    """A block in which a terminal has NARROWEST columns at least: with a few, help would never be completed."""
-    if shutil.get_terminal_size().columns >= NARROWEST:
-        yield
-        return
-    with process.environment(COLUMNS=str(NARROWEST)):
-        yield
-
-
 def _parse(arguments: list[str]) -> Any:
     """Parse the arguments into a command. What is wrong with them is returned as a line, or printed in a box by tyro.
 
@@ -174,7 +166,11 @@ def _parse(arguments: list[str]) -> Any:
 
     printed = io.StringIO()
     try:
-        with RULES, _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(RULES)
+            if "--json" in arguments:  # in lines so wide that no word is broken
+                stack.enter_context(process.environment(COLUMNS="100000"))
+                stack.enter_context(contextlib.redirect_stderr(printed))
             command = tyro.cli(Command, prog="lqrsim", args=arguments)
         return _repeated_option(command, arguments) or command
     except SystemExit as end:
@@ -200,13 +196,6 @@ def _repeated_option(command: Any, arguments: list[str]) -> str:
             several = isinstance(getattr(command, option[2:].replace("-", "_"), None), tuple)
             return f"{option}: got it {count} times, want it once" + (", with all its values" if several else "")
     return ""
-
-
-@contextlib.contextmanager
-def _unwrapped(printed: io.StringIO) -> Iterator[None]:
-    """A block that prints errors to `printed`, in lines so wide that no word is broken."""
-    with process.environment(COLUMNS="100000"), contextlib.redirect_stderr(printed):
-        yield
 
 
 if __name__ == "__main__":

@@ -136,13 +136,6 @@ PROBES = 32  # trials that show how much the disturbances change the clearance w
 STEADY = 20.0  # a clearance of more of its standard deviations does not show which trials are near a collision
 
 
-def _departure(clearance: Array) -> int:
-    """The number of knots until the clearance (T+1,) first falls by a tenth, if it is least before; else 0."""
-    fallen = clearance < 0.9 * np.maximum.accumulate(clearance)
-    first = int(fallen.argmax())
-    return first if first and clearance[:first].min() <= clearance[first:].min() else 0
-
-
 @checked
 @dataclass(eq=False)
 class TrialScore:
@@ -184,13 +177,16 @@ class TrialScore:
         draws = [_CountedDraws() for _ in self.disturbances]
         usual = self._simulate(1, lambda trial, stream: draws[stream], frames=False)
         self.sizes = tuple(stream.used for stream in draws)
-        own = self.failure in (collision_score, miss_score)
-        self.first = _departure(usual.clearance[0]) if own and self.size else 0
-        if self.first:
+        self.first, clearance = 0, usual.clearance[0]
+        # The number of knots until the clearance first falls by a tenth; it must be least before.
+        departure = int((clearance < 0.9 * np.maximum.accumulate(clearance)).argmax())
+        if not (departure and clearance[:departure].min() <= clearance[departure:].min()):
+            return
+        if self.size and self.failure in (collision_score, miss_score):
             numbers = np.random.default_rng(0).standard_normal((PROBES, self.size))
-            clearance = self.rollout(numbers, frames=False).clearance[:, : self.first]
-            steady = clearance.mean(axis=0) > STEADY * clearance.std(axis=0)
-            self.first = self.first if steady.all() else int(steady.argmin())
+            probed = self.rollout(numbers, frames=False).clearance[:, :departure]
+            steady = probed.mean(axis=0) > STEADY * probed.std(axis=0)
+            self.first = departure if steady.all() else int(steady.argmin())
 
     @property
     def size(self) -> int:
