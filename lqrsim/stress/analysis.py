@@ -268,10 +268,10 @@ def comparisons(table: Table) -> list[Comparison]:
         and second in table
         and not (alike(first, table[first]) and alike(second, table[second]))
     ]
-    return compared(pairs, table, table)
+    return compare_cells(pairs, table, table)
 
 
-def compared(
+def compare_cells(
     pairs: Iterable[tuple[Cell, Cell]], firsts: Table, seconds: Table, *, paired: bool = True
 ) -> list[Comparison]:
     """Compare pairs of cells, with p-values adjusted for their number (Holm).
@@ -280,31 +280,32 @@ def compared(
       paired: whether trials of the same number are compared with each other, see `comparisons`. If not, the difference
         of success has Newcombe's hybrid score interval for independent proportions (Statistics in Medicine 17, 1998).
     """
-    compared = [_compared(first, second, firsts[first], seconds[second], paired=paired) for first, second in pairs]
-    tested = [place for place, pair in enumerate(compared) if not np.isnan(pair.p_value)]
-    p_values = statistics.holm([compared[place].p_value for place in tested]).tolist()
-    for place, adjusted in zip(tested, p_values, strict=True):
-        compared[place] = replace(compared[place], adjusted=adjusted)
+    compared = list[Comparison]()
+    for first, second in pairs:
+        outcomes, other_outcomes = firsts[first], seconds[second]
+        rates = success(first, outcomes), success(second, other_outcomes)
+        rms, both, only_first, only_second = None, 0, None, None
+        if paired:
+            if not np.array_equal(outcomes.trial, other_outcomes.trial):
+                raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
+            split = statistics.compare(succeeded(outcomes), succeeded(other_outcomes))
+            only_first, only_second, p_value = split.only_first, split.only_second, split.p_value
+            difference = statistics.paired_difference(only_first, only_second, len(outcomes))
+            joint = succeeded(outcomes) & succeeded(other_outcomes)
+            both = int(joint.sum())
+            rms = statistics.mean(outcomes.rms[joint] - other_outcomes.rms[joint]) if both > 1 else None
+        else:
+            difference, p_value = statistics.independent_difference(*((rate.reached, rate.trials) for rate in rates))
+        if all(rate.alike for rate in rates):  # the difference of two runs
+            difference, p_value = replace(difference, low=difference.value, high=difference.value), float("nan")
+        compared.append(
+            Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)
+        )
+    tested = [number for number, comparison in enumerate(compared) if not np.isnan(comparison.p_value)]
+    p_values = statistics.holm([compared[number].p_value for number in tested]).tolist()
+    for number, adjusted in zip(tested, p_values, strict=True):
+        compared[number] = replace(compared[number], adjusted=adjusted)
     return compared
-
-
-def _compared(first: Cell, second: Cell, of_first: Outcomes, of_second: Outcomes, *, paired: bool) -> Comparison:
-    rates = success(first, of_first), success(second, of_second)
-    rms, both, only_first, only_second = None, 0, None, None
-    if paired:
-        if not np.array_equal(of_first.trial, of_second.trial):
-            raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
-        pairs = statistics.compare(succeeded(of_first), succeeded(of_second))
-        only_first, only_second, p_value = pairs.only_first, pairs.only_second, pairs.p_value
-        difference = statistics.paired_difference(only_first, only_second, len(of_first))
-        joint = succeeded(of_first) & succeeded(of_second)
-        both = int(joint.sum())
-        rms = statistics.mean(of_first.rms[joint] - of_second.rms[joint]) if both > 1 else None
-    else:
-        difference, p_value = statistics.independent_difference(*((rate.reached, rate.trials) for rate in rates))
-    if all(rate.alike for rate in rates):  # the difference of two runs
-        difference, p_value = replace(difference, low=difference.value, high=difference.value), float("nan")
-    return Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)
 
 
 def modes(outcomes: Outcomes) -> dict[tuple[str, str], int]:

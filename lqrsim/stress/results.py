@@ -473,7 +473,7 @@ def compare(
     firsts, seconds = (
         {pair[side]: results[side].outcomes(pair[side]).first(counts[side]) for pair in pairs} for side in (0, 1)
     )
-    comparisons = analysis.compared(pairs, firsts, seconds, paired=paired)
+    comparisons = analysis.compare_cells(pairs, firsts, seconds, paired=paired)
     of = [f"{policy} of " for policy in chosen] or ["", ""]
     notes = [f"first: {of[0]}{results[0].folder}; second: {of[1]}{results[1].folder}"]
     differ = [name for name in _SETTINGS if campaigns[0][name] != campaigns[1][name]]
