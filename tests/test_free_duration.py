@@ -241,11 +241,9 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
 
     def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
         now[0] += 100.0
-        return strategy.solve(fixed, settings, stop=stop)
+        return strategy.solve_fixed(fixed, settings, stop)
 
-    solution = free_duration.solve_for_duration(
-        problem(), SmootherSettings(), solve, attentive=False, callback=None, stop=stop
-    )
+    solution = free_duration.solve_for_duration(problem(), SmootherSettings(), solve, stop)
     assert solution.status is Status.CONVERGED
     assert now[0] >= 300.0  # the stated duration, a shorter one, and the end
     assert max(one.seconds for one in solution.iterations) < 50.0

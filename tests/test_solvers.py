@@ -403,8 +403,8 @@ class TestProgress:
         monkeypatch.setattr(budget, "SILENT", 1e3)
         ls.smooth(slow, callback=lambda iteration: None)
         monkeypatch.setattr(budget, "SILENT", 1e-3)
-        stop = budget.Stop(told=np.inf)
-        with stop.reporting("smooth", attentive=True):
+        stop = budget.Stop(attentive=True, told=np.inf)
+        with stop.reporting("smooth"):
             time.sleep(0.02)
         assert not caplog.records
         ls.smooth_many([slow], progress=lambda done, of: None)

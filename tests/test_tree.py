@@ -153,13 +153,13 @@ def test_trees_grow_until_the_time_is_over_and_not_where_they_cannot(pushed_trap
     stop = Stop()
     for limit in (0.0, None):
         stop.begin(limit)
-        assert not list(ways_by_trees(pushed_trap, stop, attentive=False))
+        assert not list(ways_by_trees(pushed_trap, stop))
     stop.begin(600.0)
-    seeds = [seed for seed, _ in itertools.islice(ways_by_trees(pushed_trap, stop, attentive=False), 2)]
+    seeds = [seed for seed, _ in itertools.islice(ways_by_trees(pushed_trap, stop), 2)]
     assert len(set(seeds)) == 2
     inside = dataclasses.replace(pushed_trap, initial=ls.FixedState([1.6, 0, 0, 0]))
     for problem in (inside, pushed_trap.with_constraints(pushed_trap.constraints[:2])):
-        assert not list(ways_by_trees(problem, stop, attentive=False))
+        assert not list(ways_by_trees(problem, stop))
 
 
 def test_headings_reach_their_goals_up_to_whole_turns() -> None:

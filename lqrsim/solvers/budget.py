@@ -27,14 +27,17 @@ NOTED = 10.0  # compiling is mentioned if it takes longer than the time limit di
 
 @dataclass
 class Stop:
-    """The reason for a solve to end early: a deadline on the clock of `time.perf_counter`, or an exception.
+    """What all runs of a solve share: its caller's callback and threads, and the reason to end early.
 
-    All runs of a solve share one, and so do all solves of which a solve for a free duration consists.
-
-    An exception of the callback, or Ctrl-C, ends a solve like a deadline, with the best plan so far. `finish` raises
-    the exception again, with that plan as its `solution`.
+    The reason is a deadline on the clock of `time.perf_counter`, or an exception. An exception of the callback, or
+    Ctrl-C, ends a solve like a deadline, with the best plan so far. `finish` raises the exception again, with that plan
+    as its `solution`.
     """
 
+    callback: Callback | None = None  # called with the iterations of runs that are finished
+    threads: int = 1  # for the choice among starts, and for derivatives along a trajectory
+    # Whether compiled code returns regularly, so that Ctrl-C ends it. If many problems are solved at once, it does not.
+    attentive: bool = False
     deadline: float = np.inf
     begun: float = np.nan
     error: BaseException | None = None
@@ -86,9 +89,9 @@ class Stop:
         ]
         return ", ".join(part for part in parts if not part.endswith(" nan")) + left
 
-    def reporting(self, what: str, attentive: bool) -> contextlib.AbstractContextManager[None]:
+    def reporting(self, what: str) -> contextlib.AbstractContextManager[None]:
         """A block that reports the progress if the caller hears nothing for long, unless many problems are solved."""
-        if not attentive:
+        if not self.attentive:
             return contextlib.nullcontext()
         return reported(what, lambda: self.found, lambda: self.told, self.begun)
 
@@ -115,21 +118,16 @@ class Budget:
 
     Attributes:
       log: the iterations so far, by any method.
-      stop: the deadline, or the exception of the callback.
-      attentive: whether compiled code returns regularly, so that Ctrl-C ends it. If many problems are solved at once,
-        it does not.
     """
 
-    def __init__(
-        self, most: int, stop: Stop | None = None, *, callback: Callback | None = None, attentive: bool = False
-    ) -> None:
+    def __init__(self, most: int, stop: Stop | None = None, *, callback: Callback | None = None) -> None:
         self._most, self._callback, self._reported = most, callback, 0
-        self.stop, self.attentive = Stop() if stop is None else stop, attentive
+        self.stop = Stop() if stop is None else stop
         self.log: list[Iteration] = []
 
     def another(self) -> "Budget":
         """A budget for another run, with the same number of iterations."""
-        return Budget(self._most, self.stop, callback=self._callback, attentive=self.attentive)
+        return Budget(self._most, self.stop, callback=self._callback)
 
     @property
     def left(self) -> int:

@@ -323,11 +323,16 @@ class SolveRun:
         """The ending of smoothing; NOT_FINITE if a function is not finite at the start.
 
         Raises:
-          InputError: a function is not finite at the start, and `budget.attentive` is set.
+          InputError: a function is not finite at the start, and the solve is attentive; see `Stop`.
         """
         start, control = self.work.start, self.initial_guess.offset[0]
         return check_finite_at_start(
-            self.problem, self.ending, self._rows["cost"][: self._row], start, control, refuse=self.budget.attentive
+            self.problem,
+            self.ending,
+            self._rows["cost"][: self._row],
+            start,
+            control,
+            refuse=self.budget.stop.attentive,
         )
 
     def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0, patient: bool = False) -> RunResult:
@@ -615,7 +620,7 @@ class SolveRun:
         """Run the loop with these arguments until it ends, has written `last` rows, or the budget is over.
 
         Compiled code returns after each iteration if there is a callback, a deadline or a constraint to check, and
-        otherwise after `ATTENTION` if the budget is attentive. The seconds of an iteration are averaged over the
+        otherwise after `ATTENTION` if the solve is attentive. The seconds of an iteration are averaged over the
         iterations between two returns.
 
         Args:
@@ -624,10 +629,10 @@ class SolveRun:
         problem, budget, stop = self.problem, self.budget, self.budget.stop
         rows = np.zeros(max(budget.left, 1), LOG) if rows is None else rows
         functions = functions_of(problem)
-        heard = budget.attentive and (budget.watched or bool(functions))
+        heard = budget.stop.attentive and (budget.watched or bool(functions))
         single = heard or bool(problem.constraints) or stop.deadline < np.inf
         last = min(budget.left if last is None else last, first + budget.left)
-        bite = 1 if budget.attentive or single else last
+        bite = 1 if budget.stop.attentive or single else last
         for function in functions:
             function.forget()
         outcome, backward, failed, done = declarations.RUNNING, False, -1, first
@@ -644,7 +649,7 @@ class SolveRun:
                 stop.error, outcome = error, declarations.TIMED_OUT
                 break
             seconds = (time.perf_counter() - clock) / max(done - begin, 1)
-            if budget.attentive and not single:
+            if budget.stop.attentive and not single:
                 bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
             for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
                 cost, improvement, gap, optimality, residual, method = row

@@ -24,7 +24,7 @@ from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
-from lqrsim.solvers.budget import Budget, Callback, Laps, Stop
+from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resampled, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.interior_run import LITTLE, MUCH, Barrier
@@ -58,17 +58,16 @@ FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a sea
 
 
 def solve_for_duration(
-    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], *,
-    attentive: bool, callback: Callback | None, stop: Stop, begin: Solution | None = None,
+    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], stop: Stop,
+    begin: Solution | None = None,
 ) -> Solution:  # fmt: skip
     """Find the best duration, and finish the plan with that duration.
 
     Without a start from the caller, ways to the goal are sketched. Then comes the solution for the stated duration, in
     whose place a plan `begin` may be. From each of these the search goes to the best duration nearby. Where none led to
-    a plan, trees grow. `solve` is for problems with a fixed duration, within the time of `stop`; for `attentive` see
-    `Budget`.
+    a plan, trees grow. `solve` is for problems with a fixed duration, within the time of `stop`.
     """
-    search = DurationSearch(problem, settings, solve, attentive, callback, stop)
+    search = DurationSearch(problem, settings, solve, stop)
     alone = begin is None and settings.start is None and settings.safeguard
     if alone:
         search.follow_ways()
@@ -91,12 +90,12 @@ class DurationSearch:
 
     def __init__(
         self, problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution],
-        attentive: bool, callback: Callback | None, stop: Stop,
+        stop: Stop,
     ) -> None:  # fmt: skip
         assert problem.duration is not None
         self._problem, self._settings, self._solve = problem, settings, solve
-        self._range, self._stop, self._attentive = problem.duration, stop, attentive
-        self._budget = Budget(settings.max_iterations, stop, callback=callback)
+        self._range, self._stop = problem.duration, stop
+        self._budget = Budget(settings.max_iterations, stop, callback=stop.callback)
         self.best: tuple[Problem, InteriorResult] | None = None
         self.candidates = list[Candidate]()
         self._log = list[Iteration]()  # of the search that led to the best plan
@@ -114,7 +113,7 @@ class DurationSearch:
         for share, freed in SKETCHED:
             last = bool(sketches)
             for way in [way for way in routes if way.name not in {draft.way for draft in sketches}]:
-                with stop.reporting("smooth", self._attentive), stop.heeding():
+                with stop.reporting("smooth"), stop.heeding():
                     draft = self._sketched(way, share, free if freed else None)
                     self._total += draft.iterations
                     spent[way.name] += draft.iterations
@@ -151,7 +150,7 @@ class DurationSearch:
         """Grow trees while no plan is known, and go on from the ways through them."""
         if self.best is not None or any(solution.success for solution in self._fixed):
             return
-        for seed, way in ways_by_trees(self._problem, self._stop, attentive=self._attentive):
+        for seed, way in ways_by_trees(self._problem, self._stop):
             self._follow(f"trees of short plans, seed {seed}, {way.horizon:.4g} s", way)
             if self.best is not None:
                 return
@@ -244,7 +243,7 @@ class DurationSearch:
         `share` is of the tolerance.
         """
         problem, settings, before = self._problem, self._settings, len(budget.log)
-        with self._stop.reporting("smooth", self._attentive):
+        with self._stop.reporting("smooth"):
             ordinary, result = find_duration(
                 problem, begin, tolerance=share * settings.final(problem),
                 violation=settings.violation_tolerance(problem), budget=budget, price=settings.price,

@@ -18,7 +18,7 @@ from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
-from lqrsim.solvers.budget import Budget, Callback
+from lqrsim.solvers.budget import Budget, Callback, Stop
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun, check_finite_at_start
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
@@ -72,7 +72,7 @@ def ilqr(
     _check(problem, settings)
     warn_of_goal(problem)
     with problem.dynamics.solving(check_threads(None)):
-        return _solve(problem, settings, attentive=True, callback=callback)
+        return _solve(problem, settings, Stop(callback, attentive=True))
 
 
 def ilqr_many(
@@ -117,16 +117,14 @@ def _check(problem: Problem, settings: Settings) -> None:
         )
 
 
-def _solve(
-    problem: Problem, settings: Settings, *, attentive: bool = False, callback: Callback | None = None
-) -> Solution:
-    """Solve; `attentive`: see `Budget`."""
+def _solve(problem: Problem, settings: Settings, stop: Stop | None = None) -> Solution:
     if problem.control_rate is not None:
-        return solve_with_rates(problem, settings, partial(_solve, attentive=attentive, callback=callback))
+        return solve_with_rates(problem, settings, partial(_solve, stop=stop))
     assert problem.start is not None
-    budget = Budget(settings.max_iterations, callback=callback, attentive=attentive)
-    budget.stop.begin(settings.time_limit)
-    with budget.stop.not_counting():
+    stop = Stop() if stop is None else stop
+    stop.begin(settings.time_limit)
+    budget = Budget(settings.max_iterations, stop, callback=stop.callback)
+    with stop.not_counting():
         guess = resolve(settings.start, problem)
         if guess.prior is not None:  # a function may return one
             raise InputError(_NO_PRIOR)
@@ -135,11 +133,11 @@ def _solve(
         options = SmootherSettings(stop=settings.stop, tolerance=settings.tolerance, finish=None)
         run = SolveRun.lent(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
         run.work.fixed = True  # if by the initial cost alone
-    with budget.stop.reporting("ilqr", attentive):
+    with stop.reporting("ilqr"):
         ending = run.ilqr()
     log, work = budget.log, run.work
     costs = np.array([iteration.cost for iteration in log])
-    ending = check_finite_at_start(problem, ending, costs, start, control, refuse=attentive)
+    ending = check_finite_at_start(problem, ending, costs, start, control, refuse=stop.attentive)
     complete = len(log) > 0 and ending.failed < 0
     if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was made about the previous trajectory
         if not log:
@@ -158,4 +156,4 @@ def _solve(
         result = replace(result, detail=name_risk(run, result))
     solution = assemble(problem, result, log, solver="ilqr", options=settings.options(guess))
     run.give_back()
-    return budget.stop.finish(solution)
+    return stop.finish(solution)

@@ -190,10 +190,10 @@ class PreparedSolver(OneVersion):
         problem = base.from_state(state, after=after, previous=previous)
         if self._wide is not None:
             return self._solve_wide(self._wide, problem, start, time_limit, clock)
-        stop = Stop(reserve=self._pace + self._closing)
+        stop = Stop(attentive=True, reserve=self._pace + self._closing)
         if time_limit is not None:
             stop.deadline = clock + time_limit
-        budget = Budget(self.settings.max_iterations, stop, attentive=True)
+        budget = Budget(self.settings.max_iterations, stop)
         run = SolveRun.lent(
             problem, self.settings, resolve(start, problem), np.asarray(state, dtype=np.float64), budget
         )

@@ -1,6 +1,5 @@
 """`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. `strategy.py` describes what they try."""
 
-import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -10,8 +9,7 @@ from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.solvers.between_knots import between_knots
-from lqrsim.solvers.budget import Callback
+from lqrsim.solvers.budget import Callback, Stop
 from lqrsim.solvers.initial_guess import StartLike
 from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
@@ -113,7 +111,7 @@ def smooth(
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     warn_of_goal(problem)
-    return _solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
+    return solve(problem, settings, Stop(callback, check_threads(threads), attentive=True))
 
 
 def smooth_many(
@@ -147,16 +145,7 @@ def smooth_many(
         ends as NOT_FINITE, and its detail says where.
     """
     settings = settings_from(SmootherSettings, "smooth_many", options)
-    return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
-
-
-def _solve(problem: Problem, settings: SmootherSettings, **options: Any) -> Solution:
-    """Solve; the solution can look at its plan between the knots."""
-    solution = solve(problem, settings, **options)
-    vars(solution)["_examine_between_knots"] = functools.cache(
-        functools.partial(between_knots, problem, solution.trajectory)
-    )
-    return solution
+    return solve_all(all_driven_by(problems, noise, risk), settings, _check, solve, threads=threads, progress=progress)
 
 
 @checked

@@ -1,12 +1,13 @@
 """The attempts of `smooth`, in order, until one converges.
 
-`ATTEMPTS` says what is tried in which order, when, and from what. A free duration is found in an outer loop around
-these attempts (`free_duration.py`).
+`Search.make_attempts` says what is tried in which order, and when. Loops around these attempts (`solve`) find a free
+duration (`free_duration.py`), put right what a plan does between its knots (`between_knots.py`), and leave the last
+command out of a plan with a `control_rate` (`control_rates.py`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
      (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails.
-  with constraints: the interior point from one plan after another (`ATTEMPTS` of `constrained.py`).
+  with constraints: the interior point from one plan after another (`constrained.py`).
   with `finish=None`, `stop="cost"` or noise and constraints: smoothing, and the augmented Lagrangian for constraints
      (`augmented_lagrangian.py`). Without constraints, the dynamics of an MJCF are left to smoothing, too.
 
@@ -16,11 +17,11 @@ The budget of each start is `max_iterations`; all starts share one deadline (`bu
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +36,8 @@ from lqrsim.results.solution_parts import Candidate, Curvature, Iteration, Statu
 from lqrsim.solvers import compiled, reach
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
-from lqrsim.solvers.between_knots import solve_between_knots
-from lqrsim.solvers.budget import Budget, Callback, Stop
+from lqrsim.solvers.between_knots import between_knots, solve_between_knots
+from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.constrained import Known, Ladder
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun
@@ -91,79 +92,78 @@ CALLERS_START = "the given start"  # name of the start that the caller gives
 Finish = Callable[[SolveRun, Known], RunResult]
 
 
-def solve(
-    problem: Problem,
-    settings: SmootherSettings,
-    *,
-    attentive: bool = False,
-    threads: int = 1,
-    callback: Callback | None = None,
-    stop: Stop | None = None,
-    refinements: int = REFINEMENTS,
-    begin: Solution | None = None,
-    trees: bool = True,
+def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
+    """Solve one problem; the solution can look at its plan between the knots."""
+    stop = Stop() if stop is None else stop
+    stop.begin(settings.time_limit)
+    if problem.control_rate is None:
+        solution = _right_between_knots(problem, settings, stop)
+    else:
+        solution = solve_with_rates(problem, settings, partial(_right_between_knots, stop=stop))
+    vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, problem, solution.trajectory))
+    return solution
+
+
+def _right_between_knots(problem: Problem, settings: SmootherSettings, stop: Stop) -> Solution:
+    """Solve a problem without a `control_rate`."""
+    if problem.accuracy is None and not problem.between_knots:
+        return _of_best_duration(problem, settings, stop=stop)
+    return solve_between_knots(problem, settings, partial(_of_best_duration, stop=stop), stop)
+
+
+def _of_best_duration(
+    problem: Problem, settings: SmootherSettings, begin: Solution | None = None, *, stop: Stop
 ) -> Solution:
-    """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts.
+    """Solve a problem that is to be right at its knots. A search for its duration goes on from a plan `begin`."""
+    if problem.duration is None:
+        return solve_fixed(problem, settings, stop)
+    return solve_for_duration(problem, settings, partial(solve_fixed, stop=stop, trees=False), stop, begin)
 
-    `stop` is that of a solve of which this one is a part; its time limit is then for both. `refinements` is how often
-    constraints that the plan misses within its periods may be refined. A search for a free duration goes on from a plan
-    `begin`; its solves for fixed durations have no `trees`, which it grows itself.
-    """
-    if stop is None:
-        stop = Stop()
-        stop.begin(settings.time_limit)
 
-    def part(
-        stated: Problem, options: SmootherSettings, last: Solution | None = None, *, trees: bool = True
-    ) -> Solution:
-        how = {"attentive": attentive, "threads": threads, "callback": callback, "stop": stop}
-        return solve(stated, options, begin=last, trees=trees, **how)
+def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
+    """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
+    original, log = settings, tuple[Iteration, ...]()
+    if any(constraint._rough for constraint in problem.constraints):
+        problem, settings, log = outlined(problem, settings, stop)
+    preliminary = settings is not original
+    for refinements in reversed(range(REFINEMENTS + 1)):
+        solution = _searched(problem, settings, stop, trees=trees)
+        refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
+        if log:
+            solution = replace(solution, iterations=(*log, *solution.iterations))
+        allowed = original.violation_tolerance(problem)
+        settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
+        if refined is None and not (preliminary and solution.success and not settled and not stop.due):
+            break
+        problem, settings, log = refined or problem, replace(original, start=solution, starts=None), solution.iterations
+        preliminary = False
+    return stop.finish(solution)
 
-    if problem.control_rate is not None:
-        return solve_with_rates(problem, settings, part)
-    if problem.accuracy is not None or problem.between_knots:
-        return solve_between_knots(problem, settings, part, stop)
-    if problem.duration is not None:
-        fixed = partial(part, trees=False)
-        return solve_for_duration(
-            problem, settings, fixed, attentive=attentive, callback=callback, stop=stop, begin=begin
-        )
-    before, original = tuple[Iteration, ...](), settings
-    if refinements == REFINEMENTS and any(constraint._rough for constraint in problem.constraints):
-        problem, settings, before = outlined(problem, settings, attentive, threads, callback, stop)
+
+def _searched(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool) -> Solution:
+    """The answer of a search among starts, for constraints as they are."""
     with stop.not_counting():  # compiling
         starts = [(CALLERS_START, settings.start)] if settings.start is not None else guides(problem, settings.starts)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
         first = resolve(starts[0][1], problem).penalised(problem, settings.penalty)
         check_functions(problem, start, first.offset[0].copy())
         runs = [
-            SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
+            SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop))
             for guess in (first, *(resolve(choice, problem) for _, choice in starts[1:]))
         ]
     is_plan = settings.start is not None and first.prior is None and first.interior is None
     given_plan = runs[0].given() if is_plan else None
-    search = Search([name for name, _ in starts], runs, callback, threads, given_plan, trees=trees)
-    with stop.reporting("smooth", attentive):
-        search.attempt(ATTEMPTS)
+    search = Search([(name, run) for (name, _), run in zip(starts, runs, strict=True)], given_plan)
+    with stop.reporting("smooth"):
+        search.make_attempts(trees=trees)
     solution = search.solution()
     for run in runs:
         run.give_back()
-    refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
-    if before:
-        solution = replace(solution, iterations=(*before, *solution.iterations))
-    settled = solution.status is Status.COST_CONVERGED and solution.violation <= original.violation_tolerance(problem)
-    if refined is not None or (settings is not original and solution.success and not settled and not stop.due):
-        before, again = solution.iterations, replace(original, start=solution, starts=None)
-        solution = solve(
-            refined or problem, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
-            refinements=refinements - 1,
-        )  # fmt: skip
-        solution = replace(solution, iterations=(*before, *solution.iterations))
-    return stop.finish(solution)
+    return solution
 
 
 def outlined(
-    problem: Problem, settings: SmootherSettings, attentive: bool, threads: int, callback: Callback | None, stop: Stop
+    problem: Problem, settings: SmootherSettings, stop: Stop
 ) -> tuple[Problem, SmootherSettings, tuple[Iteration, ...]]:
     """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.
 
@@ -179,12 +179,12 @@ def outlined(
         return problem, rough, ()
     free = problem.with_constraints([constraint for constraint in problem.constraints if not constraint._rough])
     with stop.not_counting():  # compiling
-        guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop, attentive=attentive)
+        guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
         check_functions(free, start, guess.offset[0].copy())
         run = SolveRun.lent(free, rough, guess, start, budget)
-    budget.report_to(callback)
-    with problem.dynamics.solving(threads), stop.reporting("smooth", attentive):
+    budget.report_to(stop.callback)
+    with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
         run.smooth(OUTLINED)
     outline, log = Trajectory(*copied(run.work.best), problem.dt), tuple(budget.log)
     run.give_back()
@@ -275,15 +275,14 @@ class Search:
         they are to be.
     """
 
-    def __init__(
-        self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int,
-        given: RunResult | None = None, *, trees: bool = False,
-    ) -> None:  # fmt: skip
-        self._named = list(zip(names, runs, strict=True))
-        self._callback, self._threads, self._known, self._given, self._trees = callback, threads, Known(), given, trees
-        self._solving = threads if len(runs) == 1 else 1
-        self._problem, self._settings = runs[0].problem, runs[0].settings
-        self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
+    def __init__(self, named: list[tuple[str, SolveRun]], given: RunResult | None = None) -> None:
+        first = named[0][1]
+        self._named, self._known, self._given = named, Known(), given
+        self._problem, self._settings, self._start, self._budget = (
+            first.problem, first.settings, first.work.start.copy(), first.budget
+        )  # fmt: skip
+        self._callback, self._threads = self._budget.stop.callback, self._budget.stop.threads
+        self._solving = self._threads if len(named) == 1 else 1
         self._default = self._settings.start is None and self._settings.starts is None
         self.tried = not self._settings.safeguard
         self._finished: list[tuple[SolveRun, RunResult]] = []
@@ -302,13 +301,45 @@ class Search:
     def best(self) -> tuple[SolveRun, RunResult]:
         return self._finished[0]
 
-    def attempt(self, attempts: "Sequence[Attempt]") -> None:
-        """Make these attempts in turn, as far as they are called for."""
-        for attempt in attempts:
-            if attempt.when(self):
-                threads = contextlib.nullcontext() if attempt.others else self._problem.dynamics.solving(self._solving)
-                with threads:
-                    attempt.make(self)
+    def make_attempts(self, *, trees: bool) -> None:
+        """Make all attempts in turn, as far as they are called for; `trees` if they may grow.
+
+        Some also solve problems with other dynamics, for which they set the number of threads themselves.
+        """
+        self.choose_start()
+        with self._problem.dynamics.solving(self._solving):
+            if trees and self.may_go_on and self.is_barred:
+                self.grow_trees()
+            if self.touches:
+                self.try_detours()
+            self.leave_saddles()
+        if self.misses_unmoved:
+            self.move()
+        if self.risked_too_much:
+            with self._problem.dynamics.solving(self._solving):
+                self.retry_without_risk()
+        if self.may_soften:
+            self.soften()
+        if self.has_left_given:
+            self.keep()
+        if self.may_go_on and not self.best[1].success:
+            self.alternate()
+
+    def choose_start(self) -> tuple[SolveRun, RunResult]:
+        """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
+        with self._problem.dynamics.solving(self._solving):
+            self.run()
+            if self.is_lost:
+                self.try_finite()
+            if self.needs_others and self.is_barred:
+                self.try_past_constraints()
+            if self.needs_others and self.is_guided:
+                self.try_reweighted()
+            if self.needs_others and not self.is_guided and self.is_without_plan:
+                self.try_elsewhere()
+            if self.needs_others and not self.is_guided:
+                self.try_sinusoidal_controls()
+        return self.best
 
     def run(self) -> None:
         """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
@@ -451,28 +482,16 @@ class Search:
         constraints = [
             constraint for constraint, passed in zip(problem.constraints, passable(problem), strict=True) if not passed
         ]
-        free = problem.with_constraints(constraints)
-        starts = guides(free, None)
-        search = Search(
-            [name for name, _ in starts], [self._another(resolve(start, free), free) for _, start in starts],
-            self._callback, self._threads,
-        )  # fmt: skip
-        search.attempt(FIRST)
-        best = search.best[1]
+        _, best = self._searched(problem.with_constraints(constraints))
         if best.success and not self._budget.stop.due:
             run = self._add(policy_of(best, "a plan without what is in the way"))
             self._known.from_start = False
             self._offer(run, self._finish(run, refine))
 
-    @property
-    def may_grow(self) -> bool:
-        """Whether trees may find a way where nothing else did."""
-        return self._trees and self.may_go_on and self.is_barred
-
     def grow_trees(self) -> None:
         """Go on from ways through trees until one leads to a plan."""
-        problem, stop = self._problem, self._budget.stop
-        for seed, way in ways_by_trees(problem, stop, attentive=self._budget.attentive):
+        problem = self._problem
+        for seed, way in ways_by_trees(problem, self._budget.stop):
             run = self._add(resolve(way, problem), f"trees of short plans, seed {seed}")
             self._offer(run, self._finish(run, from_states))
             if self.best[1].success:
@@ -716,7 +735,7 @@ class Search:
             self._stiffen({f", {moved[0]}": begin}, harder, [], self._budget.left)
             if self.best[1].success or self._budget.stop.due:
                 return
-        results = {"": self._keep_softer(name, *self._search_softly(widest))}
+        results = {"": self._keep_softer(name, *self._searched(widest))}
         for cycles, side in itertools.product(SWAYS, (1, -1)):
             if not self._budget.stop.due:
                 begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
@@ -790,14 +809,6 @@ class Search:
         run = self._another(begin, soft)
         with soft.dynamics.solving(self._threads), run.budget.limited(most):
             return self._keep_softer(name, run, refine(run, Known()))
-
-    def _search_softly(self, soft: Problem) -> tuple[SolveRun, RunResult]:
-        """Plan for softer contacts by a search."""
-        starts = guides(soft, None)
-        runs = [self._another(resolve(start, soft), soft) for _, start in starts]
-        search = Search([name for name, _ in starts], runs, self._callback, self._threads)
-        search.attempt(FIRST)
-        return search.best
 
     def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
         """Keep a plan for softer contacts as a candidate."""
@@ -887,6 +898,11 @@ class Search:
 
     # Helper methods of the steps above.
 
+    def _searched(self, problem: Problem) -> tuple[SolveRun, RunResult]:
+        """The best run of a search for another problem, as far as the choice of a start."""
+        starts = [(name, self._another(resolve(start, problem), problem)) for name, start in guides(problem, None)]
+        return Search(starts).choose_start()
+
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
         problem = self._problem if problem is None else problem
@@ -944,6 +960,11 @@ class Search:
         return self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
 
     @property
+    def needs_others(self) -> bool:
+        """Whether other starts may be tried, and are to be, and not all were."""
+        return not self.tried and self.may_go_on and self.is_poor
+
+    @property
     def _is_unacceptable(self) -> bool:
         """Whether the best plan so far is unacceptable: far from the goal, or through an obstacle.
 
@@ -980,70 +1001,6 @@ class Search:
     def is_without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
         return bool(self._problem.constraints) and not self.best[1].success
-
-
-class Attempt(NamedTuple):
-    """One of the attempts of `smooth`.
-
-    Attributes:
-      words: what it begins with. when: whether it is called for. make: makes it.
-      others: whether it also solves problems with other dynamics, for which it sets the number of threads itself.
-    """
-
-    words: str
-    when: Callable[[Search], bool]
-    make: Callable[[Search], None]
-    others: bool = False
-
-
-def _is_poor(search: Search) -> bool:
-    return not search.tried and search.may_go_on and search.is_poor
-
-
-# What a search among starts is, also of a problem that is a part of another attempt.
-FIRST = (
-    Attempt("the most promising of the given starts, or of paths to the goal", lambda search: True, Search.run),
-    Attempt("constant controls, then a line of states", lambda search: search.is_lost, Search.try_finite),
-    Attempt(
-        "a plan without the constraints that may be passed on one side or another",
-        lambda search: _is_poor(search) and search.is_barred,
-        Search.try_past_constraints,
-    ),
-    Attempt(
-        "a plan for larger weights of obstacles and goal",
-        lambda search: _is_poor(search) and search.is_guided,
-        Search.try_reweighted,
-    ),
-    Attempt(
-        "ways of states, paths from start to goal, then oscillating controls",
-        lambda search: _is_poor(search) and not search.is_guided and search.is_without_plan,
-        Search.try_elsewhere,
-    ),
-    Attempt(
-        "oscillating controls", lambda search: _is_poor(search) and not search.is_guided, Search.try_sinusoidal_controls
-    ),
-)
-ATTEMPTS = (
-    *FIRST,
-    Attempt("ways through trees of short plans", lambda search: search.may_grow, Search.grow_trees),
-    Attempt("paths to the left and to the right", lambda search: search.touches, Search.try_detours),
-    Attempt("a plan beside a saddle", lambda search: search.is_at_saddle, Search.leave_saddles),
-    Attempt(
-        "pushes by one control at a time, and approaches to a body that nothing touches",
-        lambda search: search.misses_unmoved,
-        Search.move,
-        others=True,
-    ),
-    Attempt("a plan without risk", lambda search: search.risked_too_much, Search.retry_without_risk),
-    Attempt("plans for softer contacts", lambda search: search.may_soften, Search.soften, others=True),
-    Attempt("the plan that the caller gave", lambda search: search.has_left_given, Search.keep, others=True),
-    Attempt(
-        "the cheapest plan, softened again, and its contact modes",
-        lambda search: not search.best[1].success and search.may_go_on,
-        Search.alternate,
-        others=True,
-    ),
-)
 
 
 def left_domain(problem: Problem, result: RunResult) -> str:

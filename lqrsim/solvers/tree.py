@@ -43,12 +43,12 @@ DRAWS = 100  # largest number of states that are drawn until one violates nothin
 TOLERANCE = 1e-6  # of violations, that of a solve
 
 
-def ways_by_trees(problem: Problem, stop: Stop, *, attentive: bool) -> Iterator[tuple[int, Trajectory]]:
+def ways_by_trees(problem: Problem, stop: Stop) -> Iterator[tuple[int, Trajectory]]:
     """Ways from start to goal through one pair of trees after another, in `in_steps_of` the problem, and their seeds.
 
     They end with the time. Without a time limit there are none: trees know of no end, and a problem that cannot be
     solved would be told ten times as late. Nor are there any where trees cannot grow, where nothing is in the way, or
-    where start or goal violates what is. For `attentive` see `Budget`.
+    where start or goal violates what is.
     """
     ends = _ends(problem)
     if ends is None or not any(passable(problem)) or np.isinf(stop.deadline) or stop.due:
@@ -59,7 +59,7 @@ def ways_by_trees(problem: Problem, stop: Stop, *, attentive: bool) -> Iterator[
         return
     for seed in itertools.count():
         way = None
-        with stop.reporting("smooth", attentive), stop.heeding():
+        with stop.reporting("smooth"), stop.heeding():
             way = grow(problem, seed=seed, stop=stop)
         if stop.due:
             return
