@@ -1,12 +1,12 @@
 """The plans from which a plan that keeps the constraints is sought, in turn; the interior point finishes each.
 
-`ATTEMPTS` says which, when, and in which order. If none of them converges, the plan that violates the constraints least
-is the answer. It is INFEASIBLE if two starts lead to plans whose violation is stationary and equally large.
+`ConstrainedRun` says which, when, and in which order. If none of them leads to an optimum, the plan that violates the
+constraints least is the answer. It is INFEASIBLE if two starts lead to plans whose violation is stationary and equally
+large.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from lqrsim.solvers.restoration import Restored, restore
 from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Sizes
 
-FAR = 100.0  # a violation above this many tolerances may be evidence that the constraints are infeasible
+EVIDENT = 100.0  # a violation above this many tolerances may be evidence that the constraints are infeasible
 # Iterations of the augmented Lagrangian: from the plan of smoothing; undamped iterations without progress among these;
 # and damped iterations from a plan of the search, which creep along a wall's corner to optima that cost less.
 AUGMENTED, STALE, REFINED = 50, 25, 100
@@ -51,50 +51,34 @@ class Known:
     rows: Array | None = None  # (R,) typical sizes of the constraint rows, in which violations are measured
 
 
-class Ladder:
-    """Tries one start after another for a plan that keeps the constraints; `ATTEMPTS` says which each method tries.
+class ConstrainedRun:
+    """Tries one plan after another as the beginning of the interior point, until it converges.
 
-    Attributes:
-      guess, start: the start, and the rollout of its policy. stay: whether only plans from that rollout are tried.
-      given: whether the start is to be kept to. guided: whether there is an ObstacleCost, with which smoothing chooses
-        the side on which obstacles are passed. elastic: whether violations have a price. curved: whether the dynamics
-        have second derivatives.
-      smoothed: the plan of smoothing without the constraints, once it is known.
-      untried: whether the interior point has not yet begun from the start itself.
-      converged: whether an attempt has.
+    With `stay`, only plans from the rollout of the first policy are tried.
     """
 
     def __init__(self, run: SolveRun, known: Known, *, stay: bool = False) -> None:
         self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
-        self._point, self._stages, self.guess, self.stay = InteriorRun(run), run.stages, run.initial_guess, stay
+        self._point, self._stages, self._guess, self._stay = InteriorRun(run), run.stages, run.initial_guess, stay
         self._allowed = self._point.allowed
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
-        self.smoothed: Motion | None = None
-        self.curved = has_curvature(run.problem)
-        self.guided = any(cost.contact_curvature for cost in run.problem.obstacle_costs)
-        self.elastic = run.settings.elastic is not None
-        self.given = self.guess.trajectory is not None or bool(self.guess.gain.any()) or stay
+        self._smoothed: Motion | None = None  # the plan of smoothing without the constraints, once it is known
+        self._curved = has_curvature(run.problem)
+        # With an ObstacleCost, smoothing chooses the side on which obstacles are passed.
+        self._guided = any(cost.contact_curvature for cost in run.problem.obstacle_costs)
+        self._elastic = run.settings.elastic is not None
         if run.settings.penalty is None:
             self._point.without_multipliers()
-        self.start = self._point.start()
-        feasible = (self.given or run.settings.start is not None) and self.start.violation <= self._allowed
-        self._given = self.start if feasible else None  # the answer must not be worse
-        self.untried = self.may_start = stay or not known.from_start  # the runs of a search have the same start
+        self._start = self._point.start()  # the rollout of the first policy
+        self._keeps_start = self._guess.trajectory is not None or bool(self._guess.gain.any()) or stay
+        feasible = (self._keeps_start or run.settings.start is not None) and self._start.violation <= self._allowed
+        self._given = self._start if feasible else None  # the answer must not be worse
+        self._untried = stay or not known.from_start  # the runs of a search have the same start
 
-    @property
-    def converged(self) -> bool:
-        return self._best is not None and self._best.success
-
-    @property
-    def idle(self) -> bool:
-        """Whether the interior point ended where the constraints do not act."""
-        return self._point.idle
-
-    def climb(self) -> RunResult:
+    def solve(self) -> RunResult:
         """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
-        for attempt in ATTEMPTS:
-            result = attempt.make(self) if attempt.when(self) else None
+        for result in self._attempts():
             if result is not None and result.success:
                 if not self._worse(result):
                     break
@@ -103,22 +87,56 @@ class Ladder:
                 break
         return self._answer()
 
-    def finish_interior(self) -> RunResult | None:
-        assert self.guess.interior is not None
-        return self._remember(self._point.finish(self.guess.interior))
+    def _attempts(self) -> Iterator[RunResult | None]:
+        """The results of the attempts, each of which is made when it is asked for; None if it has none."""
+        run, budget, start, hard = self._run, self._budget, self._start, not self._elastic
+        from_start, known = self._untried, tuple(multipliers.values for multipliers in self._guess.multipliers)
+        if self._guess.interior is not None:  # of the search for a free duration: it is only finished
+            yield self._remember(self._point.finish(self._guess.interior))
+        if budget.over:
+            return
+        if any(values.any() for values in known):  # the plan of another solution, with its multipliers
+            yield self._interior(copied(start), LITTLE, multipliers=known)
+        if self._stay and self._guided:
+            with budget.limited(REFINED):
+                result = damped_from_rollout(run)
+            yield self._after_multipliers(result)
+        if self._keeps_start:  # a trajectory or a policy that the caller gave
+            yield self._from_given()
+        if not self._stay:
+            yield self._from_valley()
+        # Where the cost has kinks, as where a flat side of the robot lies along an obstacle, the interior point's
+        # measures do not vanish.
+        if not (self._converged or self._curved) and self._point.idle:
+            yield self._from_best_without_constraints()
+        if self._smoothed is not None and hard:
+            if self._guided:
+                yield self._from_multipliers()
+            yield self._at_a_price(self._smoothed)
+        if self._untried:
+            yield self._from_start()
+        if from_start and hard:
+            self._known.from_start = True
+            yield self._at_a_price(copied(start))
+        if hard and not (self._converged or self._curved):
+            self._point.without_multipliers()
+            result = by_multipliers(run)
+            yield self._remember(result if result.success else None)
+        if not self._converged:
+            yield self._from_best_without_constraints()
 
-    def from_neighbour(self) -> RunResult | None:
-        known = tuple(multipliers.values for multipliers in self.guess.multipliers)
-        return self._interior(copied(self.start), LITTLE, multipliers=known)
+    @property
+    def _converged(self) -> bool:
+        return self._best is not None and self._best.success
 
-    def from_given(self) -> RunResult | None:
+    def _from_given(self) -> RunResult | None:
         # A sketch of a path is not near the answer, even if standing still keeps the constraints.
-        begin = self.guess.trajectory or self.start
-        near = self.start.violation <= self._allowed and np.allclose(begin.states, self.start.states)
-        self.untried &= near or not np.array_equal(begin.states, self.start.states)
+        begin = self._guess.trajectory or self._start
+        near = self._start.violation <= self._allowed and np.allclose(begin.states, self._start.states)
+        self._untried &= near or not np.array_equal(begin.states, self._start.states)
         return self._interior(copied(begin), LITTLE if near else MUCH)
 
-    def from_best_without_constraints(self) -> RunResult | None:
+    def _from_best_without_constraints(self) -> RunResult | None:
         """From the best plan, by Newton's method without the constraints: they may not act at the optimum.
 
         Then the tolerance is that of the problem without them.
@@ -136,33 +154,33 @@ class Ladder:
             return None
         return self._remember(replace(result, multipliers=()))
 
-    def from_valley(self) -> RunResult | None:
+    def _from_valley(self) -> RunResult | None:
         run = self._run
-        run.smooth(GUIDED if self.guided else OPENING)
+        run.smooth(GUIDED if self._guided else OPENING)
         ending = run.checked_ending()
         converged = ending.success or ending.outcome == declarations.IN_VALLEY
         plan = run.work.arrays.last if converged else run.work.best  # the plan of least cost so far
         if ending is not run.ending or not np.isfinite(run.work.cost):
             return None
-        self.smoothed = copied(plan)
+        self._smoothed = copied(plan)
         if self._budget.stop.due:
             return None
         if ending.success and not self._budget.log[-1].violation:
             return self._remember(run.result(ending))
-        if ending.outcome != declarations.IN_VALLEY or (not self.guided and self._budget.log[-1].violation):
+        if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
             # If the augmented Lagrangian method follows, it does better than an interior point that lacks curvature.
-            return self._interior(self.smoothed, MUCH, stale=TROUBLED if self.guided and not self.curved else None)
+            return self._interior(self._smoothed, MUCH, stale=TROUBLED if self._guided and not self._curved else None)
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
         # answer.
         checkpoint = run.checkpoint()
         result = run.newton()
         if result.success and result.violation == 0:
             return self._remember(result)
-        bottom = copied(result) if result.success else self.smoothed
+        bottom = copied(result) if result.success else self._smoothed
         run.go_on(checkpoint)
-        if self._budget.stop.due or (self.guided and self._cuts(bottom)):
+        if self._budget.stop.due or (self._guided and self._cuts(bottom)):
             return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
-        return self._interior(bottom, LITTLE if self.guided else MUCH)
+        return self._interior(bottom, LITTLE if self._guided else MUCH)
 
     def _cuts(self, plan: Motion) -> bool:
         """Whether a plan misses a constraint by more than `DEEP` of the row's typical size."""
@@ -171,20 +189,11 @@ class Ladder:
         missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
         return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
 
-    def from_start(self) -> RunResult | None:
-        self.untried = False
-        return self._interior(copied(self.start), MUCH)
+    def _from_start(self) -> RunResult | None:
+        self._untried = False
+        return self._interior(copied(self._start), MUCH)
 
-    def from_start_at_a_price(self) -> RunResult | None:
-        self._known.from_start = True
-        return self._at_a_price(copied(self.start))
-
-    def from_damped(self) -> RunResult | None:
-        with self._budget.limited(REFINED):
-            result = damped_from_rollout(self._run)
-        return self._after_multipliers(result)
-
-    def from_multipliers(self) -> RunResult | None:
+    def _from_multipliers(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
 
         If that plan costs more than the start, the method has diverged.
@@ -192,18 +201,9 @@ class Ladder:
         run = self._run
         with self._budget.limited(AUGMENTED):
             result = meet_constraints(run, run.result(run.ending), stale=STALE)
-        if result.success and not self.curved:
+        if result.success and not self._curved:
             return self._remember(run.certified(result))
-        return self._after_multipliers(result, most=self.start.cost)
-
-    def by_multipliers(self) -> RunResult | None:
-        self._point.without_multipliers()
-        result = by_multipliers(self._run)
-        return self._remember(result if result.success else None)
-
-    def from_smoothed_at_a_price(self) -> RunResult | None:
-        assert self.smoothed is not None
-        return self._at_a_price(self.smoothed)
+        return self._after_multipliers(result, most=self._start.cost)
 
     def _after_multipliers(self, result: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
@@ -230,8 +230,8 @@ class Ladder:
                 return None
             if priced.near or price == PRICES[-1]:
                 result = self._interior(plan, MUCH)
-            elif self.untried and self.start.violation <= self._allowed:
-                result = self.from_start()
+            elif self._untried and self._start.violation <= self._allowed:
+                result = self._from_start()
             else:
                 continue
             if result is not None and result.success:
@@ -242,8 +242,8 @@ class Ladder:
         """Run the descent; its iterations go to the log."""
         budget, laps, restored = self._budget, Laps(self._budget), None
 
-        def watch(cost: float, violation: float, promised: float, seconds: float) -> bool:
-            laps.record(RESTORATION, cost, optimality=promised, violation=violation, seconds=seconds)
+        def watch(cost: float, violation: float, predicted: float, seconds: float) -> bool:
+            laps.record(RESTORATION, cost, optimality=predicted, violation=violation, seconds=seconds)
             return budget.stop.due
 
         sizes = self._stages.sizes(plan)
@@ -262,13 +262,9 @@ class Ladder:
     def _keep_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
         result = self._point.result(*plan)
-        if not result.violation > FAR * self._allowed:
+        if not result.violation > EVIDENT * self._allowed:
             return False
-        rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
-        new_evidence = evidence(
-            self._problem, self._run.work, result, shares=shares, sizes=rows, allowed=self._allowed,
-            control_size=sizes.controls, state_size=sizes.states,
-        )  # fmt: skip
+        new_evidence = evidence(self._run, result, shares, sizes)
         if new_evidence is not None:
             self._known.evidence.append(new_evidence)
         return new_evidence is not None
@@ -292,8 +288,8 @@ class Ladder:
     def _answer(self) -> RunResult:
         """The best result, certified."""
         run, stop = self._run, self._budget.stop
-        best = self.start if self._best is None else self._best
-        priced = self.elastic and best.success
+        best = self._start if self._best is None else self._best
+        priced = self._elastic and best.success
         if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
             best = self._given
         if not best.success and self._problem.constraints:
@@ -310,69 +306,3 @@ class Ladder:
                 detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return best if best.certificate is not None else run.certified(best)
-
-
-class Attempt(NamedTuple):
-    """One of the attempts to keep the constraints."""
-
-    words: str  # the plan from which the interior point begins
-    when: Callable[[Ladder], bool]
-    make: Callable[[Ladder], RunResult | None]
-
-
-ATTEMPTS = (
-    Attempt(
-        "the optimum of the search for a free duration, which is only finished",
-        lambda tried: tried.guess.interior is not None,
-        Ladder.finish_interior,
-    ),
-    Attempt(
-        "the plan of another solution, with its multipliers",
-        lambda tried: any(multipliers.values.any() for multipliers in tried.guess.multipliers),
-        Ladder.from_neighbour,
-    ),
-    Attempt(
-        "the start, after damped iterations on the augmented Lagrangian",
-        lambda tried: tried.stay and tried.guided,
-        Ladder.from_damped,
-    ),
-    Attempt("a trajectory or a policy that the caller gave", lambda tried: tried.given, Ladder.from_given),
-    Attempt(
-        "the plan of smoothing without the constraints, after a few iterations",
-        lambda tried: not tried.stay,
-        Ladder.from_valley,
-    ),
-    # Where the cost has kinks, as where a flat side of the robot lies along an obstacle, the interior point's measures
-    # do not vanish.
-    Attempt(
-        "the best plan so far, if no constraint acts there, by Newton's method without the constraints",
-        lambda tried: not (tried.converged or tried.curved) and tried.idle,
-        Ladder.from_best_without_constraints,
-    ),
-    Attempt(
-        "that plan, after the augmented Lagrangian",
-        lambda tried: tried.smoothed is not None and tried.guided and not tried.elastic,
-        Ladder.from_multipliers,
-    ),
-    Attempt(
-        "that plan, after a descent in which constraints may be violated at a price",
-        lambda tried: tried.smoothed is not None and not tried.elastic,
-        Ladder.from_smoothed_at_a_price,
-    ),
-    Attempt("the start itself", lambda tried: tried.untried, Ladder.from_start),
-    Attempt(
-        "the start, after such a descent",
-        lambda tried: tried.may_start and not tried.elastic,
-        Ladder.from_start_at_a_price,
-    ),
-    Attempt(
-        "the plan of smoothing, by the augmented Lagrangian alone",
-        lambda tried: not (tried.converged or tried.curved or tried.elastic),
-        Ladder.by_multipliers,
-    ),
-    Attempt(
-        "the best plan so far, by Newton's method without the constraints",
-        lambda tried: not tried.converged,
-        Ladder.from_best_without_constraints,
-    ),
-)

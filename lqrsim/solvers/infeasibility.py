@@ -16,7 +16,8 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
-from lqrsim.solvers.engine import RunResult, Workspace
+from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.stages import Sizes
 
 STARTS, ALIKE = 2, 0.05  # starts that must lead to equal violations, and relative difference up to which they are equal
 STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
@@ -44,21 +45,18 @@ def alike(cases: Sequence[Evidence]) -> list[Evidence]:
     return same if len(same) >= STARTS else []
 
 
-def evidence(
-    problem: Problem, work: Workspace, plan: RunResult, *, shares: list[Array], sizes: list[Array],
-    allowed: float, control_size: Array, state_size: Array,
-) -> Evidence | None:  # fmt: skip
-    """Return the evidence that a plan provides, or None.
+def evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) -> Evidence | None:
+    """Return the evidence that a plan for the problem of a run provides, or None.
 
     Args:
       shares: multipliers of each constraint relative to the price, (T+1, rows), from -1 to 1.
-      sizes: typical sizes of each constraint's rows, (rows,). allowed: the tolerance.
-      control_size, state_size: typical sizes of controls and states.
+      sizes: typical sizes of states, controls and rows.
     """
-    missed, slopes, alone, holding = _violation_slopes(problem, work, plan, shares, sizes, allowed)
+    problem = run.problem
+    missed, slopes, alone, holding = _violation_slopes(run, plan, shares, sizes)
     if not missed > 0:
         return None
-    left, size, pull, pressed = _balance(problem, plan, slopes, alone, control_size, state_size)
+    left, size, pull, pressed = _balance(problem, plan, slopes, alone, sizes)
     if not left <= STATIONARY * size:
         return None
     if size > 0:
@@ -68,7 +66,7 @@ def evidence(
 
 
 def _violation_slopes(
-    problem: Problem, work: Workspace, plan: RunResult, shares: list[Array], sizes: list[Array], allowed: float
+    run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes
 ) -> tuple[float, Array, Array, list[tuple[float, str]]]:
     """The total violation, relative to the rows' sizes, and its slopes.
 
@@ -76,26 +74,28 @@ def _violation_slopes(
       The violation; slopes (T+1, n+m) of all rows with their multipliers, and of the violated rows alone; and the rows
       in words, each with its fraction.
     """
-    states, controls = plan.states, plan.controls
+    problem, work, states, controls = run.problem, run.work, plan.states, plan.controls
+    allowed = run.settings.violation_tolerance(problem)
     steps, joint = len(controls), states.shape[1] + controls.shape[1]
     slopes, alone, missed = np.zeros((steps + 1, joint)), np.zeros((steps + 1, joint)), 0.0
     holding: list[tuple[float, str]] = []
     for k, (term, numbers) in enumerate(
         zip(problem.constraint_terms, work.constraint_values(states, controls), strict=True)
     ):
+        rows = sizes.rows[run.stages.owners == k]
         short = np.where(np.isfinite(numbers), np.abs(numbers) if term.equality else -numbers, 0.0)
         weights = np.where(short > allowed, 1.0, np.abs(shares[k])) * (np.sign(shares[k]) if term.equality else 1.0)
-        weights[np.where(np.isfinite(numbers), numbers, np.inf) > 1e-2 * sizes[k]] *= term.equality
+        weights[np.where(np.isfinite(numbers), numbers, np.inf) > 1e-2 * rows] *= term.equality
         for t, row in np.argwhere(np.abs(weights) > 1e-6):
-            weight = weights[t, row] / sizes[k][row]
+            weight = weights[t, row] / rows[row]
             slope = weight * work.constraint_slope(k, int(row), states[t], controls[min(t, steps - 1)], int(t))
             slopes[t] -= slope
             if short[t, row] > allowed:
                 alone[t] -= slope
-                missed += float(short[t, row] / sizes[k][row])
+                missed += float(short[t, row] / rows[row])
         for row in range(term.rows):
             beyond = float(short[:, row].max())
-            share = 1 + beyond / sizes[k][row] if beyond > allowed else float(np.abs(weights[:, row]).sum())
+            share = 1 + beyond / rows[row] if beyond > allowed else float(np.abs(weights[:, row]).sum())
             if share > 1e-2:
                 t = int((short if beyond > allowed else np.abs(weights))[:, row].argmax())
                 shortfall = f", missed by {beyond:.2g}" if beyond > allowed else ""
@@ -104,7 +104,7 @@ def _violation_slopes(
 
 
 def _balance(
-    problem: Problem, plan: RunResult, slopes: Array, alone: Array, control_size: Array, state_size: Array
+    problem: Problem, plan: RunResult, slopes: Array, alone: Array, sizes: Sizes
 ) -> tuple[float, float, float, Array]:
     """The largest remaining gradient in a control, the size of the cancelling ones, and (m,) the limits' part.
 
@@ -113,20 +113,23 @@ def _balance(
     """
     states, controls = plan.states, plan.controls
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
-    space = problem.control_coordinates
+    space, state_size, control_size = problem.control_coordinates, sizes.states, sizes.controls
     low = controls <= space.low + NEAR_LIMIT * control_size
     high = controls >= space.high - NEAR_LIMIT * control_size
     total, size, pull, pressed = 0.0, 0.0, 0.0, np.zeros(m)
-    ahead, ahead_alone = slopes[steps, :n], alone[steps, :n]
+    costate, costate_alone = slopes[steps, :n], alone[steps, :n]
     for t in range(steps - 1, -1, -1):
         A, B, _ = problem.dynamics.linearize(states[t], controls[t], problem.dt)
-        slope, of_missed = slopes[t, n:] + B.T @ ahead, alone[t, n:] + B.T @ ahead_alone
+        slope, of_missed = slopes[t, n:] + B.T @ costate, alone[t, n:] + B.T @ costate_alone
         free = ~((low[t] & (slope > 0)) | (high[t] & (slope < 0)))
         total = max(total, float((np.abs(slope) * control_size * free).max()))
         pressed = np.maximum(pressed, np.abs(slope) * control_size * ~free)
         reach = np.linalg.norm(B / state_size[:, None], axis=0) * control_size
-        of_all, of_own = np.linalg.norm(ahead * state_size) * reach, np.linalg.norm(ahead_alone * state_size) * reach
+        of_all, of_own = (
+            np.linalg.norm(costate * state_size) * reach,
+            np.linalg.norm(costate_alone * state_size) * reach,
+        )
         pull = max(pull, float((np.abs(of_missed) * control_size).max()))
         size = max(size, pull, float(of_all.max()), float(of_own.max()))
-        ahead, ahead_alone = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ ahead_alone
+        costate, costate_alone = slopes[t, :n] + A.T @ costate, alone[t, :n] + A.T @ costate_alone
     return total, size, pull, pressed

@@ -24,7 +24,7 @@ from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import clearance_of, copy_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
-from lqrsim.solvers.constrained import Known, Ladder
+from lqrsim.solvers.constrained import ConstrainedRun, Known
 from lqrsim.solvers.control_rates import feedback, narrowed, widened
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
@@ -211,7 +211,7 @@ class PreparedSolver(OneVersion):
                 result, ended = neighbour.find(), neighbour.laps.ended
                 if neighbour.may_be_far:
                     best.consider(result)
-                    result, ended = Ladder(run, Known()).climb(), time.perf_counter()
+                    result, ended = ConstrainedRun(run, Known()).solve(), time.perf_counter()
             else:
                 result = _solve(run, best)
                 ended = time.perf_counter()

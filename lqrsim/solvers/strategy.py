@@ -38,7 +38,7 @@ from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.between_knots import between_knots, solve_between_knots
 from lqrsim.solvers.budget import Budget, Stop
-from lqrsim.solvers.constrained import Known, Ladder
+from lqrsim.solvers.constrained import ConstrainedRun, Known
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
@@ -197,7 +197,7 @@ def outlined(
 def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
     if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
-        return Ladder(run, known).climb()
+        return ConstrainedRun(run, known).solve()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
     result = by_multipliers(run)
@@ -210,7 +210,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
-        return Ladder(run, known, stay=True).climb()
+        return ConstrainedRun(run, known, stay=True).solve()
     result = damped_from_rollout(run)
     if not result.stuck:
         return result
