@@ -22,7 +22,6 @@ from lqrsim import cli
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.references import resolve
 from lqrsim.solvers import budget, free_duration, strategy
-from lqrsim.solvers.free_duration import at_duration
 from lqrsim.solvers.settings import SmootherSettings
 
 
@@ -161,7 +160,7 @@ def test_no_other_duration_costs_less(price: float) -> None:
     best, plan = solution.trajectory.horizon, solution.trajectory
     costs = []
     for share in (0.998, 1.0, 1.002):
-        other = at_duration(free, share * best)
+        other = free._of_duration(share * best)
         found = ls.smooth(other, start=ls.Trajectory(plan.states, plan.controls, other.dt))
         assert found.status is Status.CONVERGED
         costs.append(found.cost + price * share * best)

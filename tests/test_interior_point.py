@@ -15,7 +15,7 @@ from shooting import Shooting
 import lqrsim as ls
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.solvers.interior_point import InteriorPoint
+from lqrsim.solvers.interior_point import STRONG, InteriorPoint
 from lqrsim.solvers.stages import Stages
 
 DT = 0.1
@@ -368,7 +368,7 @@ def test_an_arm_at_rest_finds_a_plan_among_posts(seed: int) -> None:
         constraints=[ls.Clearance(world, balls=ls.CollisionSpheres(balls_along, np.full(12, 0.03)), margin=0.02)],
     )  # fmt: skip
     still = Motion(np.tile((-1.2, 0.1, 0, 0), (81, 1)), np.zeros((80, 2)))
-    found = InteriorPoint(Stages(of), still, room=0.06).run(tolerance=1e-8, violation=1e-6, most=200)
+    found = InteriorPoint(Stages(of), still, STRONG).run(tolerance=1e-8, violation=1e-6, most=200)
     assert found.solved
     states, controls = found.plan
     speeds = states[:-1, 2:]

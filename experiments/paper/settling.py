@@ -14,7 +14,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.solvers.active_set import ActiveSet
-from lqrsim.solvers.interior_point import InteriorPoint, InteriorResult, Measures
+from lqrsim.solvers.interior_point import Barrier, InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.stages import Stages
 from paper.common import numbers
 
@@ -31,7 +31,7 @@ def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
     From as far beside the optimum as leads back to it; empty if nothing does.
     """
     stages, plan = Stages(problem), Motion(solution.trajectory.states, solution.trajectory.controls)
-    found = InteriorPoint(stages, plan, barrier=NEAR, room=NEAR).run(tolerance=1e-8, violation=1e-6, most=MOST)
+    found = InteriorPoint(stages, plan, Barrier(NEAR, NEAR)).run(tolerance=1e-8, violation=1e-6, most=MOST)
     best, (of_states, of_controls, *_) = found.plan, found.sizes
     if not found.solved:
         return np.array([])

@@ -46,7 +46,7 @@ def by_multipliers(run: SolveRun) -> RunResult:
             return run.certified(result)
         # Multipliers of another problem do not help here.
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
-    run, result = _with_constraints(run, run.solve())
+    run, result = _with_constraints(run, run.run_to_end())
     return run.certified(result)
 
 
@@ -103,7 +103,7 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
     plain = problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, 0.0))
     without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))
     with budget.without_costs():
-        first = without.solve()
+        first = without.run_to_end()
         if first.success and not budget.over:
             first = meet_constraints(without, first)
     if not first.success or budget.over:
@@ -117,7 +117,7 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
     run = _again(run, problem, initial_guess)
     if first.multipliers:
         return run, meet_constraints(run, None)
-    result = run.solve()
+    result = run.run_to_end()
     return run, meet_constraints(run, result) if result.success and not budget.over else result
 
 
@@ -190,7 +190,7 @@ def damped_from_rollout(run: SolveRun) -> RunResult:
     run.roll_out()
     optimality = run.linearize_about_plan() if np.isfinite(run.work.cost) else np.nan
     if not np.isfinite(optimality):
-        return run.certified(run.solve())
+        return run.certified(run.run_to_end())
     if not run.problem.constraints:
         if not run.second_order:
             damped = run.damped()

@@ -23,7 +23,8 @@ from lqrsim.solvers.augmented_lagrangian import (
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
-from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
+from lqrsim.solvers.interior_point import STRONG, WEAK, Barrier
+from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
 from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Sizes
@@ -76,7 +77,7 @@ class ConstrainedRun:
         self._given = self._start if feasible else None  # the answer must not be worse
         self._untried = stay or not known.from_start  # the runs of a search have the same start
 
-    def solve(self) -> RunResult:
+    def run_to_end(self) -> RunResult:
         """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
         for result in self._attempts():
             if result is not None and result.success:
@@ -96,7 +97,7 @@ class ConstrainedRun:
         if budget.over:
             return
         if any(values.any() for values in known):  # the plan of another solution, with its multipliers
-            yield self._interior(copied(start), LITTLE, multipliers=known)
+            yield self._interior(copied(start), WEAK, multipliers=known)
         if self._stay and self._guided:
             with budget.limited(REFINED):
                 result = damped_from_rollout(run)
@@ -134,7 +135,7 @@ class ConstrainedRun:
         begin = self._guess.trajectory or self._start
         near = self._start.violation <= self._allowed and np.allclose(begin.states, self._start.states)
         self._untried &= near or not np.array_equal(begin.states, self._start.states)
-        return self._interior(copied(begin), LITTLE if near else MUCH)
+        return self._interior(copied(begin), WEAK if near else STRONG)
 
     def _from_best_without_constraints(self) -> RunResult | None:
         """From the best plan, by Newton's method without the constraints: they may not act at the optimum.
@@ -169,7 +170,7 @@ class ConstrainedRun:
             return self._remember(run.result(ending))
         if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
             # If the augmented Lagrangian method follows, it does better than an interior point that lacks curvature.
-            return self._interior(self._smoothed, MUCH, stale=TROUBLED if self._guided and not self._curved else None)
+            return self._interior(self._smoothed, STRONG, stale=TROUBLED if self._guided and not self._curved else None)
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
         # answer.
         checkpoint = run.checkpoint()
@@ -180,7 +181,7 @@ class ConstrainedRun:
         run.go_on(checkpoint)
         if self._budget.stop.due or (self._guided and self._cuts(bottom)):
             return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
-        return self._interior(bottom, LITTLE if self._guided else MUCH)
+        return self._interior(bottom, WEAK if self._guided else STRONG)
 
     def _cuts(self, plan: Motion) -> bool:
         """Whether a plan misses a constraint by more than `DEEP` of the row's typical size."""
@@ -191,7 +192,7 @@ class ConstrainedRun:
 
     def _from_start(self) -> RunResult | None:
         self._untried = False
-        return self._interior(copied(self._start), MUCH)
+        return self._interior(copied(self._start), STRONG)
 
     def _from_multipliers(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
@@ -212,7 +213,7 @@ class ConstrainedRun:
         usable = np.isfinite(result.cost) and result.cost <= most and np.isfinite(plan.states).all()
         if self._budget.stop.due or not usable:
             return None
-        return self._interior(plan, LITTLE)
+        return self._interior(plan, WEAK)
 
     def _at_a_price(self, plan: Motion) -> RunResult | None:
         """From the plan of a descent in which constraints may be violated at a price.
@@ -229,7 +230,7 @@ class ConstrainedRun:
             if priced.stationary:
                 return None
             if priced.near or price == PRICES[-1]:
-                result = self._interior(plan, MUCH)
+                result = self._interior(plan, STRONG)
             elif self._untried and self._start.violation <= self._allowed:
                 result = self._from_start()
             else:
@@ -273,7 +274,7 @@ class ConstrainedRun:
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
     ) -> RunResult | None:
         """The result of the interior point from a plan."""
-        return self._remember(self._point.solve(plan, barrier, multipliers=multipliers, stale=stale))
+        return self._remember(self._point.run_from(plan, barrier, multipliers=multipliers, stale=stale))
 
     def _remember(self, result: RunResult | None) -> RunResult | None:
         """Keep a result if it is the best so far."""

@@ -262,7 +262,7 @@ class SolveRun:
 
     # The phases of a run.
 
-    def solve(self, *, return_best: bool = True) -> RunResult:
+    def run_to_end(self, *, return_best: bool = True) -> RunResult:
         """Smooth; near an optimum take Newton's steps; if the method fails, take the safeguard's steps.
 
         With `return_best`, a stopped run returns its best plan, which needs another pass for a policy.

@@ -26,8 +26,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resampled, resolve
-from lqrsim.solvers.interior_point import InteriorPoint, InteriorResult, Measures
-from lqrsim.solvers.interior_run import LITTLE, MUCH, Barrier
+from lqrsim.solvers.interior_point import MEDIUM, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 from lqrsim.solvers.tree import ways_by_trees
@@ -45,13 +44,12 @@ PROMISING = 1.1
 # tolerance, that of constraints in their units, and that of what is worth going on from, violations and gaps.
 SKETCHED = (1.0, True), (1.0, False), (1.5, True), (2.0, True), (0.25, True), (2.0, False)
 SKETCH, ROUGH, KEPT, WORTH = 100, 1e-2, 1e-4, 1e-2
-FREED = Barrier(1.0, 0.02, near=False)  # beginning of the interior point from another plan
 # Tolerance of the search for durations of segments: their ends go to whole knots, one in some hundred.
 NEAR_SEGMENTS = 1e-4
 # The duration that is held while gaps are closed, relative to that of the segments together; the interior point's
 # beginning then, and its tolerance. Of plans for the race of 19 waypoints in 400 to 800 steps, 10 of 10 were put right;
-# with `LITTLE` 4 of 6, and with the duration of the segments 5 of 6.
-LONGER, CLOSING, CLOSED = 1.01, Barrier(1e-3, 2e-3, near=False), 1e-3
+# with `WEAK` 4 of 6, and with the duration of the segments 5 of 6.
+LONGER, CLOSING, CLOSED = 1.01, Barrier(1e-3, 2e-3), 1e-3
 PART_WAY = (1.0, 0.25)  # parts of the way to the duration at which a search has failed, from one of which it goes on
 FINER = 0.3  # part of the tolerance for a plan that is not certified; where errors grow 1e9-fold, 0.1 is mere rounding
 FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
@@ -104,7 +102,7 @@ class DurationSearch:
     def follow_ways(self) -> None:
         """Sketch the ways, and go on from the sketches that keep the constraints, the cheapest first."""
         problem, stop = self._problem, self._stop
-        stated = at_duration(problem, problem.steps * problem.dt)
+        stated = problem._of_duration(problem.steps * problem.dt)
         with stop.not_counting():  # compiling
             stages = Stages(stated)
             free = with_duration_state(problem)
@@ -139,7 +137,7 @@ class DurationSearch:
         """What a few iterations make of a way in a share of the stated duration, which is free or fixed."""
         problem = self._problem
         duration = float(np.clip(share * problem.steps * problem.dt, *self._range))
-        fixed = at_duration(problem, duration)
+        fixed = problem._of_duration(duration)
         result = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
         if free is not None:
             return result._replace(name=way.name, way=way.name)
@@ -162,7 +160,7 @@ class DurationSearch:
         """
         if self.best is not None or any(solution.success for solution in self._fixed) or self._budget.over:
             return
-        self._fixed.append(self._solved(at_duration(self._problem, self._range[1]), self._settings))
+        self._fixed.append(self._solved(self._problem._of_duration(self._range[1]), self._settings))
         if self._fixed[-1].success:
             self._refine(self._fixed[-1].trajectory, self._settings)
 
@@ -192,7 +190,7 @@ class DurationSearch:
         by_ways, before = self.best, self._total
         if by_ways is not None:
             settings = replace(settings, safeguard=False)
-        first = begin or self._solved(at_duration(problem, problem.steps * problem.dt), settings)
+        first = begin or self._solved(problem._of_duration(problem.steps * problem.dt), settings)
         self._fixed.append(first)
         shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
         tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
@@ -200,7 +198,7 @@ class DurationSearch:
             self._refine(first.trajectory, settings)
         while self.best is not None and shorter and not self._budget.over:
             shorter, plan = shorter - 1, self.best[0]
-            less = self._solved(at_duration(problem, max(SHORTER * plan.steps * plan.dt, self._range[0])), tries)
+            less = self._solved(problem._of_duration(max(SHORTER * plan.steps * plan.dt, self._range[0])), tries)
             if not (less.success and not self._budget.over and self._find(less.trajectory, self._budget)[0]):
                 break
         if self.candidates:
@@ -227,7 +225,7 @@ class DurationSearch:
             for share in PART_WAY if least[0] == 0 else PART_WAY[:1]:
                 dt = begin.dt + share * (end.dt - begin.dt)
                 start = end if share == 1 else replace(begin, dt=dt)
-                fixed = at_duration(self._problem, dt * self._problem.steps)
+                fixed = self._problem._of_duration(dt * self._problem.steps)
                 again = self._solved(fixed, replace(settings, start=start, starts=None))
                 self._fixed.append(again)
                 missed, cost = self._rank(again)
@@ -344,14 +342,8 @@ def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop, free: Pr
         stages.free[n] = 1.0
         states = np.column_stack([states, np.full(len(states), way.horizon)])
         prices[stages.owners == len(problem.constraint_terms)] = np.inf  # the bounds of the duration
-    laps = Laps(budget)
-
-    def watch(measures: Measures, seconds: float) -> bool:
-        measures.record(laps, seconds=seconds)
-        return stop.due
-
-    point = InteriorPoint(stages, Motion(*map(in_c_order, (states, way.controls))), room=MUCH.room, price=prices)
-    result = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=watch)
+    point = InteriorPoint(stages, Motion(*map(in_c_order, (states, way.controls))), STRONG, price=prices)
+    result = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=_recorder(budget))
     stages.give_back()
     cost, duration = result.measures.cost, way.horizon
     if not (result.measures.violation < WORTH and result.measures.gap < WORTH):
@@ -360,6 +352,17 @@ def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop, free: Pr
         duration = float(result.plan.states[0, n])
     plan = Trajectory(result.plan.states[:, :n], result.plan.controls, duration / problem.steps)
     return Sketch(plan, cost, len(budget.log), free is not None)
+
+
+def _recorder(budget: Budget) -> Callable[[Measures, float], bool]:
+    """What the interior point calls after each iteration, which joins the log; at the deadline it ends."""
+    laps = Laps(budget)
+
+    def watch(measures: Measures, seconds: float) -> bool:
+        measures.record(laps, seconds=seconds)
+        return budget.stop.due
+
+    return watch
 
 
 def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
@@ -397,7 +400,7 @@ def find_duration(
         measures=result.measures._replace(cost=cost),
         sizes=result.sizes._replace(rows=rows),
     )  # fmt: skip
-    return at_duration(problem, duration), result
+    return problem._of_duration(duration), result
 
 
 def _searched(
@@ -412,21 +415,14 @@ def _searched(
     with budget.stop.not_counting():  # compiling
         stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
     stages.jump(segments)
-    laps = Laps(budget)
-
-    def watch(measures: Measures, seconds: float) -> bool:
-        measures.record(laps, seconds=seconds)
-        return budget.stop.due
-
+    watch = _recorder(budget)
     states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     # The bounds of the duration hold at any price.
     prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, price)
 
     def run(plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()) -> InteriorResult:
-        point = InteriorPoint(
-            stages, plan, barrier=barrier.parameter, room=barrier.room, price=prices, multipliers=multipliers
-        )
+        point = InteriorPoint(stages, plan, barrier, price=prices, multipliers=multipliers)
         most = min(MOST, budget.left)
         return point.run(tolerance=tolerance, violation=violation, most=most, watch=watch, hurried=budget.hurried)
 
@@ -436,8 +432,8 @@ def _searched(
         held = run(plan, CLOSING, CLOSED)
     stages.free[n] = 1.0
     if held is not None and held.solved:
-        return stages, prices, run(held.plan, LITTLE, tolerance, held.multipliers)
-    return stages, prices, run(plan, FREED, tolerance)
+        return stages, prices, run(held.plan, WEAK, tolerance, held.multipliers)
+    return stages, prices, run(plan, MEDIUM, tolerance)
 
 
 def _with_timed_segments(
@@ -465,11 +461,6 @@ def _with_timed_segments(
     plan = resampled(result.plan.states[:, :-1], result.plan.controls, at)
     dt = float(np.clip(LONGER * ends[-1], *problem.duration)) / steps
     return replace(problem._with_segments(new[1:-1].tolist()), dt=dt), Trajectory(*plan, dt)
-
-
-def at_duration(problem: Problem, duration: float) -> Problem:
-    """The problem with a fixed duration, in seconds."""
-    return problem._of_duration(duration)
 
 
 def with_duration_state(problem: Problem, *, by_segment: bool = False) -> Problem:

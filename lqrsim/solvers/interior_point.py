@@ -38,6 +38,21 @@ class Measures(NamedTuple):
         laps.record(method, self.cost, optimality=optimality, gap=self.gap, violation=self.violation, seconds=seconds)
 
 
+class Barrier(NamedTuple):
+    """The barrier with which an interior point begins.
+
+    The parameter of each row is a fraction of the cost divided by the number of rows. The least slack is relative to a
+    row's size, or to a control's range.
+    """
+
+    parameter: float
+    slack: float
+
+
+# For plans that are far from an optimum, for those with a duration that is found now, and next to an optimum.
+STRONG, MEDIUM, WEAK = Barrier(1.0, 0.06), Barrier(1.0, 0.02), Barrier(0.01, 0.01)
+
+
 @dataclass(kw_only=True, eq=False)
 class InteriorResult:
     """Result of a run."""
@@ -63,8 +78,6 @@ class InteriorPoint:
     Args:
       stages: stages of a problem with constraints, limits, or neither.
       plan: initial states (T+1, n) and controls (T, m), which need satisfy neither dynamics nor constraints.
-      barrier: initial barrier parameter of each row, as a fraction of the cost divided by the number of rows.
-      room: the least initial slack: relative to a row's size, or to a control's range.
       price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
         hold. Or a price for each row, (R,); or a function of the typical sizes that returns these.
       multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
@@ -76,7 +89,7 @@ class InteriorPoint:
     """
 
     def __init__(
-        self, stages: Stages, plan: Motion, *, barrier: float = 1.0, room: float = 0.02,
+        self, stages: Stages, plan: Motion, barrier: Barrier = MEDIUM, *,
         price: float | Array | Callable[[Sizes], Array] = np.inf, multipliers: tuple[Array, ...] = (), oldest: int = 0,
     ) -> None:  # fmt: skip
         self.stages, self.iterations = stages, 0
@@ -87,7 +100,7 @@ class InteriorPoint:
             begun.states[0, fixed] = np.asarray(problem.start)[fixed]
         known = in_c_order(stages.of_constraints(multipliers)).reshape(-1)
         self._begun = PlanBeginning(
-            Motion(*map(in_c_order, begun)), known, bool(multipliers), float(barrier), float(room), float(oldest)
+            Motion(*map(in_c_order, begun)), known, bool(multipliers), *map(float, barrier), float(oldest)
         )
         self._arrays, self._memory = stages.interior
         self._log = np.zeros(0, MEASURES)

@@ -6,7 +6,6 @@ other plan is rolled out.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import NAME, InteriorPoint, InteriorResult, Measures
+from lqrsim.solvers.interior_point import NAME, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.settings import has_curvature
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
@@ -41,17 +40,6 @@ BESIDE, JUMP = 1e-4, 3e-3
 UPDATES = 5  # largest number of updates of the multipliers, if Newton's last steps violate constraints
 
 
-class Barrier(NamedTuple):
-    """The beginning of the interior point: barrier parameter, least slacks, and whether an optimum may be near."""
-
-    parameter: float
-    room: float
-    near: bool
-
-
-MUCH, LITTLE = Barrier(1.0, 0.06, near=False), Barrier(0.01, 0.01, near=True)
-
-
 class InteriorRun:
     """The interior point for the problem of a run, and the tolerance of its constraints.
 
@@ -69,13 +57,13 @@ class InteriorRun:
     def instead(self, plan: Motion | RunResult) -> RunResult | None:
         """The result from a plan if it converges; else None, so that smoothing can continue."""
         checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
-        result = self.solve(copied(plan), MUCH)
+        result = self.run_from(copied(plan), STRONG)
         if result is not None and result.success:
             return result
         self._run.go_on(checkpoint, self._budget.log[begin:])
         return None
 
-    def solve(
+    def run_from(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
     ) -> RunResult | None:
         """The result from a plan; None if the budget is over, or there is no result. The iterations go to the log.
@@ -95,12 +83,9 @@ class InteriorRun:
             return budget.stop.due or since == stale
 
         with budget.stop.heeding():
-            point = InteriorPoint(
-                run.stages, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
-                multipliers=multipliers,
-            )  # fmt: skip
+            point = InteriorPoint(run.stages, plan, barrier, price=run.settings.price, multipliers=multipliers)
             result = point.run(
-                tolerance=run.final, violation=self.allowed, most=min(MOST, budget.left - 1), near=barrier.near,
+                tolerance=run.final, violation=self.allowed, most=min(MOST, budget.left - 1), near=barrier is WEAK,
                 watch=watch, hurried=budget.hurried,
             )  # fmt: skip
         return None if result is None else self.finish(result)

@@ -28,8 +28,8 @@ from lqrsim.solvers.constrained import ConstrainedRun, Known
 from lqrsim.solvers.control_rates import feedback, narrowed, widened
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
-from lqrsim.solvers.interior_point import InteriorPoint, Measures
-from lqrsim.solvers.interior_run import LITTLE, copied
+from lqrsim.solvers.interior_point import WEAK, Barrier, InteriorPoint, Measures
+from lqrsim.solvers.interior_run import copied
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.restoration import restore
 from lqrsim.solvers.settings import FINE, SmootherSettings
@@ -45,9 +45,9 @@ BEGINNING, ELSEWHERE = 15.0, 200.0
 # of two links after hard pushes did not converge.
 PRICE = 0.01
 OLDEST = 20  # steps for which derivatives may serve; most solves take fewer
-# The first barrier parameter, and the least first slack relative to a row's size: many rows begin violated. Re-plans of
-# a Panda then take 8 iterations in the median and 11 in 95 %, and 12 and 19 with those of `MUCH`.
-BARRIER, ROOM = 10.0, 0.5
+# Many rows begin violated. Re-plans of a Panda then take 8 iterations in the median and 11 in 95 %, and 12 and 19 with
+# `STRONG`.
+STRONGER = Barrier(10.0, 0.5)
 
 
 @checked
@@ -211,7 +211,7 @@ class PreparedSolver(OneVersion):
                 result, ended = neighbour.find(), neighbour.laps.ended
                 if neighbour.may_be_far:
                     best.consider(result)
-                    result, ended = ConstrainedRun(run, Known()).solve(), time.perf_counter()
+                    result, ended = ConstrainedRun(run, Known()).run_to_end(), time.perf_counter()
             else:
                 result = _solve(run, best)
                 ended = time.perf_counter()
@@ -283,7 +283,7 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
     try:
         if run.initial_guess.multipliers:
             return meet_constraints(run, None)
-        result = run.solve(return_best=False)
+        result = run.run_to_end(return_best=False)
         if run.problem.constraints and result.success and not run.budget.stop.due:
             result = meet_constraints(run, result)
         return result
@@ -332,9 +332,7 @@ class _Neighbour:
             self.laps.ended = time.perf_counter()
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
-                point = InteriorPoint(
-                    self._stages, copied(self._best.plan), barrier=LITTLE.parameter, room=LITTLE.room, multipliers=known
-                )
+                point = InteriorPoint(self._stages, copied(self._best.plan), WEAK, multipliers=known)
 
                 def watch(measures: Measures, seconds: float) -> bool:
                     measures.record(self.laps, seconds=seconds)
@@ -415,7 +413,7 @@ class _Yielding:
         for function in functions_of(run.problem):
             function.forget()
         with np.errstate(all="ignore"):
-            point = InteriorPoint(run.stages, self._plan, barrier=BARRIER, room=ROOM, price=self._price, oldest=OLDEST)
+            point = InteriorPoint(run.stages, self._plan, STRONGER, price=self._price, oldest=OLDEST)
             self.ended = time.perf_counter()
             looking, laps = self.ended - clock, Laps(budget)
 

@@ -6,7 +6,7 @@ command out of a plan with a `control_rate` (`control_rates.py`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
-     (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails.
+     (`SolveRun.run_to_end`). If controls have limits: the interior point if controls stay at them, or all else fails.
   with constraints: the interior point from one plan after another (`constrained.py`).
   with `finish=None`, `stop="cost"` or noise and constraints: smoothing, and the augmented Lagrangian for constraints
      (`augmented_lagrangian.py`). Without constraints, the dynamics of an MJCF are left to smoothing, too.
@@ -44,7 +44,8 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
 from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, InteriorRun, copied
+from lqrsim.solvers.interior_point import STRONG, WEAK
+from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
 from lqrsim.solvers.multistart import (
     FOLLOW,
     SWAYS,
@@ -197,7 +198,7 @@ def outlined(
 def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
     if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
-        return ConstrainedRun(run, known).solve()
+        return ConstrainedRun(run, known).run_to_end()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
     result = by_multipliers(run)
@@ -210,7 +211,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
-        return ConstrainedRun(run, known, stay=True).solve()
+        return ConstrainedRun(run, known, stay=True).run_to_end()
     result = damped_from_rollout(run)
     if not result.stuck:
         return result
@@ -222,7 +223,7 @@ def from_states(run: SolveRun, known: Known) -> RunResult:
     """The certified result of the interior point from the trajectory of a start, whatever its rollout does."""
     assert run.initial_guess.trajectory is not None
     point = InteriorRun(run)
-    result = point.solve(copied(run.initial_guess.trajectory), MUCH)
+    result = point.run_from(copied(run.initial_guess.trajectory), STRONG)
     return run.certified(point.start() if result is None else result)
 
 
@@ -230,7 +231,7 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
     point = InteriorRun(run)
     if run.problem.constraints:
-        result = point.solve(copied(plan), LITTLE)
+        result = point.run_from(copied(plan), WEAK)
         return None if result is None or not result.success else run.certified(result)
     law = compiled.law_about(plan.states, plan.controls, saddle.law[0])
     beside = point.result(*compiled.rollout(run.problem, *law, plan.states[0].copy()))
@@ -245,7 +246,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
     problem, budget = run.problem, run.budget
     space = problem.control_coordinates
     if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
-        return run.solve()
+        return run.run_to_end()
     run.smooth(OPENING)
     controls = run.work.best.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
@@ -253,11 +254,11 @@ def _without_constraints(run: SolveRun) -> RunResult:
         result = InteriorRun(run).instead(run.work.best)
         if result is not None:
             return result
-    result = run.solve()
+    result = run.run_to_end()
     if result.success or budget.stop.due or budget.left < 2:
         return result
     result, point = result.kept(), InteriorRun(run)
-    other = point.solve(copied(run.work.best if np.isfinite(result.cost) else point.start()), MUCH)
+    other = point.run_from(copied(run.work.best if np.isfinite(result.cost) else point.start()), STRONG)
     if other is None or other.success or not other.cost < result.cost:
         return other if other is not None and other.success else result
     other = other.kept()
@@ -427,7 +428,7 @@ class Search:
         heavier = reweighted(self._problem, times)
         runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
         try:
-            boldest = choose(runs, self._threads)[0].solve()
+            boldest = choose(runs, self._threads)[0].run_to_end()
         except InputError:  # the heavier cost is not finite at the start
             return
         if self._budget.stop.due:
