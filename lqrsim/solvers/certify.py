@@ -1,21 +1,15 @@
 """Certificates: before a solver reports success, its plan is checked against the problem itself.
 
 `kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a separate code path. This module compares
-them with the solver's claims.
+them with the solver's claims; `SolveRun.certified` calls both.
 """
-
-from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels import declarations
-from lqrsim.kernels.records import CERTIFICATE, CostToGo, StructuredArray
+from lqrsim.kernels.records import CERTIFICATE, CostToGo
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Certificate
-from lqrsim.results.value_functions import Quadratic
 
 # Tolerances for rounding. A policy's control is a sum of a few terms; a step of the dynamics is some hundred
 # operations, which amplify each other's rounding errors.
@@ -29,53 +23,6 @@ TYPICAL = 1e-6
 SLACK = 2.0
 
 
-Work = Callable[[int, CostToGo, StructuredArray], object]
-
-
-def certified(
-    problem: Problem,
-    work: Work,
-    states: Array,
-    value: Quadratic | None,
-    *,
-    violation: float,
-    kept: bool = True,
-    claimed: float | None,
-    tolerance: float | None,
-    least: float = 0.0,
-) -> tuple[Certificate, str]:
-    """Certify a plan; also return, in words, contradictions to a solver's claim of convergence.
-
-    Args:
-      work: runs the compiled `certify` for a task and a cost-to-go, and writes its results to an array (1,).
-      states: (T+1, n) of the plan. value: the cost-to-go, or None.
-      violation: violation of the worst constraint. kept: whether that is within the equalities' tolerance.
-      claimed: the last cost in the log; None if the solver does not claim success.
-      tolerance: tolerance of the optimality; None if only the cost was tested.
-      least: the least cost to which the optimality is relative, as that of time where the duration was free.
-    """
-    numbers, evaluated = np.zeros(1, CERTIFICATE), np.zeros(1, CERTIFICATE)
-    numbers["typical"] = evaluated["typical"] = least
-    to_go = no_value(states)
-    if value is not None:
-        to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
-    # Without a cost-to-go, the cost of noise is weighed by the policy's own.
-    weighed = value is None and problem.noise_term is not None
-    work(declarations.EVALUATE if weighed else declarations.CERTIFY, to_go, numbers)
-    certificate = certificate_of(problem, numbers[0], states, violation=violation, least=least)
-    if value is None:
-        certificate = replace(certificate, optimality=np.inf)
-    if claimed is None:
-        return certificate, ""
-    if tolerance is not None and not certificate.optimality < SLACK * tolerance:
-        # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
-        work(declarations.EVALUATE, no_value(states), evaluated)
-        optimality = certificate_of(problem, evaluated[0], states, violation=violation, least=least).optimality
-        certificate = replace(certificate, optimality=optimality)
-    rounding = REST * float(numbers["scale"][0])
-    return certificate, faults(certificate, claimed=claimed, rest=rounding, tolerance=tolerance, kept=kept)
-
-
 def no_value(states: Array) -> CostToGo:
     """An empty cost-to-go along states (T+1, n)."""
     knots, n = states.shape
@@ -85,7 +32,10 @@ def no_value(states: Array) -> CostToGo:
 def certificate_of(
     problem: Problem, row: np.void, states: Array, *, violation: float, least: float = 0.0
 ) -> Certificate:
-    """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote."""
+    """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote.
+
+    `least` is the least cost to which the optimality is relative, as that of time where the duration was free.
+    """
     cost, scale, typical, motion, law, beyond, decrease, _ = (float(row[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):

@@ -42,7 +42,7 @@ from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Ite
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
-from lqrsim.solvers.certify import certified, no_value
+from lqrsim.solvers.certify import REST, SLACK, certificate_of, faults, no_value
 from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
@@ -104,15 +104,11 @@ class Ending:
     def detail(self, steps: int) -> str:
         """Text with the step at which it ended, of that many steps, and the exception of a user's function."""
         raised = "" if self.success or self.outcome == declarations.TIMED_OUT else self.raised
-        return ": ".join(part for part in (self._place(steps), raised) if part)
-
-    def _place(self, steps: int) -> str:
-        if self.pass_failed:
-            if self.done and self.failed < 0:
-                return ""
+        place = _DETAILS.get(self.outcome, "")
+        if self.pass_failed and not (self.done and self.failed < 0):
             which = "backward" if self.backward else "forward"
-            return f"{which} pass of iteration {self.done + 1}, step {self.failed} of {steps}"
-        return _DETAILS.get(self.outcome, "")
+            place = f"{which} pass of iteration {self.done + 1}, step {self.failed} of {steps}"
+        return ": ".join(part for part in (place, raised) if part)
 
 
 def check_finite_at_start(
@@ -500,15 +496,26 @@ class SolveRun:
     def certified(self, result: RunResult) -> RunResult:
         """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
         values = self.work.constraint_values(*result.plan)
-        violation = self.work.violation(values)
-        value = result.values.get("cost_to_go")
-        certificate, wrong = certified(
-            self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, result, to_go, out)),
-            result.states, value, violation=violation, kept=self.work.keeps(values),
-            claimed=self.budget.log[-1].cost if result.success else None,
-            tolerance=self.final if result.status is Status.CONVERGED else None,
-            least=0.0 if self.initial_guess.interior is None else self.initial_guess.interior.scale,
-        )  # fmt: skip
+        violation, value, wrong = self.work.violation(values), result.values.get("cost_to_go"), ""
+        to_go = no_value(result.states)
+        if value is not None:
+            to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
+        # Without a cost-to-go, the cost of noise is weighed by the policy's own.
+        weighed = value is None and self.problem.noise_term is not None
+        task = declarations.EVALUATE if weighed else declarations.CERTIFY
+        certificate, scale = self._checked(task, result, to_go, violation)
+        if value is None:
+            certificate = replace(certificate, optimality=np.inf)
+        if result.success:
+            tolerance = self.final if result.status is Status.CONVERGED else None
+            if tolerance is not None and not certificate.optimality < SLACK * tolerance:
+                # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
+                evaluated, _ = self._checked(declarations.EVALUATE, result, no_value(result.states), violation)
+                certificate = replace(certificate, optimality=evaluated.optimality)
+            wrong = faults(
+                certificate, claimed=self.budget.log[-1].cost, rest=REST * scale, tolerance=tolerance,
+                kept=self.work.keeps(values),
+            )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
             # The expected cost without penalties of constraints, which the cost-to-go of the solver has.
             out, none = np.zeros(1, CERTIFICATE), no_value(result.states)
@@ -525,6 +532,14 @@ class SolveRun:
         if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
             return replace(result, status=Status.NOT_POSITIVE_DEFINITE)
         return replace(result, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
+
+    def _checked(self, task: int, result: RunResult, to_go: CostToGo, violation: float) -> tuple[Certificate, float]:
+        """The certificate of a plan and its policy with a cost-to-go, and the size of the cost's terms."""
+        numbers, interior = np.zeros(1, CERTIFICATE), self.initial_guess.interior
+        numbers["typical"] = least = 0.0 if interior is None else interior.scale
+        self._loop(*self._check_arguments(task, result, to_go, numbers))
+        certificate = certificate_of(self.problem, numbers[0], result.states, violation=violation, least=least)
+        return certificate, float(numbers["scale"][0])
 
     def bend(self, result: RunResult) -> Bend:
         """The curvature at a result, by exact second derivatives; with a direction along which a saddle bends down."""
