@@ -35,14 +35,14 @@ LATE = {"HALVE": 1000, "CHOOSE": 1000}  # all run to their end
 # Options of `smooth`, and what `multistart` has instead of its own.
 ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "hover": ({"start": paper_start()}, {}),
-    "+ line": ({"starts": 1}, {"SHARES": ()}),
+    "+ line": ({"starts": 1}, {"OBSTACLES": ()}),
     "+ continuation": ({"starts": 1}, {}),
     "3 starts": ({"starts": 3}, {}),
     "5 starts": ({"starts": 5}, {}),
     "7 starts, the default": ({}, {}),
     "9 starts": ({"starts": 9}, {}),
     "dropped late": ({}, LATE),
-    "no continuation": ({}, {"SHARES": ()}),
+    "no continuation": ({}, {"OBSTACLES": ()}),
     "at even speed": ({}, {"path": linear}),
     "path weight x 0.3": ({}, {"PATH_WEIGHT": 0.3 * multistart.PATH_WEIGHT}),
     "path weight x 3": ({}, {"PATH_WEIGHT": 3 * multistart.PATH_WEIGHT}),

@@ -27,7 +27,7 @@ class ActiveSet:
     Attributes:
       plan: the current plan, which steps overwrite. measures: its measures. force, held: (T+1, R) the rows'
         multipliers, and 1 for rows held at their targets, else 0. hopeless: whether the plan is stationary but violates
-        rows that no multiplier corrects. looking: seconds spent on the models of a plan.
+        rows that no multiplier corrects. model_seconds: spent on the models of a plan.
     """
 
     def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
@@ -39,7 +39,7 @@ class ActiveSet:
         self.force[...] = stages.of_constraints(multipliers)
         clock = time.perf_counter()
         self._call(BEGIN)
-        self.looking = time.perf_counter() - clock
+        self.model_seconds = time.perf_counter() - clock
 
     @property
     def measures(self) -> Measures:
@@ -79,7 +79,7 @@ class ActiveSet:
         outcome = RUNNING
         while outcome == RUNNING:
             outcome = self._call(PIVOT)
-            if late(2 * self.looking):
+            if late(2 * self.model_seconds):
                 self.held[...] = before
                 return False
         if outcome == CONVERGED:

@@ -46,25 +46,21 @@ def by_multipliers(run: SolveRun) -> RunResult:
             return run.certified(result)
         # Multipliers of another problem do not help here.
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
-    run, result = _with_constraints(run, run.run_to_end())
+    result = run.run_to_end()
+    if run.budget.over:
+        if result.success and not run.work.keeps(run.work.constraint_values(*result.plan)):
+            status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
+            result = dataclasses.replace(result, status=status, detail="before the constraints could be met")
+    elif result.success:
+        result = meet_constraints(run, result)
+    else:
+        run, result = _first_feasible(run, result)
     return run.certified(result)
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
     """A further run, with the rest of the budget."""
     return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
-
-
-def _with_constraints(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResult]:
-    """Continue from the result without the constraints; also return the run that has the answer in its memory."""
-    if run.budget.over:
-        if result.success and not run.work.keeps(run.work.constraint_values(*result.plan)):
-            status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
-            result = dataclasses.replace(result, status=status, detail="before the constraints could be met")
-        return run, result
-    if result.success:
-        return run, meet_constraints(run, result)
-    return _first_feasible(run, result)
 
 
 def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: int = STALE) -> RunResult:
@@ -92,7 +88,7 @@ def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: i
 
 
 def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResult]:
-    """Find a plan that keeps the constraints without the cost of obstacles, then add that cost.
+    """Find a plan that keeps the constraints without the cost of obstacles, then add that cost; the run that has it.
 
     This helps if not even the problem without the constraints is solved, because deep inside obstacles their cost
     overflows.
@@ -277,16 +273,18 @@ class AugmentedLagrangian:
 
     def __init__(self, run: SolveRun) -> None:
         self._problem, self._work, self._own = run.problem, run.work, run.work.multipliers
-        self._near = tolerance = run.settings.violation_tolerance(run.problem)
+        self._allowed = tolerance = run.settings.violation_tolerance(run.problem)
         # The tolerances of inequalities and of equalities, if there are any.
         terms = run.problem.constraint_terms
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [multipliers.penalty for multipliers in self._own]  # zero, except multipliers of another solution
+        self._initial = [
+            multipliers.penalty for multipliers in self._own
+        ]  # zero, except multipliers of another solution
 
     def _restart(self) -> None:
-        self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
+        self._grown, self._missed = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
         self.stuck = 0
 
     @property
@@ -298,11 +296,11 @@ class AugmentedLagrangian:
         self._plan = states, controls
         stated = self._work.constraint_values(states, controls)
         self.kept = self._work.keeps(stated)
-        beyond = [
-            violation_of(multipliers.term, values) - multipliers.term.equality * self._near
+        excess = [
+            violation_of(multipliers.term, values) - multipliers.term.equality * self._allowed
             for multipliers, values in zip(self._own, stated, strict=True)
         ]
-        self.nearly = not self.kept and max(beyond, default=0.0) <= 0
+        self.nearly = not self.kept and max(excess, default=0.0) <= 0
         self._values = [
             values.ravel() - multipliers.margin for multipliers, values in zip(self._own, stated, strict=True)
         ]
@@ -316,10 +314,10 @@ class AugmentedLagrangian:
         self._restart()
         for which, (multipliers, values) in enumerate(self._each()):
             multipliers.values[...] = 0.0
-            if not self._first[which] > 0:
+            if not self._initial[which] > 0:
                 # This comes last: once a penalty is set, the curvature of the passes contains it.
-                self._first[which] = INITIAL * self._curvature(which) if len(values) else 1.0
-            multipliers.penalty = self._first[which]
+                self._initial[which] = INITIAL * self._stiffness(which) if len(values) else 1.0
+            multipliers.penalty = self._initial[which]
 
     def update(self, growth: float = GROWTH) -> None:
         """Set the multipliers to the forces. Increase the penalties of constraints for which this helps too little."""
@@ -330,15 +328,15 @@ class AugmentedLagrangian:
             missed[multipliers.term.equality] = max(missed[multipliers.term.equality], short)
         worst = max(missed, key=lambda kind: missed[kind])
         # Equalities that nearly hold can be met: they need a better inner minimum, not a larger penalty.
-        near = {kind: kind and short <= self._near for kind, short in missed.items()}
-        self.stuck = self.stuck + 1 if missed[worst] > 0.9 * self._last[worst] and not near[worst] else 0
+        near = {kind: kind and short <= self._allowed for kind, short in missed.items()}
+        self.stuck = self.stuck + 1 if missed[worst] > 0.9 * self._missed[worst] and not near[worst] else 0
         for kind, tolerance in self._tolerance.items():
             more = growth * self._grown[kind] <= LARGEST or not near[kind]
-            if more and missed[kind] > max(0.5 * self._last[kind], tolerance):
+            if more and missed[kind] > max(0.5 * self._missed[kind], tolerance):
                 self._grown[kind] *= growth
                 for multipliers in self._own:
                     multipliers.penalty *= growth if multipliers.term.equality == kind else 1.0
-        self._last = missed
+        self._missed = missed
 
     def added(self) -> float:
         """The augmented Lagrangian's terms in the cost of the plan."""
@@ -360,11 +358,11 @@ class AugmentedLagrangian:
             (np.abs(values) if multipliers.term.equality else -(values + multipliers.margin)).max(initial=-np.inf)
             for multipliers, values in self._each()
         ]
-        beyond = [
-            violation - allowed_violation(multipliers.term, self._near)
+        excess = [
+            violation - allowed_violation(multipliers.term, self._allowed)
             for violation, multipliers in zip(missed, self._own, strict=True)
         ]
-        which = int(np.argmax(beyond))
+        which = int(np.argmax(excess))
         term, (step, row) = self._own[which].term, self._worst_of(which)
         time = step * self._problem.dt
         return f"{term.describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
@@ -379,21 +377,15 @@ class AugmentedLagrangian:
         last = len(values) - 1 - int(np.abs(values[::-1]).argmax()) if term.equality else int(values.argmin())
         return divmod(last, term.rows)
 
-    def _curvature(self, which: int) -> float:
-        """The cost of changing the worst violation; for an equality, the largest cost for any of its entries."""
-        term, (step, row) = self._own[which].term, self._worst_of(which)
-        rows = range(term.rows) if term.equality else (row,)
-        return max(self._curvature_of(which, step, row) for row in rows)
+    def _stiffness(self, which: int) -> float:
+        """The cost of changing the worst violation of a constraint; for an equality, the largest of all its entries.
 
-    def _curvature_of(self, which: int, step: int, row: int) -> float:
-        """The cost of changing one entry of a constraint: twice the total cost of a change by 1 unit.
-
-        It is `1 / n' (S + Sbar)^-1 n` for the entry's slope n: the curvature of the total cost if the rest of the
-        trajectory adapts.
+        That is twice the total cost of a change by 1 unit, `1 / n' (S + Sbar)^-1 n` for the entry's slope n: the
+        curvature of the total cost if the rest of the trajectory adapts.
         """
+        term, (step, worst) = self._own[which].term, self._worst_of(which)
         states, controls = self._plan
-        n, steps = states.shape[1], len(controls)
-        slope = self._work.constraint_slope(which, row, states[step], controls[min(step, steps - 1)], step)
+        n, control = states.shape[1], min(step, len(controls) - 1)
         values = self._work.value_functions()
         go, come = values["cost_to_go"], values["cost_to_come"]
         try:
@@ -405,9 +397,11 @@ class AugmentedLagrangian:
                 covariance = np.linalg.inv(go.hessian[step] + come.hessian[step])
         except np.linalg.LinAlgError:
             return 1.0
-        spread = np.zeros((len(slope), len(slope)))
-        gain = self._work.arrays.policy.gain[min(step, steps - 1)]
-        spread[:n, :n], spread[n:, n:] = covariance, gain @ covariance @ gain.T
-        spread[:n, n:], spread[n:, :n] = covariance @ gain.T, gain @ covariance
-        response = float(slope @ spread @ slope)
-        return 1 / response if response > 0 else 1.0
+        gain = self._work.arrays.policy.gain[control]
+        joint = np.block([[covariance, covariance @ gain.T], [gain @ covariance, gain @ covariance @ gain.T]])
+        costs = []
+        for row in range(term.rows) if term.equality else (worst,):
+            slope = self._work.constraint_slope(which, row, states[step], controls[control], step)
+            response = float(slope @ joint @ slope)
+            costs.append(1 / response if response > 0 else 1.0)
+        return max(costs)

@@ -134,8 +134,8 @@ def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
     """
     steps, terms = problem.steps, problem.constraint_terms
     acting = [compiled.ConstraintMultipliers(problem, term) for term in terms]
-    for one in acting:
-        one.array[FIRST] = 0.0  # a fixed start cannot change, but what follows can
+    for multipliers in acting:
+        multipliers.array[FIRST] = 0.0  # a fixed start cannot change, but what follows can
     constraints = compiled.arguments(problem, multipliers=acting).stage.constraints
     results: list[Array] = [np.empty((steps, states.shape[1], term.rows)) for term in terms]
     for j in range(states.shape[1]):
@@ -145,8 +145,8 @@ def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
         for at, first in ((at_begins, 0), (at_ends, 1)):
             values = tuple(np.empty_like(multipliers.values) for multipliers in acting)
             compiled.costs_module(problem).evaluate_constraints(steps, at, controls, constraints, values)
-            for result, one, constraint, term in zip(results, values, problem.constraints, terms, strict=True):
-                rows = one.reshape(steps + 1, -1)[first : first + steps]
+            for result, flat, constraint, term in zip(results, values, problem.constraints, terms, strict=True):
+                rows = flat.reshape(steps + 1, -1)[first : first + steps]
                 if not first:
                     result[:, j] = rows
                 elif constraint.by_knot and not term.uses_control:
@@ -208,8 +208,8 @@ def solve_between_knots(
             if stop.due:
                 status, remedy = Status.TIME_LIMIT, "raise time_limit"
             wrong = errors.record(at_knots)._faults(tolerance, problem.accuracy or np.inf)
-            said = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
-            ended = {"status": status, "remedy": remedy, "detail": said}
+            detail = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
+            ended = {"status": status, "remedy": remedy, "detail": detail}
             break
         if coarse:
             assert problem.accuracy is not None

@@ -393,9 +393,9 @@ class _Smoother:
         go = riccati_pass(
             system.model(come, prior), system.end_model("final", x_end), horizon, backward=True, tolerances=tolerances
         )
-        ahead = go.at(0.0)[0]
-        x_hat = minimizer(ahead + come.at(0.0)[0], 0.0)  # Eq. (30)
-        self._x_hat = minimizer(ahead + system.end_model("initial", x_hat), 0.0)
+        first = go.at(0.0)[0]
+        x_hat = minimizer(first + come.at(0.0)[0], 0.0)  # Eq. (30)
+        self._x_hat = minimizer(first + system.end_model("initial", x_hat), 0.0)
         self._to_go, self.forward, self.backward = go, come, go
 
     def rollout(self) -> IntegrationFailure | None:

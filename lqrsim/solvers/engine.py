@@ -236,7 +236,7 @@ class SolveRun:
         self.final, self.rough = settings.final(problem), settings.rough(problem)
         self._valley = VALLEY if self.second_order and has_curvature(problem) else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
-        self._shares = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
+        self._fractions = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
 
     @property
     def cost(self) -> float:
@@ -301,7 +301,7 @@ class SolveRun:
             return True
         self.roll_out()  # before its arrays are overwritten
         work = self.work
-        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._shares[0]))
+        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._fractions[0]))
         failed, good = work.core.opening_pass(
             self.problem.steps, self.initial_guess.trajectory is not None, arrays.given, work.prior, homotopy_scaled,
             arrays.policy, arrays.to_go,
@@ -421,8 +421,9 @@ class SolveRun:
         """
         for array, copy in checkpoint:
             array[...] = copy
-        for row, one in zip(self._rows[self._row :], others, strict=False):
-            row["cost"], row["improvement"], row["gap"], row["optimality"] = one.cost, one.improvement, one.gap, np.nan
+        for row, other in zip(self._rows[self._row :], others, strict=False):
+            row["cost"], row["improvement"], row["gap"] = other.cost, other.improvement, other.gap
+            row["optimality"] = np.nan
         self._row = min(self._row + len(others), len(self._rows))
         self._valley = 0.0
         self.ending = replace(self.ending, outcome=declarations.RUNNING)
@@ -647,7 +648,7 @@ class SolveRun:
         heard = budget.stop.attentive and (budget.watched or bool(functions))
         single = heard or bool(problem.constraints) or stop.deadline < np.inf
         last = min(budget.left if last is None else last, first + budget.left)
-        bite = 1 if budget.stop.attentive or single else last
+        size = 1 if budget.stop.attentive or single else last
         for function in functions:
             function.forget()
         outcome, backward, failed, done = declarations.RUNNING, False, -1, first
@@ -657,7 +658,7 @@ class SolveRun:
                 break
             clock, begin = time.perf_counter(), done
             try:
-                done, outcome, backward, failed = self._loop(*arguments(begin, min(begin + bite, last), rows))
+                done, outcome, backward, failed = self._loop(*arguments(begin, min(begin + size, last), rows))
                 stop.error = interrupt_of(functions) or stop.error
                 missed = self._violation_of(plan) if done > begin else 0.0
             except BaseException as error:  # Ctrl-C: raised again when there is a solution
@@ -665,7 +666,7 @@ class SolveRun:
                 break
             seconds = (time.perf_counter() - clock) / max(done - begin, 1)
             if budget.stop.attentive and not single:
-                bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
+                size = max(1, int(ATTENTION / max(seconds, 1e-9)))
             for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
                 cost, improvement, gap, optimality, residual, method = row
                 violation = missed if i == done or not problem.constraints else float("nan")
@@ -680,16 +681,17 @@ class SolveRun:
     def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
         """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
         work, tolerance, valley = self.work, self.rough, 0.0 if again else self._valley
-        share = 1.0 if again else self._shares[min(first, len(self._shares) - 1)]
-        if share != 1:
+        fraction = 1.0 if again else self._fractions[min(first, len(self._fractions) - 1)]
+        if fraction != 1:
             last = min(last, first + 1)
             tolerance = valley = 0.0  # with only a part of the cost, the iterations must not converge
         guided = self.initial_guess.trajectory is not None and self.settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
-        options, scaled = {"guided": guided, "prior_iterations": count, "valley": valley}, work.homotopy_scaled(share)
         return self._stated(
-            declarations.ITERATE, first, last, rows, tolerance, options, homotopy_scaled=scaled, prior=prior
-        )
+            declarations.ITERATE, first, last, rows, tolerance,
+            {"guided": guided, "prior_iterations": count, "valley": valley}, prior=prior,
+            homotopy_scaled=work.homotopy_scaled(fraction),
+        )  # fmt: skip
 
     def _plan_arguments(
         self, task: int, how: Descent, tolerance: float, gap_tolerance: float, first: int, last: int,
@@ -827,15 +829,15 @@ class Workspace:
                 law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
-    def homotopy_scaled(self, share: float) -> CostModel:
+    def homotopy_scaled(self, fraction: float) -> CostModel:
         """The stage cost with its homotopy-scaled terms at that fraction; see `CostTerm.factor`."""
-        if share == 1:
+        if fraction == 1:
             return self.model.stage
         data = list(self.model.stage.data)
         for i, term in enumerate(compiled.cost_terms(self._problem, "stage_cost")):
             if term.factor is not None:
                 data[i] = data[i].copy()
-                data[i][len(term.functions) + term.factor] *= share
+                data[i][len(term.functions) + term.factor] *= fraction
         return self.model.stage._replace(data=tuple(data))
 
     def roll_out(self, gain: Array, offset: Array, state: Array) -> Motion:

@@ -108,24 +108,24 @@ class DurationSearch:
             free = with_duration_state(problem)
         routes, sketches = list(ways(stated, stages)), list[Sketch]()
         spent = dict.fromkeys((way.name for way in routes), 0)
-        for share, freed in SKETCHED:
-            last = bool(sketches)
+        for fraction, freed in SKETCHED:
+            is_last = bool(sketches)
             for way in [way for way in routes if way.name not in {draft.way for draft in sketches}]:
                 with stop.reporting("smooth"), stop.heeding():
-                    draft = self._sketched(way, share, free if freed else None)
+                    draft = self._sketched(way, fraction, free if freed else None)
                     self._total += draft.iterations
                     spent[way.name] += draft.iterations
                     if np.isfinite(draft.cost):
                         sketches.append(draft._replace(iterations=spent[way.name]))
                 if stop.due:
                     return
-            if last:
+            if is_last:
                 break
-        far = spent.keys() - {draft.way for draft in sketches}
+        failed = spent.keys() - {draft.way for draft in sketches}
         self.candidates += (
-            Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in routes if way.name in far
+            Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in routes if way.name in failed
         )
-        for draft in sorted(sketches, key=lambda one: one.cost):
+        for draft in sorted(sketches, key=lambda draft: draft.cost):
             if stop.due:
                 return
             if self.best is not None and draft.free and draft.cost > PROMISING * self.best[1].measures.cost:
@@ -133,10 +133,10 @@ class DurationSearch:
             else:
                 self._follow(draft.name, draft.plan)
 
-    def _sketched(self, way: Way, share: float, free: Problem | None) -> "Sketch":
-        """What a few iterations make of a way in a share of the stated duration, which is free or fixed."""
+    def _sketched(self, way: Way, fraction: float, free: Problem | None) -> "Sketch":
+        """What a few iterations make of a way in a fraction of the stated duration, which is free or fixed."""
         problem = self._problem
-        duration = float(np.clip(share * problem.steps * problem.dt, *self._range))
+        duration = float(np.clip(fraction * problem.steps * problem.dt, *self._range))
         fixed = problem._of_duration(duration)
         result = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
         if free is not None:
@@ -222,9 +222,9 @@ class DurationSearch:
             if result.solved or not np.isfinite(result.plan.states).all() or self._stop.due:
                 return
             least, end = min(self._rank(solution) for solution in self._fixed), result.trajectory(ordinary.dt)
-            for share in PART_WAY if least[0] == 0 else PART_WAY[:1]:
-                dt = begin.dt + share * (end.dt - begin.dt)
-                start = end if share == 1 else replace(begin, dt=dt)
+            for fraction in PART_WAY if least[0] == 0 else PART_WAY[:1]:
+                dt = begin.dt + fraction * (end.dt - begin.dt)
+                start = end if fraction == 1 else replace(begin, dt=dt)
                 fixed = self._problem._of_duration(dt * self._problem.steps)
                 again = self._solved(fixed, replace(settings, start=start, starts=None))
                 self._fixed.append(again)
@@ -235,15 +235,15 @@ class DurationSearch:
                 return
             begin = again.trajectory
 
-    def _find(self, begin: Trajectory, budget: Budget, share: float = 1.0) -> tuple[bool, Problem, InteriorResult]:
+    def _find(self, begin: Trajectory, budget: Budget, fraction: float = 1.0) -> tuple[bool, Problem, InteriorResult]:
         """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan.
 
-        `share` is of the tolerance.
+        `fraction` is of the tolerance.
         """
         problem, settings, before = self._problem, self._settings, len(budget.log)
         with self._stop.reporting("smooth"):
             ordinary, result = find_duration(
-                problem, begin, tolerance=share * settings.final(problem),
+                problem, begin, tolerance=fraction * settings.final(problem),
                 violation=settings.violation_tolerance(problem), budget=budget, price=settings.price,
             )  # fmt: skip
         self._total += len(budget.log) - before
@@ -280,8 +280,8 @@ class DurationSearch:
             return self._described(finished)
         first, last, chosen = self._fixed[0], self._fixed[-1], min(self._fixed, key=self._rank)
         if last.status is Status.INFEASIBLE and not chosen.success and not self._stop.due:
-            said = f"even in {last.trajectory.horizon:g} s {last.detail}"
-            return self._described(replace(last, detail=said))
+            detail = f"even in {last.trajectory.horizon:g} s {last.detail}"
+            return self._described(replace(last, detail=detail))
         status, remedy = Status.STALLED, "begin with another dt"
         if self._stop.due:
             status, remedy = Status.TIME_LIMIT, "raise time_limit"

@@ -106,11 +106,11 @@ def gradients(
 
     def difference(k: int, step: float) -> list[Array]:
         """The central difference of all values in a parameter."""
-        ahead, behind = point.copy(), point.copy()
-        ahead[k] += step
-        behind[k] -= step
-        above, below = (optimum.values(_problem_at(make, parameters), plan) for parameters in (ahead, behind))
-        return [(upper - lower) / (ahead[k] - behind[k]) for upper, lower in zip(above, below, strict=True)]
+        forward, backward = point.copy(), point.copy()
+        forward[k] += step
+        backward[k] -= step
+        above, below = (optimum.values(_problem_at(make, parameters), plan) for parameters in (forward, backward))
+        return [(upper - lower) / (forward[k] - backward[k]) for upper, lower in zip(above, below, strict=True)]
 
     columns, errors = [], []
     for k, size in enumerate(sizes):
@@ -215,14 +215,14 @@ class _Optimum:
         controls = np.zeros((stages.steps, stages.m, start.shape[1]))
         for _ in range(SWEEPS):
             # With the multipliers of the sweep before, the rows get nearer to zero.
-            pull = slopes + np.einsum("tri,trp->tip", across, weights[:, None] * rows + forces)
-            ahead, offsets = pull[-1][:n], []
+            gradient = slopes + np.einsum("tri,trp->tip", across, weights[:, None] * rows + forces)
+            costate, offsets = gradient[-1][:n], []
             for t in reversed(range(stages.steps)):
-                both = pull[t] + jacobian[t].T @ (curves[t + 1] @ arrived[t] + ahead)
+                both = gradient[t] + jacobian[t].T @ (curves[t + 1] @ arrived[t] + costate)
                 offsets.append(-np.linalg.solve(blocks[t], both[n:]))
-                ahead = both[:n] + gains[t].T @ both[n:]
+                costate = both[:n] + gains[t].T @ both[n:]
             states[0] = start
-            states[0, free] = -np.linalg.solve(curves[0][np.ix_(free, free)], ahead[free])
+            states[0, free] = -np.linalg.solve(curves[0][np.ix_(free, free)], costate[free])
             for t, offset in enumerate(reversed(offsets)):
                 controls[t] = gains[t] @ states[t] + offset
                 states[t + 1] = jacobian[t] @ np.concatenate([states[t], controls[t]]) + arrived[t]

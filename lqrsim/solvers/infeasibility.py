@@ -40,7 +40,7 @@ class Evidence:
 
 def alike(cases: Sequence[Evidence]) -> list[Evidence]:
     """The evidence with equally small violations, the least first; empty unless it is from `STARTS` starts."""
-    least = sorted(cases, key=lambda one: one.missed)
+    least = sorted(cases, key=lambda case: case.missed)
     same = [case for case in least if case.missed <= (1 + ALIKE) * least[0].missed]
     return same if len(same) >= STARTS else []
 
@@ -94,12 +94,12 @@ def _violation_slopes(
                 alone[t] -= slope
                 missed += float(short[t, row] / rows[row])
         for row in range(term.rows):
-            beyond = float(short[:, row].max())
-            share = 1 + beyond / rows[row] if beyond > allowed else float(np.abs(weights[:, row]).sum())
-            if share > 1e-2:
-                t = int((short if beyond > allowed else np.abs(weights))[:, row].argmax())
-                shortfall = f", missed by {beyond:.2g}" if beyond > allowed else ""
-                holding.append((share, f"{term.describe(row)} at {t * problem.dt:.2f} s{shortfall}"))
+            excess = float(short[:, row].max())
+            weight_of_row = 1 + excess / rows[row] if excess > allowed else float(np.abs(weights[:, row]).sum())
+            if weight_of_row > 1e-2:
+                t = int((short if excess > allowed else np.abs(weights))[:, row].argmax())
+                shortfall = f", missed by {excess:.2g}" if excess > allowed else ""
+                holding.append((weight_of_row, f"{term.describe(row)} at {t * problem.dt:.2f} s{shortfall}"))
     return missed, slopes, alone, holding
 
 

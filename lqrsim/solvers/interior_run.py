@@ -120,8 +120,8 @@ class InteriorRun:
         """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
         dynamics, dt, draws = self._problem.dynamics, self._problem.dt, np.random.default_rng(0)
 
-        def perturbed(one: Array, size: Array) -> Array:
-            return one + BESIDE * size * draws.choice([-1.0, 1.0], len(one))
+        def perturbed(numbers: Array, size: Array) -> Array:
+            return numbers + BESIDE * size * draws.choice([-1.0, 1.0], len(numbers))
 
         for x, u in zip(interior.plan.states[:-1], interior.plan.controls, strict=True):
             here = np.hstack(dynamics.linearize(x, u, dt)[:2])
@@ -157,7 +157,7 @@ class InteriorRun:
         for gains in (gain.copy(), np.zeros_like(gain)):
             law = compiled.law_about(*plan, gains)
             candidates.append(self.result(*self._run.work.roll_out(*law, plan.states[0]), law))
-        return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
+        return min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
 
     def _polished(self, interior: InteriorResult) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
@@ -208,9 +208,9 @@ class InteriorRun:
         """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""
         controls, gain = interior.plan.controls.copy(), interior.gain.copy()
         for side, sign in ((self._run.stages.low, -1.0), (self._run.stages.high, 1.0)):
-            room = np.abs(side - controls) / interior.sizes.controls
+            distance = np.abs(side - controls) / interior.sizes.controls
             force = sign * interior.pressing * interior.sizes.controls / interior.scale
-            pressed = (room < AT_LIMIT) & (force > room)
+            pressed = (distance < AT_LIMIT) & (force > distance)
             controls = np.where(pressed, side, controls)
             gain[pressed] = 0.0
         return controls, gain

@@ -147,8 +147,8 @@ def _off_plan(parts: tuple[Array, ...], passes: RiccatiArrays, states: Array) ->
     scale = np.maximum(np.ptp(states, axis=0), 1.0)
     gap = float((np.abs(x_hat - states) / scale).max())
     u_hat = np.einsum("tij,tj->ti", gain, x_hat[:-1]) + offset
-    ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
-    return gap, float((np.abs(x_hat[1:] - ahead) / scale).max())
+    reached = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
+    return gap, float((np.abs(x_hat[1:] - reached) / scale).max())
 
 
 def _cost_at(initial: Quadratic | FixedState, state: Array) -> float:

@@ -23,8 +23,8 @@ from lqrsim.solvers.parallel import workers
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows the gain from each of these choices.
 STARTS = 7
-ASIDE = 3  # number of starts for passing a constraint on another side
-SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
+DETOURS = 3  # number of starts for passing a constraint on another side
+OBSTACLES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
 PATH_WEIGHT = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # sideways bend of the paths, relative to the distance from start to goal
 FOLD = 0.9  # bend for states that move collision spheres: an arm must fold up before it passes an obstacle
@@ -76,7 +76,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count, ring=ring, unit=unit):
         about = between.copy()
         about[:, moving] = path(*ends, bend, problem.steps)
-        prior = InitialPrior(weight, about=about, iterations=CHOOSE if holding else 1, obstacles=SHARES)
+        prior = InitialPrior(weight, about=about, iterations=CHOOSE if holding else 1, obstacles=OBSTACLES)
         starts.append((name, prior))
     return starts
 
@@ -113,13 +113,13 @@ def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]
     """Paths to the goal that bend to the sides, by name; none without a position, or if the goal is at the start.
 
     Args:
-      count: the number of starts including the straight path, which is not returned; by default `ASIDE`.
+      count: the number of starts including the straight path, which is not returned; by default `DETOURS`.
     """
     place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
         return {}
     trajectories = {}
-    for name, bend in bends((goal - begin)[place], ASIDE if count is None else count)[1:]:
+    for name, bend in bends((goal - begin)[place], DETOURS if count is None else count)[1:]:
         states = path(begin, goal, np.zeros(len(begin)), problem.steps)
         states[:, place] = path(begin[place], goal[place], bend, problem.steps)
         controls = np.tile(problem.nominal_control, (problem.steps, 1))
@@ -176,10 +176,11 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
     space, nominal = problem.control_coordinates, problem.nominal_control
     actuators = problem.dynamics.control_coordinates
     low, high = np.maximum(space.low, actuators.low), np.minimum(space.high, actuators.high)
-    room = np.minimum(high - nominal, nominal - low)
-    far = SWAY * np.where(np.isfinite(room), np.maximum(room, 0.0), 1.0)
+    margin = np.minimum(high - nominal, nominal - low)
+    amplitude = SWAY * np.where(np.isfinite(margin), np.maximum(margin, 0.0), 1.0)
     times = np.arange(problem.steps)[:, None] / problem.steps
-    return nominal + far * np.sign(cycles) * np.sin(2 * np.pi * (abs(cycles) * times - np.arange(len(nominal)) / 4))
+    phases = abs(cycles) * times - np.arange(len(nominal)) / 4
+    return nominal + amplitude * np.sign(cycles) * np.sin(2 * np.pi * phases)
 
 
 def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
@@ -191,13 +192,13 @@ def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
     space, nominal, start = problem.control_coordinates, problem.nominal_control, problem.start
     assert start is not None
     m, steps = len(nominal), problem.steps
-    shares = LEVELS if m < 3 else LEVELS[::2]
-    combinations = itertools.product(shares, repeat=m) if m < 5 else zip(*[shares] * m, strict=True)
+    levels = LEVELS if m < 3 else LEVELS[::2]
+    combinations = itertools.product(levels, repeat=m) if m < 5 else zip(*[levels] * m, strict=True)
     limited = np.isfinite([space.low, space.high]).all()
-    for share, far in itertools.product(combinations, (1.0,) if limited else UNLIMITED):
-        low = np.where(np.isfinite(space.low), space.low, nominal - far)
-        high = np.where(np.isfinite(space.high), space.high, nominal + far)
-        control = low + np.array(share) * (high - low)
+    for level, half_range in itertools.product(combinations, (1.0,) if limited else UNLIMITED):
+        low = np.where(np.isfinite(space.low), space.low, nominal - half_range)
+        high = np.where(np.isfinite(space.high), space.high, nominal + half_range)
+        control = low + np.array(level) * (high - low)
         plan = compiled.rollout(problem, np.zeros((steps, m, len(start))), np.tile(control, (steps, 1)), start.copy())
         if np.isfinite(plan[0]).all():
             yield control, Motion(*plan)
@@ -214,11 +215,11 @@ def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
     start, steps = problem.start, problem.steps
     nominal = np.broadcast_to(problem.nominal_controls, (steps, len(low)))
     gain = np.zeros((steps, len(low), len(nominal[0]) if start is None else len(start)))
-    for i, side, share, part in itertools.product(range(len(low)), (high, low), PUSHED, PARTS):
-        far = share * np.where(np.isfinite(side[i]), side[i] - nominal[:, i], 1.0 if side is high else -1.0)
+    for i, side, fraction, duration in itertools.product(range(len(low)), (high, low), PUSHED, PARTS):
+        change = fraction * np.where(np.isfinite(side[i]), side[i] - nominal[:, i], 1.0 if side is high else -1.0)
         controls = nominal.copy()
-        controls[:, i] += np.where(np.arange(steps) < part * steps, far, 0.0)
-        if start is not None and far.any():
+        controls[:, i] += np.where(np.arange(steps) < duration * steps, change, 0.0)
+        if start is not None and change.any():
             plan = Motion(*compiled.rollout(problem, gain, controls, start.copy()))
             if np.isfinite(plan.states).all():
                 yield f"a push by {space.names[i]}", controls, plan
@@ -269,26 +270,26 @@ def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m")
     straight: list[tuple[str, Array]] = [("straight", np.zeros(len(way)))]
     if count == 1 or len(way) == 1:
         return straight
-    ahead, others = way / distance, count - 1
+    forward, others = way / distance, count - 1
     if len(way) == 2:
-        left, step = np.array([-ahead[1], ahead[0]]), min(STEP, WIDEST / ((others + 1) // 2))
+        left, step = np.array([-forward[1], forward[0]]), min(STEP, WIDEST / ((others + 1) // 2))
         sides = [((i // 2 + 1) * step, i % 2) for i in range(others)]
         return straight + [
-            (f"{far * distance:.3g} {unit} to the {('left', 'right')[side]}", far * distance * (1 - 2 * side) * left)
-            for far, side in sides
+            (f"{bend * distance:.3g} {unit} to the {('left', 'right')[side]}", bend * distance * (1 - 2 * side) * left)
+            for bend, side in sides
         ]
     if len(way) > 3:
-        aside = np.linalg.qr(np.column_stack([ahead, np.eye(len(way))[:, np.argsort(np.abs(ahead))[:-1]]]))[0][:, 1:]
-        far = ring * distance
+        axes = np.eye(len(way))[:, np.argsort(np.abs(forward))[:-1]]
+        sideways, bend = np.linalg.qr(np.column_stack([forward, axes]))[0][:, 1:], ring * distance
         named = [
-            (f"{far:.3g} {unit} aside, direction {sign}{side + 1}", factor * far * aside[:, side])
+            (f"{bend:.3g} {unit} aside, direction {sign}{side + 1}", factor * bend * sideways[:, side])
             for side in range(len(way) - 1)
             for sign, factor in (("", 1), ("-", -1))
         ]
         return straight + named[:others]
-    across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    across = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
     across /= np.linalg.norm(across)
-    upright = np.cross(ahead, across)
+    upright = np.cross(forward, across)
     angles = 2 * np.pi * np.arange(others) / others
     return straight + [
         (

@@ -331,7 +331,7 @@ class _Neighbour:
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
             self.laps.ended = time.perf_counter()
             solved = self._solve(active)
-            if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
+            if not (solved or active.hopeless or self._late(BEGINNING * active.model_seconds)) and budget.left:
                 point = InteriorPoint(self._stages, copied(self._best.plan), WEAK, multipliers=known)
 
                 def watch(measures: Measures, seconds: float) -> bool:
@@ -343,7 +343,7 @@ class _Neighbour:
                     active = ActiveSet(self._stages, result.plan, result.multipliers, self._allowed)
                     solved = self._solve(active)
             self.laps.ended = time.perf_counter()
-            in_time = self.laps.ended + ELSEWHERE * active.looking + self._closing < budget.stop.deadline
+            in_time = self.laps.ended + ELSEWHERE * active.model_seconds + self._closing < budget.stop.deadline
             self.may_be_far = not solved and in_time and budget.left > 1
             return self._result(active, solved)
 
@@ -352,7 +352,7 @@ class _Neighbour:
 
         def watch(measures: Measures) -> bool:
             measures.record(self.laps, "active set")
-            return self._late(active.looking) or not self._budget.left
+            return self._late(active.model_seconds) or not self._budget.left
 
         return active.run(self._run.final, watch, self._late)
 
@@ -415,16 +415,16 @@ class _Yielding:
         with np.errstate(all="ignore"):
             point = InteriorPoint(run.stages, self._plan, STRONGER, price=self._price, oldest=OLDEST)
             self.ended = time.perf_counter()
-            looking, laps = self.ended - clock, Laps(budget)
+            model_seconds, laps = self.ended - clock, Laps(budget)
 
             def watch(measures: Measures, seconds: float) -> bool:
                 measures.record(laps, seconds=seconds)
                 self.ended = time.perf_counter()
                 # The next iteration may compute the derivatives anew.
-                self._late = self.ended + looking + seconds + self._closing >= budget.stop.deadline
+                self._late = self.ended + model_seconds + seconds + self._closing >= budget.stop.deadline
                 return self._late
 
-            self._late = self.ended + looking + self._closing >= budget.stop.deadline
+            self._late = self.ended + model_seconds + self._closing >= budget.stop.deadline
             if self._late or not budget.left:
                 return None
             result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)

@@ -54,10 +54,10 @@ def restore(
         return stages.call("restoration", first, last, price, stages.about, work, memory, log)
 
     run(0, 0)
-    done, outcome, ended, at_minimum, bite = 0, RUNNING, False, False, 1
+    done, outcome, ended, at_minimum, size = 0, RUNNING, False, False, 1
     while outcome in (RUNNING, NO_PROGRESS) and not ended and done < most:
         first, clock = done, time.perf_counter()
-        done, outcome = run(first, min(first + bite, most))
+        done, outcome = run(first, min(first + size, most))
         seconds = (time.perf_counter() - clock) / max(done - first, 1)
         for row in log[first:done].tolist():
             ended = watch(*row, seconds) or ended
@@ -70,7 +70,7 @@ def restore(
                 Motion(*map(np.copy, work.plan)), [shares[:, stages.owners == k].copy() for k in terms]
             )
         if not hurried and not functions:
-            bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
+            size = max(1, int(ATTENTION / max(seconds, 1e-9)))
     if outcome == NOT_FINITE:
         return None
     return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["nearly_feasible"][0]))

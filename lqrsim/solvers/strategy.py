@@ -79,7 +79,7 @@ ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 
 # Saddles that are left in turn; steps away from one along its direction of negative curvature, relative to the typical
 # sizes; and the relative decrease of cost that such a step must lead to.
-SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
+SADDLES, SADDLE_STEPS, SADDLE_DECREASE = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 
 PUSHES = 2  # plans of pushes and approaches from which a descent begins
 SAVES = 0.5  # cost of a plan that moves a body, relative to one that does not, with which the search for more ends
@@ -404,7 +404,7 @@ class Search:
                 (missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control)
             )
         plans = [entry for entry in plans if np.isfinite(entry[:2]).all()]
-        for _, _, control in sorted(plans, key=lambda one: one[:2])[:CONSTANT]:
+        for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
             run = self._add(
                 resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}"
             )
@@ -512,7 +512,7 @@ class Search:
             if np.isfinite(states).all():
                 missed = run.work.violation(run.work.constraint_values(states, controls))
                 motions.append((missed, name, Trajectory(states, controls, problem.dt)))
-        return [(name, motion) for _, name, motion in sorted(motions, key=lambda one: one[0])]
+        return [(name, motion) for _, name, motion in sorted(motions, key=lambda motion: motion[0])]
 
     def _steered(self) -> list[int]:
         """The states that place the robot: its position, or else states on which constraints to be passed depend."""
@@ -578,9 +578,9 @@ class Search:
         if bend.direction is None:
             return False
         saddle, direction = at_saddle.kept(), bend.direction
-        for far, sign in itertools.product(AWAY, (1, -1)):
+        for size, sign in itertools.product(SADDLE_STEPS, (1, -1)):
             moved = Trajectory(
-                saddle.states + sign * far * direction.states, saddle.controls + sign * far * direction.controls,
+                saddle.states + sign * size * direction.states, saddle.controls + sign * size * direction.controls,
                 self._problem.dt,
             )  # fmt: skip
             run_beside = self._another(InitialGuess(saddle.law[0].copy(), saddle.law[1].copy(), "a saddle"))
@@ -588,7 +588,7 @@ class Search:
             result = from_beside(run_beside, moved, saddle)
             if self._budget.stop.due:
                 break
-            if result is not None and result.success and result.cost < saddle.cost - FELL_FROM * abs(saddle.cost):
+            if result is not None and result.success and result.cost < saddle.cost - SADDLE_DECREASE * abs(saddle.cost):
                 self._named.append(("beside a saddle", run_beside))
                 self._offer(run_beside, result, better=True)
                 return True
@@ -624,8 +624,8 @@ class Search:
             plan = Motion(*compiled.rollout(problem, *drawn.law, before.states[0].copy()))
             if consider(name, policy_of(drawn, name), plan):
                 break
-        plans.sort(key=lambda one: one[:2])
-        self._nearer = next(((name, cost) for away, cost, name, _ in plans if not away), None)
+        plans.sort(key=lambda entry: entry[:2])
+        self._nearer = next(((name, cost) for missed, cost, name, _ in plans if not missed), None)
         for _, _, name, begin in plans[:PUSHES]:
             run = self._add(begin, name)
             with problem.dynamics.solving(self._threads):
@@ -755,7 +755,7 @@ class Search:
             again = self._stiffen({", again": before}, last, [], SOFT) if last else None
             begin = min(
                 (candidate for candidate in (before, again) if candidate is not None and candidate is not optimum),
-                key=lambda one: one.cost, default=before,
+                key=lambda result: result.cost, default=before,
             )  # fmt: skip
             if begin is optimum or self._budget.stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
                 return
@@ -771,7 +771,7 @@ class Search:
         if self._problem.constraints:
             return self.best[1]
         finite = [result for _, result in self._finished if np.isfinite(result.cost)]
-        return min(finite, key=lambda found: found.cost, default=self.best[1])
+        return min(finite, key=lambda result: result.cost, default=self.best[1])
 
     def _stiffen(
         self, plans: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str], most: int

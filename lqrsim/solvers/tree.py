@@ -267,8 +267,8 @@ class Tree:
         if not count:
             return None
         root, mean, constant = (part[:count] for part in self._reach)
-        away = (root.reshape(-1, n) @ target).reshape(mean.shape) - mean
-        costs = constant + np.square(away).sum(axis=-1) / 2 + self._worn[:count]
+        deviations = (root.reshape(-1, n) @ target).reshape(mean.shape) - mean
+        costs = constant + np.square(deviations).sum(axis=-1) / 2 + self._worn[:count]
         node, arrival = np.unravel_index(int(np.argmin(costs)), costs.shape)
         steps = int(self._planner.arrivals[arrival])
         plan = self._planner.plan(self._states[node], target, self._sign, steps)

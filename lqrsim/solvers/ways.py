@@ -195,17 +195,17 @@ class Grid:
         for move in itertools.product((-1, 0, 1), repeat=len(self.shape)):
             if not any(move):
                 continue
-            here = tuple(slice(max(-m, 0), n - max(m, 0)) for m, n in zip(move, self.shape, strict=True))
+            cells_here = tuple(slice(max(-m, 0), n - max(m, 0)) for m, n in zip(move, self.shape, strict=True))
             neighbour = tuple(slice(max(m, 0), n - max(-m, 0)) for m, n in zip(move, self.shape, strict=True))
             fits = free.along(np.array(move)).reshape(self.shape)
-            both = fits[here] & fits[neighbour]
-            rows.append(index[here][both])
+            both = fits[cells_here] & fits[neighbour]
+            rows.append(index[cells_here][both])
             columns.append(index[neighbour][both])
-            weights.append(np.linalg.norm(move) * (length[here][both] + length[neighbour][both]) / 2)
+            weights.append(np.linalg.norm(move) * (length[cells_here][both] + length[neighbour][both]) / 2)
         graph = coo_array((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), (index.size,) * 2)
         first, last = index[self.nearest(np.array([begin, end]))].tolist()
-        far, before = dijkstra(graph.tocsr(), indices=first, return_predecessors=True)
-        if not np.isfinite(far[last]):
+        distances, before = dijkstra(graph.tocsr(), indices=first, return_predecessors=True)
+        if not np.isfinite(distances[last]):
             return None
         cells = [last]
         while cells[-1] != first:
@@ -260,15 +260,15 @@ def _paths(
     fits = _fits(stages, headings, np.array([start, goal]), grid.points)
     for at in (begin, end):
         fits |= np.abs(grid.points - at).max(axis=1) <= NEAR * grid.cell
-    away, roomy = float(np.linalg.norm(end - begin)), np.array([fits.all(axis=0)])
+    distance, any_heading = float(np.linalg.norm(end - begin)), np.array([fits.all(axis=0)])
     straight = [] if headings.angles else [np.linspace(begin, end, DENSE)]
     for backwards in (False, True) if headings.angles else (False,):
         known = straight.copy()
         narrow = [Fits(fits, True, backwards)] if headings.angles else []
-        for free in (Fits(roomy, False), *narrow, Fits(fits, False)):
-            for path in _routes(grid, begin, end, free, BESIDE * away):
+        for free in (Fits(any_heading, False), *narrow, Fits(fits, False)):
+            for path in _routes(grid, begin, end, free, BESIDE * distance):
                 dense = _drawn(path, DENSE)
-                if all(_apart(dense, other) > BESIDE * away for other in known):
+                if all(_apart(dense, other) > BESIDE * distance for other in known):
                     known.append(dense)
                     yield path, backwards
 
@@ -330,10 +330,10 @@ def _fits(stages: Stages, headings: Headings, ends: Array, points: Array) -> npt
     controls = np.broadcast_to(problem.nominal_controls, (problem.steps, len(problem.control_coordinates)))
     for fitting, attitude in zip(fits, attitudes, strict=True):
         for first in range(0, len(points), knots):
-            part = points[first : first + knots]
+            batch = points[first : first + knots]
             states = np.tile(attitude, (knots + 2, 1))
-            states[1 : 1 + len(part), place] = part
-            values = stages.values(Motion(in_c_order(states), in_c_order(controls)))[1 : 1 + len(part), rows]
+            states[1 : 1 + len(batch), place] = batch
+            values = stages.values(Motion(in_c_order(states), in_c_order(controls)))[1 : 1 + len(batch), rows]
             fitting[first : first + knots] = ~(values < 0).any(axis=1)
     return fits
 
