@@ -1,7 +1,6 @@
 """One run of the solver from one start: memory, smoothing, Newton's method at the end, and the safeguard."""
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -46,7 +45,7 @@ from lqrsim.solvers.certify import REST, SLACK, certificate_of, faults, no_value
 from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
-from lqrsim.solvers.stages import LARGEST_KEPT, MOST_KEPT, Stages
+from lqrsim.solvers.stages import Pool, Stages
 
 _METHODS = {getattr(declarations, name): name.lower() for name in ("SMOOTH", "DAMPED", "REJECTED", "ILQR", "NEWTON")}
 # The status of each outcome: that of the same name, if there is one.
@@ -72,8 +71,6 @@ VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
 # The squares that the interior point's margins leave of a cost of zero, relative to those that rounding leaves.
 MARGIN_SQUARES = 1e8
 ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
-_idle: "list[SolveRun]" = []
-_lending = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -200,16 +197,14 @@ class SolveRun:
         cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
         entry: str = "smoother",
     ) -> "SolveRun":  # fmt: skip
-        """A run, if possible in memory that an earlier solve gave back, because allocating takes time.
+        """A run, if possible in memory that an earlier solve gave back.
 
         The run overwrites the result of the earlier solve, which must have been copied.
         """
         wanted = entry, compiled.core(problem, settings.form), problem.steps
-        with _lending:
-            fitting = (idle for idle in reversed(_idle) if (idle.entry, idle.work.core, idle.problem.steps) == wanted)
-            run = next(fitting, None) if settings.first_pass == "forward" else None
-            if run is not None:
-                _idle.remove(run)
+        run = None
+        if settings.first_pass == "forward":
+            run = _pool.take(lambda idle: (idle.entry, idle.work.core, idle.problem.steps) == wanted)
         if run is None:
             return cls(problem, settings, initial_guess, start, budget, entry)
         run.problem, run.settings = problem, settings
@@ -220,10 +215,7 @@ class SolveRun:
     def give_back(self) -> None:
         """Leave the memory to another solve."""
         self._release_stages()
-        if self.problem.steps * self.problem.bytes_per_step <= LARGEST_KEPT:
-            with _lending:
-                _idle.append(self)
-                del _idle[:-MOST_KEPT]
+        _pool.give_back(self, self.problem)
 
     def _begin(self, initial_guess: InitialGuess, budget: Budget) -> None:
         self.initial_guess, self.budget = initial_guess, budget
@@ -729,6 +721,9 @@ class SolveRun:
 
     def _violation_of(self, plan: Motion) -> float:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
+
+
+_pool = Pool[SolveRun]()
 
 
 class Workspace:

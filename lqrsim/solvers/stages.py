@@ -7,8 +7,8 @@ to do with the rows: the interior point, the active set, and the restoration.
 
 import functools
 import threading
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,29 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # memories that are kept for later solves, and largest size in bytes
-_idle: "list[Stages]" = []
-_lending = threading.Lock()
+M = TypeVar("M")
+
+
+class Pool(Generic[M]):
+    """Memories that were given back, for later solves, because allocating takes time."""
+
+    def __init__(self) -> None:
+        self._idle, self._lock = list[M](), threading.Lock()
+
+    def take(self, fits: Callable[[M], bool]) -> M | None:
+        """The memory that was given back last and fits; None if there is none."""
+        with self._lock:
+            memory = next((idle for idle in reversed(self._idle) if fits(idle)), None)
+            if memory is not None:
+                self._idle.remove(memory)
+        return memory
+
+    def give_back(self, memory: M, problem: Problem) -> None:
+        """Keep a memory of a solve of this problem, unless it is too large."""
+        if problem.steps * problem.bytes_per_step <= LARGEST_KEPT:
+            with self._lock:
+                self._idle.append(memory)
+                del self._idle[:-MOST_KEPT]
 
 
 class Sizes(NamedTuple):
@@ -140,12 +161,9 @@ class Stages:
 
     @classmethod
     def lent(cls, problem: Problem) -> "Stages":
-        """The stages of a problem, if possible in memory that was given back, because allocating takes time."""
+        """The stages of a problem, if possible in memory that was given back."""
         shape = _shape(problem)
-        with _lending:
-            stages = next((idle for idle in reversed(_idle) if idle._shape == shape), None)
-            if stages is not None:
-                _idle.remove(stages)
+        stages = _pool.take(lambda idle: idle._shape == shape)
         if stages is None:
             return cls(problem)
         stages._read_problem(problem)
@@ -154,10 +172,7 @@ class Stages:
 
     def give_back(self) -> None:
         """Leave the memory to another solve."""
-        if self.steps * self.problem.bytes_per_step <= LARGEST_KEPT:
-            with _lending:
-                _idle.append(self)
-                del _idle[:-MOST_KEPT]
+        _pool.give_back(self, self.problem)
 
     def prepare(self) -> None:
         """Compile what a solve needs of the stages, with the interior point, together."""
@@ -271,6 +286,7 @@ class Stages:
         return zeros_of(RestorationArrays, **self._lengths), np.zeros(1, RESTORATION)
 
 
+_pool = Pool[Stages]()
 _Shape = tuple[int, int, int, tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 

@@ -128,7 +128,7 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
         problem, settings, log = outlined(problem, settings, stop)
     preliminary = settings is not original
     for refinements in reversed(range(REFINEMENTS + 1)):
-        solution = _searched(problem, settings, stop, trees=trees)
+        solution = _search(problem, settings, stop, trees=trees)
         refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
         if log:
             solution = replace(solution, iterations=(*log, *solution.iterations))
@@ -141,7 +141,7 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
     return stop.finish(solution)
 
 
-def _searched(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool) -> Solution:
+def _search(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool) -> Solution:
     """The answer of a search among starts, for constraints as they are."""
     with stop.not_counting():  # compiling
         starts = [(CALLERS_START, settings.start)] if settings.start is not None else guides(problem, settings.starts)
@@ -284,6 +284,7 @@ class Search:
         )  # fmt: skip
         self._callback, self._threads = self._budget.stop.callback, self._budget.stop.threads
         self._solving = self._threads if len(named) == 1 else 1
+        self._guided = path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
         self._default = self._settings.start is None and self._settings.starts is None
         self.tried = not self._settings.safeguard
         self._finished: list[tuple[SolveRun, RunResult]] = []
@@ -314,7 +315,7 @@ class Search:
             if self.touches:
                 self.try_detours()
             self.leave_saddles()
-        if self.misses_unmoved:
+        if self._default and self.may_go_on and self._unmoved():
             self.move()
         if self.risked_too_much:
             with self._problem.dynamics.solving(self._solving):
@@ -330,23 +331,21 @@ class Search:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         with self._problem.dynamics.solving(self._solving):
             self.run()
-            if self.is_lost:
-                self.try_finite()
+            self.try_finite()
             if self.needs_others and self.is_barred:
                 self.try_past_constraints()
-            if self.needs_others and self.is_guided:
+            if self.needs_others and self._guided:
                 self.try_reweighted()
-            if self.needs_others and not self.is_guided and self.is_without_plan:
+            if self.needs_others and not self._guided and self.is_without_plan:
                 self.try_elsewhere()
-            if self.needs_others and not self.is_guided:
+            if self.needs_others and not self._guided:
                 self.try_sinusoidal_controls()
         return self.best
 
     def run(self) -> None:
         """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
         chosen, *others = choose([run for _, run in self._named], self._threads)
-        if self._may_follow_a_line:
-            chosen = self._smooth_or_follow_a_line(chosen)
+        chosen = self._smooth_or_follow_a_line(chosen)
         self._offer(chosen, self._finish(chosen))
         if not chosen.problem.constraints:
             return
@@ -358,44 +357,37 @@ class Search:
                 break
             self._offer(run, self._finish(run))
 
-    @property
-    def _may_follow_a_line(self) -> bool:
-        """Whether a line of states is another start: an arm, say, whose every joint has a motor.
+    def _smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
+        """For an arm, say, whose every joint has a motor: if smoothing fails, also smooth from a line of states.
 
+        From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
+
+        Returns:
+          The run itself, or that from the line if it is cheaper.
         """
         problem = self._problem
         driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
         known = problem.start is not None and problem.goal is not None
         plain = not problem.constraints and self._default and not self._named[0][1].second_order
-        return driven and known and plain and self._settings.safeguard
-
-    def _smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
-        """Smooth; if this fails, which damped steps would follow, also from a line of states; the cheaper of both.
-
-        From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
-        """
+        if not (driven and known and plain and self._settings.safeguard):
+            return run
         run.budget.report_to(self._callback)
         run.smooth(self._settings.max_iterations)
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
         if run.ending.success or run.ending.status in unfinished or self._budget.stop.due:
             return run
-        line = self._add(resolve(line_of_states(self._problem), self._problem), "a line of states")
+        line = self._add(resolve(line_of_states(problem), problem), "a line of states")
         line.budget.report_to(self._callback)
         line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
 
-    @property
-    def is_lost(self) -> bool:
-        """Whether the states leave their domain."""
-        best = self.best[1]
-        lost = not np.isfinite(best.cost) and best.status is not Status.RISK_TOO_HIGH
-        return lost and self._problem.start is not None and not self._budget.stop.due
-
     def try_finite(self) -> None:
-        """Try constant controls under which the states stay in their domain, and a line of states."""
-        problem, exact = self._problem, self.best[0].second_order
-        assert problem.start is not None
+        """Where states leave their domain, try constant controls under which they do not, and a line of states."""
+        problem, exact, best = self._problem, self.best[0].second_order, self.best[1]
+        lost = not np.isfinite(best.cost) and best.status is not Status.RISK_TOO_HIGH
+        if not lost or problem.start is None or self._budget.stop.due:
+            return
         self._known.from_start = False
         work, plans = self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in constant_controls(problem):
@@ -418,33 +410,27 @@ class Search:
 
     def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
+        stop = self._budget.stop
         for times in HEAVIER:
-            self._try_reweighted(times)
-        self.tried = not self._budget.stop.due
-
-    def _try_reweighted(self, times: float) -> None:
-        if self._budget.stop.due:
-            return
-        heavier = reweighted(self._problem, times)
-        runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
-        try:
-            boldest = choose(runs, self._threads)[0].run_to_end()
-        except InputError:  # the heavier cost is not finite at the start
-            return
-        if self._budget.stop.due:
-            return
-        run = self._add(policy_of(boldest, f"a plan for {times:g} times the weight of obstacles and goal"))
-        result, best = self._finish(run, refine), self.best[1]
-        # The same optimum, different within the tolerances, is no improvement.
-        lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
-        self._offer(run, result, better=result.rank < best.rank and lower)
+            if stop.due:
+                return
+            heavier = reweighted(self._problem, times)
+            runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
+            try:
+                heaviest = choose(runs, self._threads)[0].run_to_end()
+            except InputError:  # the heavier cost is not finite at the start
+                continue
+            if stop.due:
+                return
+            run = self._add(policy_of(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
+            result, best = self._finish(run, refine), self.best[1]
+            # The same optimum, different within the tolerances, is no improvement.
+            lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
+            self._offer(run, result, better=result.rank < best.rank and lower)
+        self.tried = not stop.due
 
     def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
-        self._try_elsewhere()
-        self.tried = not self._budget.stop.due
-
-    def _try_elsewhere(self) -> None:
         problem, exact = self._problem, self.best[0].second_order
         if exact:
             self._follow_ways()
@@ -452,12 +438,13 @@ class Search:
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
             if self._budget.stop.due or self.best[1].success:
-                return
+                break
             self._known.from_start = False
             run = self._add(resolve(start, problem), name)
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._offer(run, self._finish(run, finish if exact and name in sways else refine))
+        self.tried = not self._budget.stop.due
 
     def _follow_ways(self) -> None:
         """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
@@ -541,7 +528,7 @@ class Search:
     @property
     def touches(self) -> bool:
         """Whether the best plan touches a constraint that may be passed on another side."""
-        if self._settings.start is not None or not self.best[0].second_order or path_weight(self._problem) > 0:
+        if self._settings.start is not None or not self.best[0].second_order or self._guided:
             return False
         touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
         return any(multipliers.values.any() for multipliers in touched)
@@ -554,18 +541,12 @@ class Search:
                 run = self._add(resolve(trajectory, problem), name)
                 self._offer(run, self._finish(run))
 
-    @property
-    def is_at_saddle(self) -> bool:
-        """Whether the best plan is a saddle."""
-        certificate = self.best[1].certificate
-        return certificate is not None and certificate.curvature is Curvature.SADDLE
-
     def leave_saddles(self) -> None:
-        """Go down along a direction of negative curvature, and converge from there, while that is a saddle, too."""
+        """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle."""
         for _ in range(SADDLES):
-            if not self.is_at_saddle:
-                return
             run, best = self.best
+            if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
+                return
             if not self._descend(run, best):
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
@@ -594,13 +575,11 @@ class Search:
                 return True
         return False
 
-    @property
-    def misses_unmoved(self) -> bool:
-        """Whether no control changes a state that misses its goal, such as a box that nothing touches."""
-        return self._default and self.may_go_on and bool(self._unmoved())
-
     def move(self) -> None:
-        """Begin with motions that change these states: pushes by one control at a time, and approaches to a body."""
+        """Begin with motions that change states that miss their goal and that no control changes, as of a box.
+
+        These are pushes by one control at a time, and approaches to a body that nothing touches.
+        """
         problem, before, places = self._problem, self.best[1], self._unmoved()
         self._still = before, places
         plans = list[tuple[bool, float, str, InitialGuess]]()
@@ -939,11 +918,6 @@ class Search:
         return self._default and self.may_go_on and (alone or not best.success)
 
     @property
-    def is_guided(self) -> bool:
-        """Whether obstacles in the cost push the plan."""
-        return path_weight(self._problem) > 0
-
-    @property
     def _cut_short(self) -> bool:
         """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
         if self.best[1].success or not (self._default and self._settings.safeguard and self._budget.stop.due):
@@ -975,7 +949,7 @@ class Search:
         """
         problem = self._problem
         space = problem.dynamics.state_coordinates
-        if not self.is_guided or problem.goal is None:
+        if not self._guided or problem.goal is None:
             return self.is_without_plan or self._idle()
         (run, best), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not best.success:
