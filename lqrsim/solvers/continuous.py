@@ -191,7 +191,7 @@ def smooth_lq_continuous(
         return constant_model if constant_model is not None else _model(at(t), n, m)
 
     constant_model = None if callable(stage) else _model(first, n, m)
-    c_0, c_l = _end("initial", initial, n), _end("final", final, n)
+    c_0, c_l = (bordered(*check_end(name, cost, n)) for name, cost in (("initial", initial), ("final", final)))
     backward, forward, status, detail = None, None, Status.CONVERGED, ""
     where = "backward pass"
     try:
@@ -214,11 +214,6 @@ def _model(stage: Stage, n: int, m: int) -> Model:
         raise InputError(f"stage: got B of shape {B.shape}, want ({n}, {m}) at all times")
     hessian, gradient = np.block([[Q, P.T], [P, R]]), np.concatenate([q, r])
     return homogeneous(A, B, c, hessian, gradient, float(np.asarray(stage.constant)), np.zeros(n), np.zeros(m))
-
-
-def _end(field: str, cost: Quadratic, n: int) -> Array:
-    """An initial or final cost as V (n+1, n+1). Raises InputError unless it is a quadratic of n states."""
-    return bordered(*check_end(field, cost, n))
 
 
 def _check_minimum(backward: Pass, forward: Pass) -> None:
@@ -335,7 +330,9 @@ def _iterate(
         except IntegrationFailure as failure:
             return iterations, failure.status, _at(f"{solver.where} of iteration {number}", failure)
         escape = solver.rollout()
-        improvement = solver.improvement(iterations[-1].cost if iterations else math.inf)
+        before = iterations[-1].cost if iterations else math.inf
+        # A cost below the tolerance is noise of the integrator.
+        improvement = (before - solver.cost) / max(abs(solver.cost), solver.tolerances.atol)
         settled = abs(improvement) < tolerance and solver.gap < gap_tolerance
         row = Iteration(
             cost=solver.cost, improvement=improvement, gap=solver.gap,
@@ -360,14 +357,14 @@ class _Smoother:
     Attributes:
       forward, backward: the passes of the last iteration that completed both passes; None before.
       where: the pass that is under way.
-      cost, gap: cost and gap of the last rollout; see `Iteration`.
+      cost, gap: cost and gap of the last rollout; see `Iteration`. tolerances: those of the integration.
     """
 
     def __init__(
         self, problem: Problem, state: Array, control: Array, prior: InitialPrior | None, tolerances: Tolerances
     ) -> None:
         n, m = len(state), len(control)
-        self.system, self._tolerances = System(problem), tolerances
+        self.system, self.tolerances = System(problem), tolerances
         self._prior, self._prior_left = prior, prior.iterations if prior is not None else 0
         self._x_hat = state  # at 0
         # Before the first pass there is no cost-to-go, and the policy applies the initial control.
@@ -380,7 +377,7 @@ class _Smoother:
 
     def passes(self) -> None:
         """One pass forward and one backward. Paper: Secs. V-A and V-B. Raises IntegrationFailure."""
-        system, horizon, tolerances = self.system, self.system.horizon, self._tolerances
+        system, horizon, tolerances = self.system, self.system.horizon, self.tolerances
         prior, self._prior_left = self._prior if self._prior_left > 0 else None, self._prior_left - 1
         self.where = "forward pass"
         come = riccati_pass(
@@ -402,7 +399,7 @@ class _Smoother:
         """Run the new policy and set `cost` and `gap`; infinite if it diverges. Returns the failure, if any."""
         assert self.forward is not None
         try:
-            self.cost, self._states = self.system.rollout(self._x_hat, self._to_go, self._tolerances)
+            self.cost, self._states = self.system.rollout(self._x_hat, self._to_go, self.tolerances)
             times = self.system.knots
             total = self.forward.at(times)[0] + self._to_go.at(times)[0]
             x_hats = np.array([minimizer(V, t) for V, t in zip(total, times.tolist(), strict=True)])
@@ -413,19 +410,15 @@ class _Smoother:
         self.gap = float((np.abs(x_hats - states).max(axis=0) / np.maximum(np.ptp(states, axis=0), 1.0)).max())
         return None
 
-    def improvement(self, before: float) -> float:
-        """See `Iteration.improvement`. A cost below the tolerance is noise of the integrator."""
-        return (before - self.cost) / max(abs(self.cost), self._tolerances.atol)
-
     def optimality(self) -> float:
         """See `Iteration.optimality`; infinite if a model about the rollout has no minimum."""
         if self._states is None:
             return math.inf
         try:
-            decrease = self.system.decrease(self._states, self._to_go, self._tolerances)
+            decrease = self.system.decrease(self._states, self._to_go, self.tolerances)
         except IntegrationFailure:
             return math.inf
-        return decrease / max(abs(self.cost), self._tolerances.atol)
+        return decrease / max(abs(self.cost), self.tolerances.atol)
 
 
 def _at(where: str, failure: IntegrationFailure) -> str:

@@ -58,12 +58,15 @@ def smooth_lq(
     value += float(final(states[-1])) + _cost_at(initial, states[0])
     gap, residual, optimality = np.inf, np.inf, np.inf
     if not detail:
-        promised = float(Quadratic(*(part[0] for part in passes.to_go))(start)) + _cost_at(initial, start)
+        predicted = float(Quadratic(*(part[0] for part in passes.to_go))(start)) + _cost_at(initial, start)
         with np.errstate(all="ignore"):
-            optimality = abs(value - promised) / max(abs(value), 1e-28 * _size(parts, initial, final), 1e-300)
+            # If the terms of the cost at the origin cancel, a rounding error relative to them remains.
+            terms = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
+            terms += abs(float(initial.constant)) if isinstance(initial, Quadratic) else 0.0
+            optimality = abs(value - predicted) / max(abs(value), 1e-28 * terms, 1e-300)
             gap, residual = _off_plan(parts, passes, states)
         if not optimality < ACCURACY:
-            detail = f"too ill-conditioned: the plan costs {value:.9g}, the cost-to-go promised {promised:.9g}"
+            detail = f"too ill-conditioned: the plan costs {value:.9g}, the cost-to-go promised {predicted:.9g}"
     solved = not detail
     close = solved and max(gap, residual) < ACCURACY
     if solved and not close:
@@ -158,10 +161,13 @@ def _cost_at(initial: Quadratic | FixedState, state: Array) -> float:
 
 def _policy(gain: Array, offset: Array, nominal: Array, dt: float) -> AffinePolicy:
     _, m, n = gain.shape
+    states, controls = (
+        Coordinates(names=tuple(f"{letter}{i}" for i in range(size)), units=("",) * size)
+        for letter, size in (("x", n), ("u", m))
+    )
     return AffinePolicy(
-        gain=gain, offset=offset, nominal=nominal, dt=dt,
-        state_coordinates=_coordinates("x", n), control_coordinates=_coordinates("u", m),
-    )  # fmt: skip
+        gain=gain, offset=offset, nominal=nominal, dt=dt, state_coordinates=states, control_coordinates=controls
+    )
 
 
 @checked
@@ -170,16 +176,6 @@ def _parts(stage: Stage) -> tuple[Array, ...]:
     if np.ndim(stage.B) != 3:
         raise InputError("stage: got a single stage, want one stage per step: B of shape (T, n, m)")
     return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))
-
-
-def _size(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> float:
-    """Size of the cost's terms at the origin. If the terms cancel, a rounding error relative to this remains."""
-    size = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
-    return size + (abs(float(initial.constant)) if isinstance(initial, Quadratic) else 0.0)
-
-
-def _coordinates(letter: str, size: int) -> Coordinates:
-    return Coordinates(names=tuple(f"{letter}{i}" for i in range(size)), units=("",) * size)
 
 
 def _digest(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> str:
