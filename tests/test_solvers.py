@@ -403,7 +403,7 @@ class TestProgress:
         monkeypatch.setattr(budget, "SILENT", 1e3)
         ls.smooth(slow, callback=lambda iteration: None)
         monkeypatch.setattr(budget, "SILENT", 1e-3)
-        stop = budget.Stop(attentive=True, told=np.inf)
+        stop = budget.Stop(attentive=True, called=np.inf)
         with stop.reporting("smooth"):
             time.sleep(0.02)
         assert not caplog.records
@@ -495,7 +495,7 @@ def test_the_time_that_is_left_only_falls(monkeypatch: pytest.MonkeyPatch, seed:
         nonlocal counted
         seconds = float(draws.uniform(0.0, 5.0))
         now[0], counted = now[0] + seconds, counted + seconds * counts
-        said.append(int(stop.found.split("at most ")[1].split(" s ")[0]))
+        said.append(int(stop.progress.split("at most ")[1].split(" s ")[0]))
         assert said[-1] == round(100 - counted)
 
     for _ in range(6):

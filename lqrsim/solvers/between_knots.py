@@ -44,7 +44,7 @@ class PlanErrors:
     # For each constraint, the largest violation in each period, and the part of the period after which it is (T, rows),
     # not above 0 for what is not violated, or does not act between the knots.
     worst: list[Array]
-    shares: list[Array]
+    times: list[Array]
 
     @property
     def missed(self) -> float:
@@ -54,29 +54,29 @@ class PlanErrors:
     def record(self, problem: Problem) -> BetweenKnots:
         """The record of it, with the names of the problem's constraints."""
         violations: dict[str, tuple[float, float]] = {}
-        for constraint, term, worst, shares in zip(
-            problem.constraints, problem.constraint_terms, self.worst, self.shares, strict=True
+        for constraint, term, worst, times in zip(
+            problem.constraints, problem.constraint_terms, self.worst, self.times, strict=True
         ):
             for row, name in enumerate(names_of(constraint, term)):
                 t = int(np.argmax(worst[:, row]))
-                violation = float(worst[t, row]), problem.begin + problem.dt * (t + float(shares[t, row]))
+                violation = float(worst[t, row]), problem.begin + problem.dt * (t + float(times[t, row]))
                 if violation[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
                     violations[name] = violation
         return BetweenKnots(self.step_error, self.end_error, violations)
 
 
-def measure(problem: Problem, plan: Trajectory) -> PlanErrors:
+def plan_errors(problem: Problem, plan: Trajectory) -> PlanErrors:
     """What a plan does between its knots, with a problem's inequalities; the problem's dt is the plan's."""
     motion = Motion(in_c_order(plan.states), in_c_order(plan.controls))
     step_error, end_error = _errors(problem, motion)
-    worst, shares = _violations(problem, motion)
-    return PlanErrors(step_error, end_error, worst, shares)
+    worst, times = _violations(problem, motion)
+    return PlanErrors(step_error, end_error, worst, times)
 
 
 def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
     """What a plan for a problem does between its knots; its duration is the plan's."""
     stated = replace(problem, dt=plan.dt, duration=None, time_weight=0.0, accuracy=None, between_knots=False)
-    return measure(stated, plan).record(stated)
+    return plan_errors(stated, plan).record(stated)
 
 
 def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
@@ -118,13 +118,13 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
     states = _within(problem, plan, problem.dynamics._parts_of(problem.dt, GRID))
     states = np.concatenate([plan.states[:-1, None], states], axis=1)
     values = _values(problem, states, plan.controls)
-    worst, shares = [], []
+    worst, times = [], []
     for checked, rows in zip(within, values, strict=True):
-        missed, share = _deepest(-rows)
+        missed, time = _deepest(-rows)
         missed[0, rows[0, 0] < -MISSED] = 0.0
         worst.append(missed if checked else np.zeros_like(missed))
-        shares.append(share)
-    return worst, shares
+        times.append(time)
+    return worst, times
 
 
 def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
@@ -182,7 +182,7 @@ def solve_between_knots(
     rows = [Rows(np.zeros((problem.steps, term.rows)), np.zeros(term.rows)) for term in problem.constraint_terms]
 
     def again(last: Solution) -> Solution:
-        stated = _with_rows(problem, replace(at_knots, dt=last.trajectory.dt), rows)
+        stated = _with_rows_within(problem, replace(at_knots, dt=last.trajectory.dt), rows)
         return solve(stated, replace(settings, start=last, starts=None), last)
 
     solution, rounds, failed = solve(at_knots, settings, None), 0, 0
@@ -194,11 +194,11 @@ def solve_between_knots(
                 solution = again(solution)
             else:  # another way than the last plan's
                 rows = [constraint_rows.everywhere() for constraint_rows in rows]
-                solution = solve(_with_rows(problem, replace(at_knots, dt=problem.dt), rows), settings, None)
+                solution = solve(_with_rows_within(problem, replace(at_knots, dt=problem.dt), rows), settings, None)
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)
-        errors = measure(at_knots, solution.trajectory)
+        errors = plan_errors(at_knots, solution.trajectory)
         coarse = problem.accuracy is not None and errors.step_error > problem.accuracy
         missed = problem.between_knots and errors.missed > tolerance
         if not (coarse or missed):
@@ -231,7 +231,7 @@ def solve_between_knots(
     )  # fmt: skip
 
 
-def _with_rows(problem: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
+def _with_rows_within(problem: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
     """The problem with rows within its periods beside the constraints that are asked."""
     pairs = zip(problem.constraints, rows, strict=True)
     within = [

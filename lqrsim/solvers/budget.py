@@ -45,10 +45,10 @@ class Stop:
     # default it is the duration of the last iteration.
     reserve: float = 0.0
     pace: float = 0.0
-    # For all runs: the number of iterations, the last iteration, and the time at which the caller was last told of one.
+    # For all runs: the number of iterations, the last iteration, and the time at which the callback was last called.
     iterations: int = 0
     last: Iteration | None = None
-    told: float = -np.inf
+    called: float = -np.inf
     _stopped: float | None = None  # when the clock was stopped, if it does not count now
 
     def begin(self, seconds: float | None) -> None:
@@ -77,7 +77,7 @@ class Stop:
         return self.error is not None or time.perf_counter() + (self.reserve or self.pace) >= self.deadline
 
     @property
-    def found(self) -> str:
+    def progress(self) -> str:
         """The progress of the solve as text: the results so far, and the time that is left."""
         now, last = time.perf_counter() if self._stopped is None else self._stopped, self.last
         left = "" if self.deadline == np.inf else f"; at most {max(self.deadline - now, 0.0):.0f} s left"
@@ -93,7 +93,7 @@ class Stop:
         """A block that reports the progress if the caller hears nothing for long, unless many problems are solved."""
         if not self.attentive:
             return contextlib.nullcontext()
-        return reported(what, lambda: self.found, lambda: self.told, self.begun)
+        return reported(what, lambda: self.progress, lambda: self.called, self.begun)
 
     @contextlib.contextmanager
     def heeding(self) -> Iterator[None]:
@@ -153,18 +153,18 @@ class Budget:
         """Add an iteration to the log, and tell the callback."""
         self.log.append(iteration)
         self.stop.iterations, self.stop.last = self.stop.iterations + 1, iteration
-        self._tell((iteration,))
+        self._call((iteration,))
 
     def report_to(self, callback: Callback | None) -> None:
         """Set a callback; it is called at once with the iterations so far that none was called with."""
         self._callback = callback
-        self._tell(self.log[self._reported :])
+        self._call(self.log[self._reported :])
 
-    def _tell(self, iterations: Iterable[Iteration]) -> None:
+    def _call(self, iterations: Iterable[Iteration]) -> None:
         if self._callback is None:
             return
         self._reported = len(self.log)
-        self.stop.told = time.perf_counter()
+        self.stop.called = time.perf_counter()
         with self.stop.heeding():
             for iteration in iterations:
                 self._callback(iteration)
@@ -208,7 +208,7 @@ class Budget:
                 last, look = self.log[-2:]
                 self.log[begin - 1 :] = [replace(look, method=method, seconds=last.seconds + look.seconds)]
             else:
-                self._tell(self.log[begin:])
+                self._call(self.log[begin:])
 
 
 class Laps:
@@ -283,8 +283,8 @@ class _Activity:
     """What a block of `reported` does: its name, and functions as there. `due` is the time of the next report."""
 
     what: str
-    found: Callable[[], str]
-    told: Callable[[], float]
+    progress: Callable[[], str]
+    called: Callable[[], float]
     begun: float
 
     def __post_init__(self) -> None:
@@ -295,8 +295,8 @@ class _Activity:
         """Report the progress if it is due."""
         if now < self.due:
             return
-        if now - self.told() >= SILENT:
-            _log.warning("%s: %.0f s, %s", self.what, now - self.begun, self.found())
+        if now - self.called() >= SILENT:
+            _log.warning("%s: %.0f s, %s", self.what, now - self.begun, self.progress())
             self._wait = min(2 * self._wait, SELDOM)
         self.due = now + self._wait
 
@@ -306,18 +306,17 @@ _watch = _Watch()
 
 @contextlib.contextmanager
 def reported(
-    what: str, found: Callable[[], str], told: Callable[[], float] = lambda: -np.inf, begun: float | None = None
+    what: str, progress: Callable[[], str], called: Callable[[], float] = lambda: -np.inf, begun: float | None = None
 ) -> Iterator[None]:
     """A block that reports its progress after two silent seconds, as a warning of the logger `lqrsim`.
 
     Args:
       what: name of the activity, such as "smooth".
-      found: function that returns the results so far, and the time that is left, as text.
-      told: function that returns the time at which the caller was last told otherwise, on the clock of
-        `time.perf_counter`.
+      progress: function that returns the results so far, and the time that is left, as text.
+      called: function that returns the time at which a callback was last called, on the clock of `time.perf_counter`.
       begun: time at which the activity began, on the same clock; by default now.
     """
-    activity = _Activity(what, found, told, time.perf_counter() if begun is None else begun)
+    activity = _Activity(what, progress, called, time.perf_counter() if begun is None else begun)
     try:
         _watch.begin(activity)
         yield

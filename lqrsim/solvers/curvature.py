@@ -3,6 +3,9 @@
 The Hessian of the Lagrangian is reduced to the changes that keep the dynamics and all rows that are at zero. Its
 inertia is that of the control blocks of a Riccati recursion, in which later controls respond at their best. If a block
 has a negative eigenvalue, its eigenvector and these responses are a direction of negative curvature.
+
+The recursion takes long, so compiled ones come first, which can only say that a plan is a minimum beyond doubt: without
+constraints that of `kernels/certificate.py` (`SolveRun.check_curvature`), else `Stages.least_curvatures`.
 """
 
 from typing import NamedTuple
@@ -16,7 +19,7 @@ from lqrsim.results.solution_parts import Curvature
 from lqrsim.solvers.stages import Sizes, Stages
 
 # Weight of a row that is at zero, for a change by its size: of the plan's cost or, if it is more, the largest force.
-# Forces bend the Lagrangian by the rows' own curvature; where the duration was free, they are in the cost of time.
+# Forces check the Lagrangian by the rows' own curvature; where the duration was free, they are in the cost of time.
 HELD = 1e6
 AT_ZERO = 1e-5  # value of a row, relative to its size, that counts as zero
 TANGENT = 1e-3  # change of a held row, relative to its size and that of the direction, that is only the weight's
@@ -29,20 +32,20 @@ SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below whi
 Flags = npt.NDArray[np.bool_]
 
 
-class Bend(NamedTuple):
-    """The curvature at a plan, and for a saddle the direction of negative curvature, scaled to the typical sizes."""
+class CurvatureCheck(NamedTuple):
+    """The curvature at a plan, and for a saddle a direction of negative curvature, scaled to the typical sizes."""
 
     curvature: Curvature
     direction: Motion | None = None
 
 
-def curvature_at(stages: Stages, plan: Motion, multipliers: Array) -> Bend:
+def curvature_at(stages: Stages, plan: Motion, multipliers: Array) -> CurvatureCheck:
     """The curvature of the Lagrangian at a stationary plan, with multipliers (T+1, R) of the constraints' rows.
 
     Those of limits are worked out here. The models of the stages are overwritten.
     """
     with np.errstate(all="ignore"):
-        return _Reduced(stages, plan, multipliers, stages.sizes(plan)).bend()
+        return _Reduced(stages, plan, multipliers, stages.sizes(plan)).check()
 
 
 class _Reduced:
@@ -64,22 +67,22 @@ class _Reduced:
         self._all: Flags = at_zero
         self._strict: Flags = at_zero & (stages.equality | pressing)
 
-    def bend(self) -> Bend:
+    def check(self) -> CurvatureCheck:
         """A saddle if it bends down with all rows held that are at zero; a minimum if it bends up with fewer held."""
-        if self._bends_up(self._strict):
-            return Bend(Curvature.MINIMUM)
+        if self._surely_convex(self._strict):
+            return CurvatureCheck(Curvature.MINIMUM)
         kind, direction = self._recursion(self._all)
         if kind is Curvature.MINIMUM and (self._all & ~self._strict).any():
             kind = self._recursion(self._strict)[0]
             kind = Curvature.SINGULAR if kind is Curvature.SADDLE else kind
-        return Bend(kind, direction)
+        return CurvatureCheck(kind, direction)
 
     def _weights(self, held: Flags) -> Array:
         """Weights (T+1, R) on these rows."""
         return np.where(held & self._stages.live, HELD * self._scale / self._sizes.rows**2, 0.0)
 
-    def _bends_up(self, held: Flags) -> bool:
-        """Whether the curvature is positive beyond doubt: a compiled look, which most plans pass."""
+    def _surely_convex(self, held: Flags) -> bool:
+        """Whether the curvature is positive beyond doubt, by compiled code, as along most plans."""
         stages, fixed = self._stages, np.zeros((self._stages.steps, self._stages.m), dtype=bool)
         for row, (_, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             fixed[:, i] |= held[:-1, row]

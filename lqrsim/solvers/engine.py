@@ -42,7 +42,7 @@ from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
 from lqrsim.solvers.certify import REST, SLACK, certificate_of, faults, no_value
-from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
+from lqrsim.solvers.curvature import FLAT, CurvatureCheck, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import Pool, Stages
@@ -518,7 +518,7 @@ class SolveRun:
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         result = replace(result, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
-            result = replace(result, certificate=replace(certificate, curvature=self.bend(result).curvature))
+            result = replace(result, certificate=replace(certificate, curvature=self.check_curvature(result).curvature))
         self._release_stages()
         if not wrong:
             return result
@@ -534,17 +534,17 @@ class SolveRun:
         certificate = certificate_of(self.problem, numbers[0], result.states, violation=violation, least=least)
         return certificate, float(numbers["scale"][0])
 
-    def bend(self, result: RunResult) -> Bend:
-        """The curvature at a result, by exact second derivatives; with a direction along which a saddle bends down."""
+    def check_curvature(self, result: RunResult) -> CurvatureCheck:
+        """The curvature at a result by exact second derivatives, with a direction of negative curvature at a saddle."""
         problem = self.problem
         exact = self.second_order and has_curvature(problem) and problem.noise_term is None
         if not (result.status is Status.CONVERGED and exact):
-            return Bend(Curvature.NOT_CHECKED)
+            return CurvatureCheck(Curvature.NOT_CHECKED)
         if not problem.constraints:
             out = np.zeros(1, CERTIFICATE)
             self._loop(*self._check_arguments(declarations.CURVE, result, no_value(result.states), out))
             if out["curvature"][0] > FLAT:
-                return Bend(Curvature.MINIMUM)
+                return CurvatureCheck(Curvature.MINIMUM)
         stages, plan = self.stages, Motion(*map(in_c_order, result.plan))
         return curvature_at(
             stages, plan, stages.of_constraints([multipliers.values for multipliers in result.multipliers])

@@ -56,10 +56,10 @@ class InitialPrior:
                 f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times"
             )
         self.iterations = iterations
-        shares = check_array("InitialPrior: obstacles", obstacles, (None,))
-        if ((shares < 0) | (shares > 1)).any():
+        fractions = check_array("InitialPrior: obstacles", obstacles, (None,))
+        if ((fractions < 0) | (fractions > 1)).any():
             raise InputError(f"InitialPrior: obstacles: got {excerpt(obstacles)}, want numbers from 0 to 1")
-        self.obstacles = tuple(shares.tolist())
+        self.obstacles = tuple(fractions.tolist())
         self.controls = controls
         if controls is not None:
             self.controls = numbers_of("InitialPrior: controls", controls, "controls (m,) or (T, m)")
@@ -71,8 +71,8 @@ class InitialPrior:
         if self.about.ndim == 1:
             return self.about
         before = min(int(step), len(self.about) - 2)
-        share = step - before
-        return (1 - share) * self.about[before] + share * self.about[before + 1]
+        fraction = step - before
+        return (1 - fraction) * self.about[before] + fraction * self.about[before + 1]
 
     @checked
     def fitting(self, problem: Problem) -> "InitialPrior":

@@ -422,7 +422,7 @@ class Search:
                 continue
             if stop.due:
                 return
-            run = self._add(policy_of(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
+            run = self._add(guess_from(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
             result, best = self._finish(run, refine), self.best[1]
             # The same optimum, different within the tolerances, is no improvement.
             lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
@@ -472,7 +472,7 @@ class Search:
         ]
         _, best = self._searched(problem.with_constraints(constraints))
         if best.success and not self._budget.stop.due:
-            run = self._add(policy_of(best, "a plan without what is in the way"))
+            run = self._add(guess_from(best, "a plan without what is in the way"))
             self._known.from_start = False
             self._offer(run, self._finish(run, refine))
 
@@ -555,10 +555,10 @@ class Search:
 
     def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
         """Leave a saddle; return whether a plan was found that costs less."""
-        bend = run.bend(at_saddle)
-        if bend.direction is None:
+        direction = run.check_curvature(at_saddle).direction
+        if direction is None:
             return False
-        saddle, direction = at_saddle.kept(), bend.direction
+        saddle = at_saddle.kept()
         for size, sign in itertools.product(SADDLE_STEPS, (1, -1)):
             moved = Trajectory(
                 saddle.states + sign * size * direction.states, saddle.controls + sign * size * direction.controls,
@@ -601,7 +601,7 @@ class Search:
             drawn = self._solve_through(through)
             self._approached.append(name)
             plan = Motion(*compiled.rollout(problem, *drawn.law, before.states[0].copy()))
-            if consider(name, policy_of(drawn, name), plan):
+            if consider(name, guess_from(drawn, name), plan):
                 break
         plans.sort(key=lambda entry: entry[:2])
         self._nearer = next(((name, cost) for missed, cost, name, _ in plans if not missed), None)
@@ -662,7 +662,7 @@ class Search:
         assert given is not None
         still = reach.differ(best, given, self._unmoved())
         if not self._budget.stop.due:
-            run = self._add(policy_of(given, "descent from the given plan"))
+            run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
             wanted = run.is_worse(best, given) or (still and other.cost < best.cost) or other.rank < best.rank
             self._offer(run, other, better=wanted and not run.is_worse(other, given))
@@ -685,7 +685,7 @@ class Search:
         riskless_plan = finish(choose(runs, self._threads)[0], Known())
         if not riskless_plan.success or self._budget.stop.due:
             return
-        begin = policy_of(riskless_plan, "a plan without risk")
+        begin = guess_from(riskless_plan, "a plan without risk")
         run = self._add(
             replace(begin, cost_to_go=riskless_plan.values["cost_to_go"], multipliers=riskless_plan.multipliers)
         )
@@ -767,7 +767,7 @@ class Search:
         for name, problem in soft:
             most_soft = LOOK if len(plans) > 1 else SOFT
             plans = {
-                origin: self._solve_softly(f"{name}{origin}", problem, policy_of(result, name), most_soft)
+                origin: self._solve_softly(f"{name}{origin}", problem, guess_from(result, name), most_soft)
                 for origin, result in plans.items()
                 if np.isfinite(result.cost)
             } or plans
@@ -775,7 +775,7 @@ class Search:
                 return None
             plans = dict(sorted(plans.items(), key=lambda pair: pair[1].cost)[: -(-len(plans) // FEWER)])
         origin = min(plans, key=lambda origin: plans[origin].cost)
-        run = self._add(policy_of(plans[origin], "a plan for softer contacts"))
+        run = self._add(guess_from(plans[origin], "a plan for softer contacts"))
         with self._problem.dynamics.solving(self._threads), run.budget.limited(most):
             ended = self._finish(run, refine)
         stages = ", ".join([*before, *(name for name, _ in soft)])
@@ -803,7 +803,7 @@ class Search:
         """
         from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
 
-        run = self._another(policy_of(plan, "the best plan"))
+        run = self._another(guess_from(plan, "the best plan"))
         run.budget.report_to(self._callback)
         result = None
         # A cost that is not curved in all controls has no descent of this kind.
@@ -999,6 +999,6 @@ def line_of_states(problem: Problem) -> Trajectory:
     return Trajectory(np.linspace(problem.start, end, problem.steps + 1), controls.copy(), problem.dt)
 
 
-def policy_of(result: RunResult, summary: str) -> InitialGuess:
+def guess_from(result: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
     return InitialGuess(result.law[0].copy(), result.law[1].copy(), summary)
