@@ -108,27 +108,6 @@ class Ending:
         return ": ".join(part for part in (place, raised) if part)
 
 
-def check_finite_at_start(
-    problem: Problem, ending: Ending, costs: Array, x: Array, u: Array, *, refuse: bool
-) -> Ending:
-    """Find the cause if the first iteration is not finite: a function that is not finite at the start (x, u).
-
-    `costs` are the costs of the iterations so far.
-
-    Raises:
-      InputError: there is such a function, and `refuse` is set; otherwise the returned ending names it.
-    """
-    lost = not len(costs) and ending.status is Status.NOT_FINITE
-    if lost or (len(costs) and not np.isfinite(costs[0])):
-        try:
-            check_start(problem, x, u)
-        except InputError as error:
-            if refuse:
-                raise
-            return replace(ending, outcome=declarations.NOT_FINITE, raised=str(error))
-    return ending
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`."""
@@ -176,7 +155,7 @@ class SolveRun:
 
     Attributes:
       initial_guess: the start. work: the memory. budget: the iterations and the time. entry: the compiled function.
-      ending: the state of smoothing; the outcome is RUNNING until it has ended.
+      ending: the state of smoothing or iLQR; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
         the smoothing before it; see `SmootherSettings`.
     """
@@ -308,20 +287,20 @@ class SolveRun:
         self._loop(*self._arguments(0, 0, self._rows))
 
     def checked_ending(self) -> Ending:
-        """The ending of smoothing; NOT_FINITE if a function is not finite at the start.
+        """The ending; NOT_FINITE if a function is not finite at the start, which the detail then names.
 
         Raises:
-          InputError: a function is not finite at the start, and the solve is attentive; see `Stop`.
+          InputError: there is such a function, and the solve is attentive; see `Stop`.
         """
-        start, control = self.work.start, self.initial_guess.offset[0]
-        return check_finite_at_start(
-            self.problem,
-            self.ending,
-            self._rows["cost"][: self._row],
-            start,
-            control,
-            refuse=self.budget.stop.attentive,
-        )
+        first, ending = self._rows["cost"][: min(self._row, 1)], self.ending
+        if not np.isfinite(first).all() or (not len(first) and ending.status is Status.NOT_FINITE):
+            try:
+                check_start(self.problem, self.work.start, self.initial_guess.offset[0])
+            except InputError as error:
+                if self.budget.stop.attentive:
+                    raise
+                return replace(ending, outcome=declarations.NOT_FINITE, raised=str(error))
+        return ending
 
     def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0, patient: bool = False) -> RunResult:
         """Newton's method from the best plan so far; `added` is the part of its cost from the constraints.
@@ -383,9 +362,10 @@ class SolveRun:
         return self._iterate(arguments, self.work.best)
 
     def ilqr(self) -> Ending:
-        """Iterations of iLQR, from the rollout of the first policy; with the entry "ilqr"."""
+        """Iterations of iLQR, from the rollout of the first policy; with the entry "ilqr". The ending is checked."""
         arguments = partial(self._plan_arguments, declarations.ITERATE, NO_DESCENT, self.final, 0.0)
-        return self._iterate(arguments, self.work.best)
+        self.ending, self._row = self._iterate(arguments, self.work.best, self._rows), len(self.budget.log)
+        return self.checked_ending()
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
         """Run more iterations, in separate rows. A prior no longer acts.

@@ -20,7 +20,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.budget import Budget, Callback, Stop
 from lqrsim.solvers.control_rates import solve_with_rates
-from lqrsim.solvers.engine import RunResult, SolveRun, check_finite_at_start
+from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import name_risk
@@ -128,16 +128,14 @@ def _solve(problem: Problem, settings: Settings, stop: Stop | None = None) -> So
         guess = resolve(settings.start, problem)
         if guess.prior is not None:  # a function may return one
             raise InputError(_NO_PRIOR)
-        start, control = problem.start.copy(), guess.offset[0].copy()
-        check_functions(problem, start, control)
+        start = problem.start.copy()
+        check_functions(problem, start, guess.offset[0].copy())
         options = SmootherSettings(stop=settings.stop, tolerance=settings.tolerance, finish=None)
         run = SolveRun.lent(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
         run.work.fixed = True  # if by the initial cost alone
     with stop.reporting("ilqr"):
         ending = run.ilqr()
     log, work = budget.log, run.work
-    costs = np.array([iteration.cost for iteration in log])
-    ending = check_finite_at_start(problem, ending, costs, start, control, refuse=stop.attentive)
     complete = len(log) > 0 and ending.failed < 0
     if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was made about the previous trajectory
         if not log:

@@ -18,7 +18,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import NAME, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures
+from lqrsim.solvers.interior_point import NAME, WEAK, Barrier, InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.settings import has_curvature
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
@@ -53,15 +53,6 @@ class InteriorRun:
     def __init__(self, run: SolveRun) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self.allowed = run.settings.violation_tolerance(run.problem)
-
-    def instead(self, plan: Motion | RunResult) -> RunResult | None:
-        """The result from a plan if it converges; else None, so that smoothing can continue."""
-        checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
-        result = self.run_from(copied(plan), STRONG)
-        if result is not None and result.success:
-            return result
-        self._run.go_on(checkpoint, self._budget.log[begin:])
-        return None
 
     def run_from(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None

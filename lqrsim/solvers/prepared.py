@@ -135,7 +135,7 @@ class PreparedSolver(OneVersion):
         if self.problem.constraints and run.second_order:
             stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
             if _can_yield(self.problem):
-                _Yielding(run, plan).find(best.plan, best.cost)
+                _Yielding(run, plan, best).find()
                 return
             _Neighbour(run, plan, best).find()
             # Another solve may need code that this solve did not need.
@@ -200,12 +200,8 @@ class PreparedSolver(OneVersion):
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
             if run.second_order and _can_yield(problem):
-                point = _Yielding(run, _plan_of(start, best), self._closing)
-                result, ended = point.find(best.plan, best.cost), point.ended
-                if result is None:
-                    result = replace(_unchanged(best), status=point.unsolved)
-                else:
-                    best.adopt(result)
+                point = _Yielding(run, _plan_of(start, best), best, self._closing)
+                result, ended = point.find(), point.ended
             elif problem.constraints and run.second_order:
                 neighbour = _Neighbour(run, _plan_of(start, best), best, self._closing)
                 result, ended = neighbour.find(), neighbour.laps.ended
@@ -400,15 +396,15 @@ class _Yielding:
     Arguments and `ended` are as in `_Neighbour`, of whose laps it is the last time.
     """
 
-    def __init__(self, run: SolveRun, plan: Motion, closing: float = 0.0) -> None:
-        self._run, self._plan, self._closing = run, plan, closing
+    def __init__(self, run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
+        self._run, self._plan, self._best, self._closing = run, plan, best, closing
         terms, owners = run.problem.constraint_terms, run.stages.owners
         self._yields = (owners >= 0) & np.array([term.yields for term in terms])[owners]
         self._allowed = run.settings.violation_tolerance(run.problem)
         self.ended, self._late = time.perf_counter(), False
 
-    def find(self, before: Motion, cost: float) -> RunResult | None:
-        """The plan found, carried out with feedback; None if it is worse than the plan `before` of this cost."""
+    def find(self) -> RunResult:
+        """The plan that is found, carried out with feedback, unless it is worse than the best."""
         run, budget, clock = self._run, self._run.budget, time.perf_counter()
         for function in functions_of(run.problem):
             function.forget()
@@ -426,19 +422,27 @@ class _Yielding:
 
             self._late = self.ended + model_seconds + self._closing >= budget.stop.deadline
             if self._late or not budget.left:
-                return None
+                return replace(_unchanged(self._best), status=self._unsolved)
             result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
             law = compiled.law_about(*result.plan, result.gain.copy())
             plan = run.work.roll_out(*law, self._plan.states[0])
             reached = run.stages.trial(plan)[0]
             rank = self._rank(plan, reached)
             solved = result.solved and rank[1] == 0
-            if not solved and rank > self._rank(before, cost):
-                return None
-        return self._result(plan, law, reached, Status.CONVERGED if solved else self.unsolved)
+            if not solved and rank > self._rank(self._best.plan, self._best.cost):
+                return replace(_unchanged(self._best), status=self._unsolved)
+        work, status = run.work, Status.CONVERGED if solved else self._unsolved
+        violation, detail = work.violation(work.constraint_values(*plan)), ""
+        if violation > self._allowed:
+            lagrangian = AugmentedLagrangian(run)
+            lagrangian.evaluate(*plan)
+            detail = f"elastic: {lagrangian.worst()}"
+        answer = RunResult(status=status, detail=detail, plan=plan, law=law, cost=reached, violation=violation)
+        self._best.adopt(answer)
+        return answer
 
     @property
-    def unsolved(self) -> Status:
+    def _unsolved(self) -> Status:
         """The status of a solve that has not converged."""
         return Status.TIME_LIMIT if self._late else Status.MAX_ITERATIONS
 
@@ -461,15 +465,6 @@ class _Yielding:
         short = np.where(stages.live & self._yields, np.maximum(-values, 0.0), 0.0)
         paid = float((short * np.where(self._yields, self._prices, 0.0)).sum())
         return not np.isfinite(plan.states).all(), self._missed(plan), cost + paid
-
-    def _result(self, plan: Motion, law: tuple[Array, Array], cost: float, status: Status) -> RunResult:
-        work = self._run.work
-        violation, detail = work.violation(work.constraint_values(*plan)), ""
-        if violation > self._allowed:
-            lagrangian = AugmentedLagrangian(self._run)
-            lagrangian.evaluate(*plan)
-            detail = f"elastic: {lagrangian.worst()}"
-        return RunResult(status=status, detail=detail, plan=plan, law=law, cost=cost, violation=violation)
 
 
 class _Best:

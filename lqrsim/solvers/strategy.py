@@ -243,21 +243,22 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
 
 def _without_constraints(run: SolveRun) -> RunResult:
     """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
-    problem, budget = run.problem, run.budget
-    space = problem.control_coordinates
+    problem, budget, space, point = run.problem, run.budget, run.problem.control_coordinates, InteriorRun(run)
     if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
         return run.run_to_end()
     run.smooth(OPENING)
     controls = run.work.best.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        result = InteriorRun(run).instead(run.work.best)
-        if result is not None:
+        checkpoint, begin = run.checkpoint(), len(budget.log)
+        result = point.run_from(copied(run.work.best), STRONG)
+        if result is not None and result.success:
             return result
+        run.go_on(checkpoint, budget.log[begin:])
     result = run.run_to_end()
     if result.success or budget.stop.due or budget.left < 2:
         return result
-    result, point = result.kept(), InteriorRun(run)
+    result = result.kept()
     other = point.run_from(copied(run.work.best if np.isfinite(result.cost) else point.start()), STRONG)
     if other is None or other.success or not other.cost < result.cost:
         return other if other is not None and other.success else result
