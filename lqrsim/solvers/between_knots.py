@@ -171,21 +171,22 @@ def _deepest(missed: Array) -> tuple[Array, Array]:
 
 def solve_between_knots(
     problem: Problem, settings: SmootherSettings,
-    solve: Callable[[Problem, SmootherSettings, Solution | None], Solution], stop: Stop,
+    solve: Callable[..., Solution], stop: Stop,
 ) -> Solution:  # fmt: skip
     """Solve a problem in rounds until its plan is as it is to be between the knots.
 
-    `solve` solves a problem that is to be right at its knots, within the time of `stop`. From the second round on it
-    gets the last plan, too, from which a search for a free duration goes on.
+    `solve` solves a problem that is to be right at its knots, within the time of `stop`. With a free duration, its
+    search goes on from the plan `begin` from the second round on.
     """
     at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.violation_tolerance(problem)
     rows = [Rows(np.zeros((problem.steps, term.rows)), np.zeros(term.rows)) for term in problem.constraint_terms]
 
     def again(last: Solution) -> Solution:
         stated = _with_rows_within(problem, replace(at_knots, dt=last.trajectory.dt), rows)
-        return solve(stated, replace(settings, start=last, starts=None), last)
+        begun = {} if problem.duration is None else {"begin": last}
+        return solve(stated, replace(settings, start=last, starts=None), **begun)
 
-    solution, rounds, failed = solve(at_knots, settings, None), 0, 0
+    solution, rounds, failed = solve(at_knots, settings), 0, 0
     iterations, ended = solution.iterations, {}
     while solution.success or (rounds and failed < FAILED and not stop.due):
         if not solution.success:
@@ -194,7 +195,7 @@ def solve_between_knots(
                 solution = again(solution)
             else:  # another way than the last plan's
                 rows = [constraint_rows.everywhere() for constraint_rows in rows]
-                solution = solve(_with_rows_within(problem, replace(at_knots, dt=problem.dt), rows), settings, None)
+                solution = solve(_with_rows_within(problem, replace(at_knots, dt=problem.dt), rows), settings)
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)

@@ -97,28 +97,16 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     """Solve one problem; the solution can look at its plan between the knots."""
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
-    if problem.control_rate is None:
-        solution = _right_between_knots(problem, settings, stop)
-    else:
-        solution = solve_with_rates(problem, settings, partial(_right_between_knots, stop=stop))
+    solve_part: Callable[..., Solution] = partial(solve_fixed, stop=stop)
+    if problem.duration is not None:
+        solve_part = partial(solve_for_duration, solve=partial(solve_part, trees=False), stop=stop)
+    if problem.accuracy is not None or problem.between_knots:
+        solve_part = partial(solve_between_knots, solve=solve_part, stop=stop)
+    if problem.control_rate is not None:
+        solve_part = partial(solve_with_rates, solve=solve_part)
+    solution = solve_part(problem, settings)
     vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, problem, solution.trajectory))
     return solution
-
-
-def _right_between_knots(problem: Problem, settings: SmootherSettings, stop: Stop) -> Solution:
-    """Solve a problem without a `control_rate`."""
-    if problem.accuracy is None and not problem.between_knots:
-        return _of_best_duration(problem, settings, stop=stop)
-    return solve_between_knots(problem, settings, partial(_of_best_duration, stop=stop), stop)
-
-
-def _of_best_duration(
-    problem: Problem, settings: SmootherSettings, begin: Solution | None = None, *, stop: Stop
-) -> Solution:
-    """Solve a problem that is to be right at its knots. A search for its duration goes on from a plan `begin`."""
-    if problem.duration is None:
-        return solve_fixed(problem, settings, stop)
-    return solve_for_duration(problem, settings, partial(solve_fixed, stop=stop, trees=False), stop, begin)
 
 
 def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
