@@ -100,8 +100,9 @@ class InteriorPoint:
             begun.states[0, fixed] = np.asarray(problem.start)[fixed]
         known = in_c_order(stages.of_constraints(multipliers)).reshape(-1)
         self._begun = PlanBeginning(
-            Motion(*map(in_c_order, begun)), known, bool(multipliers), *map(float, barrier), float(oldest)
-        )
+            Motion(*map(in_c_order, begun)), known, bool(multipliers), float(barrier.parameter), float(barrier.slack),
+            float(oldest),
+        )  # fmt: skip
         self._arrays, self._memory = stages.interior
         self._log = np.zeros(0, MEASURES)
         self._tolerances = np.nan, np.nan

@@ -114,8 +114,8 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
     original, log = settings, tuple[Iteration, ...]()
     if any(constraint._rough for constraint in problem.constraints):
         problem, settings, log = outlined(problem, settings, stop)
-    preliminary = settings is not original
-    for refinements in reversed(range(REFINEMENTS + 1)):
+    refinements, preliminary = REFINEMENTS, settings is not original
+    while True:
         solution = _search(problem, settings, stop, trees=trees)
         refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
         if log:
@@ -123,10 +123,9 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
         allowed = original.violation_tolerance(problem)
         settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
         if refined is None and not (preliminary and solution.success and not settled and not stop.due):
-            break
+            return stop.finish(solution)
         problem, settings, log = refined or problem, replace(original, start=solution, starts=None), solution.iterations
-        preliminary = False
-    return stop.finish(solution)
+        refinements, preliminary = refinements - 1, False
 
 
 def _search(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool) -> Solution:
