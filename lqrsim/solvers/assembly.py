@@ -23,7 +23,7 @@ from lqrsim.solvers.step_stability import unstable_step
 from lqrsim.versions import versions
 
 # The policies of plans through contacts are run from this many starts that differ by this much in each state.
-BESIDE, LITTLE = 8, 1e-9
+NEIGHBOURS, OFFSET = 8, 1e-9
 # Distance of a rotation vector from a whole turn, in rad, below which the solution says so. With 0.01 rad of noise, a
 # quadrotor that hovers 0.35 rad from there stays level, and one at 0.17 rad tumbles.
 NEAR_TURN = 0.3
@@ -31,7 +31,7 @@ NEAR_TURN = 0.3
 # 2 pi / NEAR_TURN times in a rotation vector.
 NEAR_TILT = 0.1
 UNBOUNDED = 1e10  # a cost so many times below that of the first iteration, or below -1, falls for ever
-FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
+UNFINISHED = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
 
 def assemble(
@@ -105,7 +105,7 @@ def _usable(result: RunResult, options: dict[str, object]) -> str:
         return ""
     if not np.isfinite(plan.optimality):
         return "the plan can be used, for it keeps dynamics, limits and constraints; whether it is optimal is unknown"
-    if plan.optimality > FAR:
+    if plan.optimality > UNFINISHED:
         return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
     wanted = f", where {tolerance:g} is wanted" if isinstance(tolerance, float) else ""
     return (
@@ -157,11 +157,11 @@ def _fragile(problem: Problem, result: RunResult) -> str:
     states, space = result.states, problem.dynamics.state_coordinates
     if not problem.dynamics.touches(states):
         return ""
-    for draw in range(BESIDE):
+    for draw in range(NEIGHBOURS):
         signs = np.sign(np.sin(1.0 + (1 + draw) * np.arange(1, len(space) + 1)))
-        run, _ = compiled.rollout(problem, *result.law, states[0] + LITTLE * signs)
+        run, _ = compiled.rollout(problem, *result.law, states[0] + OFFSET * signs)
         if said := departure(space, run, states, problem.dt):
-            return f"from a start that differs by {LITTLE:g} in each state, the policy {said}"
+            return f"from a start that differs by {OFFSET:g} in each state, the policy {said}"
     return ""
 
 
