@@ -385,16 +385,12 @@ class Search:
             )
         plans = [entry for entry in plans if np.isfinite(entry[:2]).all()]
         for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
-            run = self._add(
-                resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}"
-            )
-            self._offer(run, self._finish(run))
+            self._try(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
             if self.best[1].success or self._budget.stop.due:
                 return
         if np.isfinite(self.best[1].cost) or not exact:
             return
-        run = self._add(resolve(line_of_states(problem), problem), "a line of states")
-        self._offer(run, self._finish(run, from_states))
+        self._try("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
@@ -428,10 +424,9 @@ class Search:
             if self._budget.stop.due or self.best[1].success:
                 break
             self._known.from_start = False
-            run = self._add(resolve(start, problem), name)
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
-            self._offer(run, self._finish(run, finish if exact and name in sways else refine))
+            self._try(name, start, finish if exact and name in sways else refine)
         self.tried = not self._budget.stop.due
 
     def _follow_ways(self) -> None:
@@ -441,8 +436,7 @@ class Search:
             if self._budget.stop.due:
                 return
             self._known.from_start = False
-            run = self._add(resolve(way.over(problem), problem), way.name)
-            self._offer(run, self._finish(run, from_states))
+            self._try(way.name, way.over(problem), from_states)
 
     @property
     def is_barred(self) -> bool:
@@ -460,16 +454,14 @@ class Search:
         ]
         _, best = self._searched(problem.with_constraints(constraints))
         if best.success and not self._budget.stop.due:
-            run = self._add(guess_from(best, "a plan without what is in the way"))
             self._known.from_start = False
-            self._offer(run, self._finish(run, refine))
+            name = "a plan without what is in the way"
+            self._try(name, guess_from(best, name), refine)
 
     def grow_trees(self) -> None:
         """Go on from ways through trees until one leads to a plan."""
-        problem = self._problem
-        for seed, way in ways_by_trees(problem, self._budget.stop):
-            run = self._add(resolve(way, problem), f"trees of short plans, seed {seed}")
-            self._offer(run, self._finish(run, from_states))
+        for seed, way in ways_by_trees(self._problem, self._budget.stop):
+            self._try(f"trees of short plans, seed {seed}", way, from_states)
             if self.best[1].success:
                 return
 
@@ -526,8 +518,7 @@ class Search:
         problem, tried = self._problem, {name for name, _ in self._named}
         for name, trajectory in detours(problem, self._settings.starts).items():
             if name not in tried and not self._budget.stop.due:
-                run = self._add(resolve(trajectory, problem), name)
-                self._offer(run, self._finish(run))
+                self._try(name, trajectory)
 
     def leave_saddles(self) -> None:
         """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle."""
@@ -886,6 +877,11 @@ class Search:
         """Run to the end. The callback is called for all iterations of the run, including earlier ones."""
         run.budget.report_to(self._callback)
         return how(run, self._known if known is None else known)
+
+    def _try(self, name: str, start: StartLike | InitialGuess, how: Finish = finish) -> None:
+        """Finish a run from another start, which is one of the candidates, and record its result."""
+        run = self._add(resolve(start, self._problem), name)
+        self._offer(run, self._finish(run, how))
 
     def _offer(self, run: SolveRun, result: RunResult, *, better: bool | None = None) -> None:
         """Record a result; it becomes the best if `better` says so, by default if its rank does."""
