@@ -14,6 +14,7 @@ import re
 import sys
 import sysconfig
 import types
+import warnings
 from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -371,6 +372,16 @@ def _bytes(count: int) -> str:
             return f"{count:.3g} {unit}"
         count = count / 1000  # pyright: ignore[reportAssignmentType]
     return f"{count:.3g} PB" if count < 1e6 else f"{count:.1e} PB"
+
+
+def renamed(old: str, new: str) -> property:
+    """The earlier name of a method, which warns, for programs of the version before."""
+
+    def method(self: Any) -> Any:
+        warnings.warn(f"{old} is {new} now; the earlier name goes in lqrsim 0.4", FutureWarning, stacklevel=2)
+        return getattr(self, new)
+
+    return property(method, doc=f"The earlier name of `{new}`.")
 
 
 def free_name(name: str, taken: Container[str]) -> str:

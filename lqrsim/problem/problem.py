@@ -21,6 +21,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     keep,
+    renamed,
 )
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import (
@@ -299,6 +300,8 @@ class Problem(OneVersion):
             raise InputError(f"plan: got {got}, want {want}")
         moved = self if tuple(knots) == self.segments else self._with_segments(knots)
         return moved._of_duration(plan.trajectory.horizon)
+
+    settled = renamed("settled", "with_duration_of")
 
     def _of_duration(self, seconds: float) -> "Problem":
         """The problem with a fixed duration."""

@@ -19,6 +19,7 @@ from lqrsim.errors import (
     check_number,
     check_weights,
     excerpt,
+    renamed,
     vectors_of,
 )
 from lqrsim.problem.clearance import Clearance
@@ -296,6 +297,8 @@ class MjcfRobot(Robot):
             raise InputError(f"state: got one at which {drifting}, want activations that come to rest")
         rested[2 * model.nv :] = held.activations
         return rested
+
+    settled = renamed("settled", "at_rest")
 
     def _drifting(self, held: Holding) -> list[str]:
         """Why each actuator that never rests does not, as text."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import Bounds, Line, Positive, Seed, Want, checked
-from lqrsim.errors import check_name, keep
+from lqrsim.errors import check_name, keep, renamed
 from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
@@ -106,6 +106,8 @@ class Scenario(OneVersion):
         if self.problem.duration is None:
             return self
         return replace(self, problem=self.problem.with_duration_of(plan), fit_timestep=True)
+
+    settled = renamed("settled", "with_duration_of")
 
 
 def names() -> list[str]:
