@@ -566,6 +566,8 @@ def test_a_planar_quadrotor_races_through_waypoints(places: list[tuple[float, fl
     assert solution.status is Status.CONVERGED, solution.detail
     plan, state = solution.trajectory, np.zeros(6)
     passed = dict(zip(stated.with_duration_of(solution).segments, places, strict=True))
+    with pytest.warns(FutureWarning, match="settled is with_duration_of now"):
+        assert stated.settled(solution).digest == stated.with_duration_of(solution).digest
     for knot, control in enumerate(plan.controls):
         if knot in passed:
             assert np.hypot(*(state[:2] - passed[knot])) <= 0.1 + 1e-3

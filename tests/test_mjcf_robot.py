@@ -367,6 +367,8 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
     model, angles = robot.scene.model, dict(zip(("upper", "fore"), rng.uniform(-1, 1, 2), strict=True))
     state = robot.at(None, **angles)
     np.testing.assert_array_equal(robot.at_rest(state), state)
+    with pytest.warns(FutureWarning, match="settled is at_rest now"):
+        np.testing.assert_array_equal(robot.settled(state), state)
     data = mujoco.MjData(model)
     data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], robot.hold(state)
     mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
