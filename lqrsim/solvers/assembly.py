@@ -9,6 +9,7 @@ import numpy as np
 
 from lqrsim.annotations import LINE
 from lqrsim.errors import Array, printable
+from lqrsim.kernels.records import Policy
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target, departure
@@ -48,7 +49,8 @@ def assemble(
     falls = bool(log) and result.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
     if falls and not result.success and result.status is not Status.NOT_POSITIVE_DEFINITE:
         result = replace(result, status=Status.DIVERGED, detail="the cost falls without bound")
-    states, controls, law = result.states.copy(), result.controls.copy(), (result.law[0].copy(), result.law[1].copy())
+    states, controls = map(np.copy, result.plan)
+    law = Policy(*map(np.copy, result.law))
     inverse_law = result.values.get("inverse_law")
     if inverse_law is not None:
         inverse_law = inverse_law[0].copy(), inverse_law[1].copy()

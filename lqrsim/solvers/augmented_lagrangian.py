@@ -48,7 +48,7 @@ def by_multipliers(run: SolveRun) -> RunResult:
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
     result = run.run_to_end()
     if run.budget.over:
-        if result.success and not run.work.keeps(run.work.constraint_values(*result.plan)):
+        if result.success and not run.work.keeps(run.work.constraint_values(result.plan)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
             result = dataclasses.replace(result, status=status, detail="before the constraints could be met")
     elif result.success:
@@ -71,10 +71,10 @@ def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: i
     lagrangian = AugmentedLagrangian(run)
     if unconstrained is None:
         run.roll_out()
-        lagrangian.evaluate(*run.work.last)
+        lagrangian.evaluate(run.work.last)
         run.weigh_noise(run.work.last)
     else:
-        lagrangian.evaluate(*unconstrained.plan)
+        lagrangian.evaluate(unconstrained.plan)
         if lagrangian.kept:
             return unconstrained
         lagrangian.start()
@@ -107,7 +107,7 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if first.success else first.status
         return run, dataclasses.replace(first, status=status, final=not first.success, values={})
     initial_guess = dataclasses.replace(
-        run.initial_guess, gain=first.law[0].copy(), offset=first.law[1].copy(), trajectory=None, prior=None,
+        run.initial_guess, gain=first.law.gain.copy(), offset=first.law.offset.copy(), trajectory=None, prior=None,
         cost_to_go=first.values.get("cost_to_go"), multipliers=first.multipliers,
     )  # fmt: skip
     run = _again(run, problem, initial_guess)
@@ -133,7 +133,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
         if stopped or len(log) == begin or not np.isfinite(log[-1].cost):
             break
         last = log[-1]
-        lagrangian.evaluate(*work.last)
+        lagrangian.evaluate(work.last)
         settled = ending.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
         if done == len(rows) or (settled and lagrangian.solved):
             break
@@ -167,14 +167,14 @@ def _damped(
     plans = [(plan, cost) for plan, cost in plans if np.isfinite(cost)]
     if not plans:
         return undamped
-    lagrangian.evaluate(*plans[-1][0])
+    lagrangian.evaluate(plans[-1][0])
     lagrangian.start()
     merits = []
     for plan, cost in plans:
-        lagrangian.evaluate(*plan)
+        lagrangian.evaluate(plan)
         merits.append(cost + lagrangian.added())
     plan, cost = plans[int(np.argmin(merits))]
-    work.set_best(*plan, cost)
+    work.set_best(plan, cost)
     return _rounds(run, lagrangian, "the undamped method failed with the constraints")
 
 
@@ -197,7 +197,7 @@ def damped_from_rollout(run: SolveRun) -> RunResult:
                 return run.certified(run.newton(patient=True))
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
-    lagrangian.evaluate(*run.work.best)
+    lagrangian.evaluate(run.work.best)
     lagrangian.start()
     return run.certified(_rounds(run, lagrangian, ""))
 
@@ -205,14 +205,14 @@ def damped_from_rollout(run: SolveRun) -> RunResult:
 def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunResult:
     """Damped iterations from the plan in the memory and updates of the multipliers, until the constraints are met."""
     work, budget = run.work, run.budget
-    lagrangian.evaluate(*work.best)
+    lagrangian.evaluate(work.best)
     rounds, rough = 0, True
     while True:
         rounds += 1
         run.weigh_noise(work.best)
         # Until the multipliers are approximately right, an accurate minimum is not worth its time.
         ending = run.damped(added=lagrangian.added(), least=(ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0))
-        lagrangian.evaluate(*work.best)
+        lagrangian.evaluate(work.best)
         if ending.success and lagrangian.solved:
             if not rough:
                 result = run.damped_result(ending, ending.status, why)
@@ -291,10 +291,9 @@ class AugmentedLagrangian:
     def grown(self) -> float:
         return max(self._grown.values())
 
-    def evaluate(self, states: Array, controls: Array) -> None:
+    def evaluate(self, plan: Motion) -> None:
         """Evaluate the constraints of a plan."""
-        self._plan = states, controls
-        stated = self._work.constraint_values(states, controls)
+        self._plan, stated = plan, self._work.constraint_values(plan)
         self.kept = self._work.keeps(stated)
         excess = [
             violation_of(multipliers.term, values) - multipliers.term.equality * self._allowed

@@ -216,27 +216,25 @@ class CostsByStep:
         return costs
 
 
-def rollout(
-    problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None
-) -> tuple[Array, Array]:
+def rollout(problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None) -> Motion:
     """Roll out the policy u_t = gain_t x + offset_t from a state, by the model.
 
-    Gains (T, m, n), offsets (T, m); returns states (T+1, n) and controls (T, m). `dt` is the control period in seconds,
+    Gains (T, m, n), offsets (T, m). `dt` is the control period in seconds,
     by default the problem's.
     """
     model = arguments(problem)
     model = model if dt is None else model._replace(dt=float(dt))
     steps = len(gain)
-    states, controls = np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1]))
-    policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Motion(states, controls)
+    plan = Motion(np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1])))
+    policy = Policy(in_c_order(gain), in_c_order(offset))
     with problem.dynamics.quiet():
         core(problem).rollout(steps, in_c_order(state), policy, model, plan)
-    return states, controls
+    return plan
 
 
-def law_about(states: Array, controls: Array, gain: Array) -> tuple[Array, Array]:
+def law_about(states: Array, controls: Array, gain: Array) -> Policy:
     """The policy with these gains (T, m, n) that tracks a plan: the gains, and its offsets (T, m)."""
-    return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
+    return Policy(gain, controls - np.einsum("tij,tj->ti", gain, states[:-1]))
 
 
 def policy_of(problem: Problem, gain: Array, offset: Array, nominal: Array) -> AffinePolicy:

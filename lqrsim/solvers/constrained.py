@@ -147,7 +147,7 @@ class ConstrainedRun:
             return None
         best = best.kept()
         self._point.without_multipliers()
-        run.work.set_best(*best.plan, best.cost)
+        run.work.set_best(best.plan, best.cost)
         tolerance, run.final = run.final, run.settings.final(self._problem.with_constraints([]))
         result = run.newton(detail=best.detail, patient=True)
         if not result.success or result.violation > 0:
@@ -226,7 +226,7 @@ class ConstrainedRun:
             if priced is None:
                 return None
             plan = priced.plan
-            self._remember(self._point.result(*plan))
+            self._remember(self._point.result(plan))
             if priced.stationary:
                 return None
             if priced.near or price == PRICES[-1]:
@@ -262,7 +262,7 @@ class ConstrainedRun:
 
     def _keep_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
-        result = self._point.result(*plan)
+        result = self._point.result(plan)
         if not result.violation > EVIDENT * self._allowed:
             return False
         new_evidence = evidence(self._run, result, shares, sizes)
@@ -295,12 +295,12 @@ class ConstrainedRun:
             best = self._given
         if not best.success and self._problem.constraints:
             lagrangian = AugmentedLagrangian(run)
-            lagrangian.evaluate(best.states, best.controls)
+            lagrangian.evaluate(best.plan)
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
             if best.violation > self._allowed and (same := alike(self._known.evidence)):
                 best = same[0].plan
-                lagrangian.evaluate(best.states, best.controls)
+                lagrangian.evaluate(best.plan)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
                 best = replace(best, against=same[0].beside(detail))

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
@@ -95,7 +96,7 @@ def _gains(
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
     guess = InitialGuess(gain, controls, multipliers=multipliers)
     run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
-    run.work.set_best(states, controls, float(compiled.costs_of(problem, states[None], controls[None])[0]))
+    run.work.set_best(Motion(states, controls), float(compiled.costs_of(problem, states[None], controls[None])[0]))
     with problem.dynamics.quiet():
         if np.isfinite(run.linearize_about_plan()):
             gain = run.work.arrays.policy.gain.copy()

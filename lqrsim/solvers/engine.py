@@ -114,7 +114,7 @@ class RunResult:
 
     status: Status
     plan: Motion
-    law: tuple[Array, Array]  # gain (T, m, n) and offset (T, m)
+    law: Policy
     cost: float = np.inf  # of the plan, as in the log; infinite without a plan
     violation: float = np.inf
     gap: float = np.nan
@@ -450,7 +450,7 @@ class SolveRun:
         work, optimality = self.work, self.linearize_about_plan() if optimality is None else optimality
         values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
         if not np.isfinite(optimality):  # there is neither a model about the plan nor a policy
-            law, gap = (np.zeros_like(work.arrays.policy.gain), work.best.controls.copy()), np.nan
+            law, gap = Policy(np.zeros_like(work.arrays.policy.gain), work.best.controls.copy()), np.nan
         else:
             values = work.value_functions()
             if not gap < self.settings.gap_tolerance:
@@ -468,7 +468,7 @@ class SolveRun:
 
     def certified(self, result: RunResult) -> RunResult:
         """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
-        values = self.work.constraint_values(*result.plan)
+        values = self.work.constraint_values(result.plan)
         violation, value, wrong = self.work.violation(values), result.values.get("cost_to_go"), ""
         to_go = no_value(result.states)
         if value is not None:
@@ -576,7 +576,7 @@ class SolveRun:
 
     def _missed(self, result: RunResult) -> float:
         """The violation of a plan to two digits; 0 within the tolerances."""
-        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(*result.plan)):
+        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(result.plan)):
             return 0.0
         return float(f"{result.violation:.2g}")
 
@@ -682,7 +682,7 @@ class SolveRun:
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
         return self._stated(
-            task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=result.plan, last_policy=Policy(*result.law),
+            task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=result.plan, last_policy=result.law,
             certificate=certificate,
         )  # fmt: skip
 
@@ -700,7 +700,7 @@ class SolveRun:
         return task, begin, end, settings._replace(**options), work.model, arrays_, work.memory_rows, rows
 
     def _violation_of(self, plan: Motion) -> float:
-        return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
+        return self.work.violation(self.work.constraint_values(plan)) if self.problem.constraints else 0.0
 
 
 _pool = Pool[SolveRun]()
@@ -771,9 +771,9 @@ class Workspace:
         """The cost of the best plan; infinite where there is none."""
         return float(self.memory["plan_cost"])
 
-    def set_best(self, states: Array, controls: Array, cost: float = np.inf) -> None:
+    def set_best(self, plan: Motion, cost: float = np.inf) -> None:
         """Make a plan the best one; its cost is infinite where it is not known."""
-        self.best.states[...], self.best.controls[...] = states, controls
+        self.best.states[...], self.best.controls[...] = plan
         self.memory["plan_cost"] = cost
 
     def begin_descent(self, how: Descent, added: float = 0.0, least: float = 0.0) -> None:
@@ -815,22 +815,22 @@ class Workspace:
                 data[i][len(term.functions) + term.factor] *= fraction
         return self.model.stage._replace(data=tuple(data))
 
-    def roll_out(self, gain: Array, offset: Array, state: Array) -> Motion:
-        """Roll out the policy u_t = gain_t x + offset_t from a state: gains (T, m, n), offsets (T, m)."""
+    def roll_out(self, policy: Policy, state: Array) -> Motion:
+        """Roll out a policy from a state."""
         plan = Motion(np.empty_like(self.last.states), np.empty_like(self.last.controls))
-        of = self._problem.steps, in_c_order(state), Policy(in_c_order(gain), in_c_order(offset)), self.model, plan
+        of = self._problem.steps, in_c_order(state), Policy(*map(in_c_order, policy)), self.model, plan
         if self._rollout is None:
             self._rollout = self.core.lay_out("rollout", *of)
         with self._problem.dynamics.quiet():
             self._rollout(*of)
         return plan
 
-    def constraint_values(self, states: Array, controls: Array) -> list[Array]:
+    def constraint_values(self, plan: Motion) -> list[Array]:
         """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero if it does not act."""
         values = [np.empty_like(multipliers.values) for multipliers in self.multipliers]
         if values:
             constraints = self.model.stage.constraints
-            of = self._problem.steps, in_c_order(states), in_c_order(controls), constraints, tuple(values)
+            of = self._problem.steps, *map(in_c_order, plan), constraints, tuple(values)
             if self._evaluation is None:
                 self._evaluation = self._costs.lay_out("evaluate_constraints", *of)
             self._evaluation(*of)

@@ -10,6 +10,7 @@ import numpy as np
 from lqrsim.annotations import checked
 from lqrsim.errors import InputError, check_number
 from lqrsim.kernels import declarations
+from lqrsim.kernels.records import Policy
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
@@ -143,7 +144,7 @@ def _solve(problem: Problem, settings: Settings, stop: Stop | None = None) -> So
         complete = bool(np.isfinite(run.linearize_about_plan()))
     (states, controls), gain = work.best, work.arrays.policy.gain
     # Without a pass about the trajectory the policy has no feedback.
-    law = compiled.law_about(states, controls, gain) if complete else (np.zeros_like(gain), controls)
+    law = compiled.law_about(states, controls, gain) if complete else Policy(np.zeros_like(gain), controls)
     result = RunResult(
         status=ending.status, detail=ending.detail(problem.steps), plan=work.best, law=law, cost=work.cost,
         violation=0.0, gap=0.0,

@@ -79,9 +79,7 @@ def _violation_slopes(
     steps, joint = len(controls), states.shape[1] + controls.shape[1]
     slopes, alone, missed = np.zeros((steps + 1, joint)), np.zeros((steps + 1, joint)), 0.0
     holding: list[tuple[float, str]] = []
-    for k, (term, numbers) in enumerate(
-        zip(problem.constraint_terms, work.constraint_values(states, controls), strict=True)
-    ):
+    for k, (term, numbers) in enumerate(zip(problem.constraint_terms, work.constraint_values(plan.plan), strict=True)):
         rows = sizes.rows[run.stages.owners == k]
         short = np.where(np.isfinite(numbers), np.abs(numbers) if term.equality else -numbers, 0.0)
         weights = np.where(short > allowed, 1.0, np.abs(shares[k])) * (np.sign(shares[k]) if term.equality else 1.0)

@@ -12,7 +12,7 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.kernels.active_set import AT_LIMIT, FIRMNESS
 from lqrsim.kernels.interior_point import ENDS, FLAT
-from lqrsim.kernels.records import Motion
+from lqrsim.kernels.records import Motion, Policy
 from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -124,17 +124,17 @@ class InteriorRun:
     def start(self) -> RunResult:
         """The rollout of the initial policy."""
         guess, start = self._run.initial_guess, self._run.work.start
-        plan = self._run.work.roll_out(guess.gain, guess.offset, start)
-        return self.result(*plan, (guess.gain, guess.offset))
+        law = Policy(guess.gain, guess.offset)
+        return self.result(self._run.work.roll_out(law, start), law)
 
-    def result(self, states: Array, controls: Array, law: tuple[Array, Array] | None = None) -> RunResult:
+    def result(self, plan: Motion, law: Policy | None = None) -> RunResult:
         """The result for a plan that has not converged; without a law, its controls are applied without feedback."""
         if law is None:
-            law = np.zeros((*controls.shape, states.shape[1])), controls
-        cost, _ = self._run.stages.trial(Motion(states, controls))
+            law = Policy(np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls)
+        cost, _ = self._run.stages.trial(plan)
         work = self._run.work
-        violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
-        cost, plan = cost if np.isfinite(cost) else np.inf, Motion(states, controls)
+        violation = work.violation(work.constraint_values(plan)) if np.isfinite(plan.states).all() else np.inf
+        cost = cost if np.isfinite(cost) else np.inf
         return RunResult(status=Status.MAX_ITERATIONS, plan=plan, law=law, cost=cost, violation=violation)
 
     def without_multipliers(self) -> None:
@@ -147,20 +147,20 @@ class InteriorRun:
         candidates = []
         for gains in (gain.copy(), np.zeros_like(gain)):
             law = compiled.law_about(*plan, gains)
-            candidates.append(self.result(*self._run.work.roll_out(*law, plan.states[0]), law))
+            candidates.append(self.result(self._run.work.roll_out(law, plan.states[0]), law))
         return min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
 
     def _polished(self, interior: InteriorResult) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
         work = self._run.work
         law = compiled.law_about(interior.plan.states, *self._at_limits(interior))
-        states, controls = work.roll_out(*law, interior.plan.states[0])
-        if not np.isfinite(states).all():
+        plan = work.roll_out(law, interior.plan.states[0])
+        if not np.isfinite(plan.states).all():
             return None
-        self._set_multipliers(interior, work.constraint_values(states, controls), FIRMNESS)
-        work.set_best(states, controls, cost := self._run.stages.trial(Motion(states, controls))[0])
+        self._set_multipliers(interior, work.constraint_values(plan), FIRMNESS)
+        work.set_best(plan, cost := self._run.stages.trial(plan)[0])
         lagrangian = AugmentedLagrangian(self._run)
-        lagrangian.evaluate(*work.best)
+        lagrangian.evaluate(work.best)
         with self._budget.joined_with_last(NAME):
             if has_curvature(self._problem):
                 result = self._newton(lagrangian, interior.scale)
@@ -170,7 +170,7 @@ class InteriorRun:
                     lagrangian.update(growth=1.0)
                     result = self._newton(lagrangian, interior.scale)
                 if not (result.success and lagrangian.kept):  # as where no other plan takes as little time
-                    work.set_best(states, controls, cost)
+                    work.set_best(plan, cost)
                     result = self._ended_inside(lagrangian, interior)
             else:
                 result = self._ended_inside(lagrangian, interior)
@@ -190,8 +190,8 @@ class InteriorRun:
         """
         work, laps = self._run.work, Laps(self._budget)
         result = self._run.about_plan(Status.CONVERGED)
-        self._set_multipliers(interior, work.constraint_values(*work.best), FAINT * FIRMNESS)
-        lagrangian.evaluate(*work.best)
+        self._set_multipliers(interior, work.constraint_values(work.best), FAINT * FIRMNESS)
+        lagrangian.evaluate(work.best)
         interior.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
         return result
 
@@ -220,14 +220,14 @@ class InteriorRun:
     def _newton(self, lagrangian: AugmentedLagrangian, scale: float) -> RunResult:
         """Run Newton's method from the plan in memory, with these multipliers, to an optimality relative to `scale`."""
         result = self._run.newton(added=lagrangian.added(), least=scale)
-        lagrangian.evaluate(*result.plan)
+        lagrangian.evaluate(result.plan)
         return result
 
     def _pressing(
         self, lagrangian: AugmentedLagrangian, interior: InteriorResult, result: RunResult
     ) -> tuple[Multipliers, ...]:
         """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
-        values = self._run.work.constraint_values(*result.plan)
+        values = self._run.work.constraint_values(result.plan)
         multipliers = []
         for k, updated in enumerate(lagrangian.multipliers()):
             size = interior.sizes.rows[self._run.stages.owners == k]

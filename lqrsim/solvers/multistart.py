@@ -200,8 +200,8 @@ def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
         high = np.where(np.isfinite(space.high), space.high, nominal + half_range)
         control = low + np.array(level) * (high - low)
         plan = compiled.rollout(problem, np.zeros((steps, m, len(start))), np.tile(control, (steps, 1)), start.copy())
-        if np.isfinite(plan[0]).all():
-            yield control, Motion(*plan)
+        if np.isfinite(plan.states).all():
+            yield control, plan
 
 
 def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
@@ -220,7 +220,7 @@ def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
         controls = nominal.copy()
         controls[:, i] += np.where(np.arange(steps) < duration * steps, change, 0.0)
         if start is not None and change.any():
-            plan = Motion(*compiled.rollout(problem, gain, controls, start.copy()))
+            plan = compiled.rollout(problem, gain, controls, start.copy())
             if np.isfinite(plan.states).all():
                 yield f"a push by {space.names[i]}", controls, plan
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Positive, checked
 from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels.records import Motion
+from lqrsim.kernels.records import Motion, Policy
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.last_command import with_last_command
@@ -123,13 +123,13 @@ class PreparedSolver(OneVersion):
         n, m, steps = len(self._states), len(self._controls), self.problem.steps
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
         control = self.problem.nominal_control.copy()
-        law = np.zeros((steps, m, n)), np.tile(control, (steps, 1))
+        law = Policy(np.zeros((steps, m, n)), np.tile(control, (steps, 1)))
         guess, budget = InitialGuess(*law), Budget(self.settings.max_iterations)
         run = SolveRun(self.problem, self.settings, guess, state, budget)
         run.roll_out()
         compiled.rollout(self.problem, *law, state)
         clearance_of(self.problem, run.work.last.states)  # a solution that is shifted has it
-        run.work.constraint_values(*run.work.best)
+        run.work.constraint_values(run.work.best)
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and run.second_order:
@@ -425,17 +425,17 @@ class _Yielding:
                 return replace(_unchanged(self._best), status=self._unsolved)
             result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
             law = compiled.law_about(*result.plan, result.gain.copy())
-            plan = run.work.roll_out(*law, self._plan.states[0])
+            plan = run.work.roll_out(law, self._plan.states[0])
             reached = run.stages.trial(plan)[0]
             rank = self._rank(plan, reached)
             solved = result.solved and rank[1] == 0
             if not solved and rank > self._rank(self._best.plan, self._best.cost):
                 return replace(_unchanged(self._best), status=self._unsolved)
         work, status = run.work, Status.CONVERGED if solved else self._unsolved
-        violation, detail = work.violation(work.constraint_values(*plan)), ""
+        violation, detail = work.violation(work.constraint_values(plan)), ""
         if violation > self._allowed:
             lagrangian = AugmentedLagrangian(run)
-            lagrangian.evaluate(*plan)
+            lagrangian.evaluate(plan)
             detail = f"elastic: {lagrangian.worst()}"
         answer = RunResult(status=status, detail=detail, plan=plan, law=law, cost=reached, violation=violation)
         self._best.adopt(answer)
@@ -452,7 +452,7 @@ class _Yielding:
 
     def _missed(self, plan: Motion) -> float:
         """The largest violation of the constraints that do not give way, beyond what is allowed."""
-        values = self._run.work.constraint_values(*plan)
+        values = self._run.work.constraint_values(plan)
         pairs = zip(self._run.problem.constraint_terms, values, strict=True)
         hard = ((term, number) for term, number in pairs if not term.yields)
         return max(
@@ -480,11 +480,12 @@ class _Best:
         clock = time.perf_counter()
         run.roll_out()
         self.rolling_out = time.perf_counter() - clock
-        values = self._work.constraint_values(*self._work.last)
+        values = self._work.constraint_values(self._work.last)
         self.cost, self.violation = self._work.cost, self._work.violation(values)
         self.before = self.cost
         self.plan = copied(self._work.last)
-        self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
+        self.law = Policy(guess.gain, guess.offset)
+        self.cost_to_go, self.multipliers = guess.cost_to_go, guess.multipliers
         self.improved = False
         # Equalities are kept only within a tolerance.
         allowed = run.settings.violation_tolerance(run.problem)
@@ -546,5 +547,5 @@ class _Best:
     def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
         states, controls, gain, offset, *to_go = arrays
         self.cost, self.violation, self.improved = cost, violation, True
-        self.plan, self.law = Motion(states, controls), (gain, offset)
+        self.plan, self.law = Motion(states, controls), Policy(gain, offset)
         self.cost_to_go = Quadratic(*to_go) if to_go else None

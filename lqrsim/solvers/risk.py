@@ -8,7 +8,7 @@ import numpy as np
 from lqrsim.annotations import Bounds, Seed, checked
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_memory
-from lqrsim.kernels.records import Policy
+from lqrsim.kernels.records import Motion, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
@@ -86,7 +86,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
         raise InputError(f"solution: got a plan of {got} steps, controls and states, want {wanted}")
     settings = SmootherSettings(tolerance=1e-4, max_iterations=1, start=plan, constraint_tolerance=1e-3)
     run = SolveRun(problem, settings, resolve(plan.controls, problem), plan.states[0].copy(), Budget(1))
-    run.work.set_best(plan.states, plan.controls)
+    run.work.set_best(Motion(plan.states, plan.controls))
     if run.fails_at(0.0) >= 0:
         raise InputError("solution: got a plan about which no backward pass succeeds, want one that converged")
     high = 1e-6 / max(abs(solution.cost), 1e-100) if np.isfinite(solution.cost) else 1.0
@@ -101,7 +101,7 @@ def name_risk(run: SolveRun, result: RunResult) -> str:
     """The detail of an answer whose risk was too high: at which step, and which risk is not, if that can be told."""
     work, risk, steps = run.work, run.problem.risk, run.problem.steps
     if not np.isfinite(work.cost):
-        work.set_best(*work.last)
+        work.set_best(work.last)
     if not np.isfinite(work.best.states).all():
         return result.detail
     failed = run.fails_at(risk)

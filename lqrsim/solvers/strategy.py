@@ -220,11 +220,11 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     if run.problem.constraints:
         result = point.run_from(copied(plan), WEAK)
         return None if result is None or not result.success else run.certified(result)
-    law = compiled.law_about(plan.states, plan.controls, saddle.law[0])
-    beside = point.result(*compiled.rollout(run.problem, *law, plan.states[0].copy()))
+    law = compiled.law_about(plan.states, plan.controls, saddle.law.gain)
+    beside = point.result(compiled.rollout(run.problem, *law, plan.states[0].copy()))
     if not beside.cost < saddle.cost:
         return None
-    run.work.set_best(*beside.plan, beside.cost)
+    run.work.set_best(beside.plan, beside.cost)
     return run.certified(run.newton(patient=True))
 
 
@@ -252,7 +252,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
     other = other.kept()
     if budget.over:
         return replace(other, status=result.status, detail=result.detail)
-    run.work.set_best(*other.plan, other.cost)
+    run.work.set_best(other.plan, other.cost)
     return run.newton(detail=result.detail, patient=True)
 
 
@@ -379,7 +379,7 @@ class Search:
         self._known.from_start = False
         work, plans = self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in constant_controls(problem):
-            missed = float(f"{work.violation(work.constraint_values(*plan)):.2g}")
+            missed = float(f"{work.violation(work.constraint_values(plan)):.2g}")
             plans.append(
                 (missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control)
             )
@@ -475,10 +475,10 @@ class Search:
             run = self._another(resolve(prior, problem))
             run.budget.report_to(None)  # it is not run to its end
             run.smooth(FOLLOW)
-            states, controls = (part.copy() for part in run.work.arrays.last)
-            if np.isfinite(states).all():
-                missed = run.work.violation(run.work.constraint_values(states, controls))
-                motions.append((missed, name, Trajectory(states, controls, problem.dt)))
+            plan = copied(run.work.arrays.last)
+            if np.isfinite(plan.states).all():
+                missed = run.work.violation(run.work.constraint_values(plan))
+                motions.append((missed, name, Trajectory(*plan, problem.dt)))
         return [(name, motion) for _, name, motion in sorted(motions, key=lambda motion: motion[0])]
 
     def _steered(self) -> list[int]:
@@ -543,7 +543,7 @@ class Search:
                 saddle.states + sign * size * direction.states, saddle.controls + sign * size * direction.controls,
                 self._problem.dt,
             )  # fmt: skip
-            run_beside = self._another(InitialGuess(saddle.law[0].copy(), saddle.law[1].copy(), "a saddle"))
+            run_beside = self._another(guess_from(saddle, "a saddle"))
             run_beside.budget.report_to(self._callback)
             result = from_beside(run_beside, moved, saddle)
             if self._budget.stop.due:
@@ -579,7 +579,7 @@ class Search:
                 break
             drawn = self._solve_through(through)
             self._approached.append(name)
-            plan = Motion(*compiled.rollout(problem, *drawn.law, before.states[0].copy()))
+            plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
             if consider(name, guess_from(drawn, name), plan):
                 break
         plans.sort(key=lambda entry: entry[:2])
@@ -985,4 +985,4 @@ def line_of_states(problem: Problem) -> Trajectory:
 
 def guess_from(result: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
-    return InitialGuess(result.law[0].copy(), result.law[1].copy(), summary)
+    return InitialGuess(result.law.gain.copy(), result.law.offset.copy(), summary)
