@@ -23,7 +23,7 @@ from sympy import Abs, Heaviside, Max, Min, Mod, Piecewise, atan2, cos, exp, flo
 
 import lqrsim as ls
 from lqrsim import rotations
-from lqrsim.codegen.edge_pushing import weighted_hessian
+from lqrsim.codegen.edge_pushing import Operations, hessian_of
 from lqrsim.errors import Array
 
 # Each maps numbers of size 1 to numbers of size 1, so that rounding stays what it is. Some are undefined in a case of
@@ -193,12 +193,14 @@ def test_the_effort_grows_with_the_number_of_operations() -> None:
         slope = c * (2 + value) + s
         second = (2 * c - s * (2 + value)) * first**2 + slope * second
         value, first = s * (2 + value), slope * first
-        found = weighted_hessian([formula], [weight], [x], most=1000)
+        operations = Operations()
+        found = hessian_of(operations, operations.of([formula]), [weight], [x], most=1000)
         assert found is not None
         counts.append(len(found[0]))
     assert sympy.count_ops(formula) > 3000
     assert len(set(np.diff(counts)[1:])) == 1
-    assert weighted_hessian([formula], [weight], [x], most=counts[-1] // 2) is None
+    operations = Operations()
+    assert hessian_of(operations, operations.of([formula]), [weight], [x], most=counts[-1] // 2) is None
     dynamics = ls.Dynamics(lambda x, u, p: [formula], states={"a": ""}, controls={"b": ""})
     hessian = compiled_hessian(dynamics, np.array([0.4]), np.zeros(1), np.ones(1))
     # Ten turns of a map that stretches by up to 2 round by some 1e-13.

@@ -31,7 +31,10 @@ class Operations:
         self._names: dict[Any, Any] = {}
 
     def of(self, formulas: Sequence[Any]) -> list[Any]:
-        """The names of formulas: symbols, negative symbols or numbers. Common subexpressions become one."""
+        """The names of formulas: symbols, negative symbols or numbers. Common subexpressions become one.
+
+        Formulas are real SymPy expressions, without kinks as SymPy writes them; see `without_kinks`.
+        """
         import sympy
 
         shared, reduced = sympy.cse(formulas, symbols=sympy.numbered_symbols("c", real=True))
@@ -135,28 +138,19 @@ class WeightedSum:
         return self._operations.step(sympy.Add(*terms))
 
 
-def weighted_hessian(
-    formulas: Sequence[Any], weights: Sequence[Any], variables: Sequence[Any], *, most: int
+def hessian_of(
+    operations: Operations, results: Sequence[Any], weights: Sequence[Any], variables: Sequence[Any], *, most: int
 ) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
-    """The second derivatives of `sum_i weights[i] formulas[i]`.
+    """The second derivatives of `sum_i weights[i] results[i]`; steps are added to the operations.
 
     Args:
-      formulas: real SymPy expressions, without kinks as SymPy writes them; see `without_kinks`.
+      results: names of formulas, as `operations.of` returns them.
       weights: a symbol for each formula, which is in none of them.
 
     Returns:
       Steps (symbol, operation), in order, and in terms of these the second derivatives by variables i <= j that are not
       always zero, as (i, j) -> expression. None if there would be more than `most` steps.
     """
-    operations = Operations()
-    results = operations.of(formulas)
-    return hessian_of(operations, results, weights, variables, most=most)
-
-
-def hessian_of(
-    operations: Operations, results: Sequence[Any], weights: Sequence[Any], variables: Sequence[Any], *, most: int
-) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
-    """The same for formulas that are operations already, given their names; steps are added to the operations."""
     order = {symbol: i for i, symbol in enumerate(variables)}
     forward = []
     for symbol, operation in operations.steps:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Count, Finite, Positive, checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
-from lqrsim.codegen.edge_pushing import weighted_hessian
+from lqrsim.codegen.edge_pushing import Operations, hessian_of
 from lqrsim.codegen.jax_steps import JaxSteps
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of, text_source
@@ -436,9 +436,9 @@ class Dynamics:
         return {"source": source, "support": support}
 
     def _weighted_hessian(self) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
-        """The second derivatives by (x, u) of f's entries, weighted by w0, w1, ..., as `weighted_hessian` has them."""
-        rates, x, u = self._traced()
-        return weighted_hessian(rates, symbolic.weights(len(rates)), [*x, *u], most=MOST_STEPS)
+        """The second derivatives by (x, u) of f's entries, weighted by w0, w1, ..., as `hessian_of` has them."""
+        (rates, x, u), operations = self._traced(), Operations()
+        return hessian_of(operations, operations.of(rates), symbolic.weights(len(rates)), [*x, *u], most=MOST_STEPS)
 
     @checked
     def period_near(self, dt: Finite) -> float:
