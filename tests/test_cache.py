@@ -150,13 +150,13 @@ def test_a_damaged_item_is_made_again(
 
 
 FOREIGN = (
-    {}, {"returns": None}, {"returns": 3}, {"returns": [["complex"], False]},
+    {}, {"returns": None}, {"returns": 3}, {"returns": [["complex"]]},
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("said", FOREIGN)
+@pytest.mark.parametrize("details", FOREIGN)
 def test_what_was_well_kept_and_can_not_be_used_is_made_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, said: dict[str, Any]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, details: dict[str, Any]
 ) -> None:
     """A checksum does not tell whether another version of the compiler wrote it."""
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
@@ -166,7 +166,7 @@ def test_what_was_well_kept_and_can_not_be_used_is_made_again(
     (item,) = tmp_path.iterdir()
     kept = disk_cache.load(item.stem)
     assert kept is not None
-    disk_cache.save(item.stem, kept[0], "a test", **said)
+    disk_cache.save(item.stem, kept[0], "a test", **details)
     before = len(compiled_module.compilations)
     CompiledModule(text_source(source), {}, "a test").triple(x, out)
     assert out[0] == 6

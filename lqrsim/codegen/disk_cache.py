@@ -57,14 +57,14 @@ def key(*parts: str | bytes) -> str:
 
 
 def load(name: str) -> tuple[bytes, dict[str, Any]] | None:
-    """The contents of an item, and what was said of them; None if it is missing, damaged or cannot be read."""
+    """The contents of an item, and their details; None if it is missing, damaged or cannot be read."""
     path = folder() / f"{name}{_SUFFIX}"
     try:
         header, _, contents = path.read_bytes().partition(b"\n")
     except OSError:
         return None
     header_fields = _object_of(header)
-    details = header_fields.get("said", {})
+    details = header_fields.get("details", {})
     if header_fields.get("sha256") != sha256(json.dumps(details), contents):
         return None
     with contextlib.suppress(OSError):
@@ -81,9 +81,9 @@ def made_of(stored: tuple[bytes, dict[str, Any]] | None, make: Callable[[bytes, 
         return None
 
 
-def save(name: str, contents: bytes, what: str, **said: Any) -> None:
-    """Store an item if possible, with what is `said` of its contents; two processes may store the same one."""
-    header = json.dumps({"what": what, "said": said, "sha256": sha256(json.dumps(said), contents)}).encode()
+def save(name: str, contents: bytes, what: str, **details: Any) -> None:
+    """Store an item if possible, with details of its contents; two processes may store the same one."""
+    header = json.dumps({"what": what, "details": details, "sha256": sha256(json.dumps(details), contents)}).encode()
     with contextlib.suppress(OSError, InputError):
         with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
             unfinished.write_bytes(header + b"\n" + contents)
