@@ -671,7 +671,7 @@ def test_a_row_is_what_a_rollout_with_contacts_and_a_replay_say(rough: Results, 
     rollout = ls.simulate(
         cage, rough.solution("smooth"), disturbances=ROUGH.disturbances(cell), trials=300, frames=False
     )
-    again = rough.trials.outcomes(rollout)
+    again = outcomes(rollout, rough.trials.scenario.problem)
     assert (table.outcome == "collided").sum() >= 3
     for name, column in again.columns().items():
         np.testing.assert_array_equal(column, table.columns()[name], err_msg=name)
