@@ -27,6 +27,7 @@ from lqrsim.machine import processors
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.solvers.compiled import costs_of
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -466,7 +467,7 @@ def test_weights_of_a_problem_by_name_and_by_unit() -> None:
         robot.problem(start, goal, weights={"N": 1.0})
 
 
-def rov_among(others: str) -> ls.MjcfRobot:
+def rov_among(others: str, *, hull: str = "ellipsoid") -> ls.MjcfRobot:
     """A body with eight thrusters, which could turn it in any way while it flies, and what else there is."""
     places = [(x, y) for x in (-0.15, 0.15) for y in (-0.1, 0.1)]
     sites = "".join(f'<site name="{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(places))
@@ -478,7 +479,7 @@ def rov_among(others: str) -> ls.MjcfRobot:
     return ls.MjcfRobot(
         scene_from_xml(
             f"""<mujoco><option timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"/><worldbody>
-            <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/><geom type="ellipsoid" mass="11.5"
+            <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/><geom type="{hull}" mass="11.5"
             size="0.25 0.18 0.13"/>{sites}</body>{others}</worldbody><actuator>{thrusters}</actuator></mujoco>""",
             "rov",
         ),
@@ -509,6 +510,34 @@ def test_a_free_body_passes_pillars(clearance: float | None) -> None:
     assert min(apart) > (-1e-5 if clearance is None else clearance - 1e-5)
     if clearance is not None:
         assert min(apart) == pytest.approx(clearance, abs=1e-5)
+
+
+def test_a_plan_along_which_flat_sides_lie_along_pillars_ends() -> None:
+    """The optimum is at kinks of distances, where no gradient vanishes, though no clearance acts.
+
+    Of plans by other controls, which smooth random changes make, none is cheaper by more than the tolerance.
+    """
+    pillars = ((1.5, 0.2, 0.2), (3.0, -0.3, 0.2))
+    others = "".join(f'<geom type="cylinder" size="{r} 2" pos="{x} {y} 2"/>' for x, y, r in pillars)
+    robot = rov_among(others, hull="box")
+    problem = robot.problem(robot.at(), robot.at(rov_x=4.0), steps=40, dt=0.2, clearance=0.05)
+    solution = ls.smooth(problem, starts=1, max_iterations=60, threads=1)
+    assert solution.status is ls.Status.CONVERGED, solution
+    assert solution.clearance is not None
+    assert solution.clearance.min() > 0.05
+    draws, states, controls = np.random.default_rng(0), [], []
+    for size in (0.0, *np.geomspace(1e-4, 1.0, 40)):
+        change = size * np.cumsum(draws.normal(size=(40, 8)), axis=0) / 6.0
+        xs, us = [solution.trajectory.states[0]], []
+        for t, known in enumerate(solution.trajectory.controls):
+            fed_back = solution.policy.gain[t] @ (xs[-1] - solution.trajectory.states[t])
+            us.append(np.clip(known + fed_back + change[t], -35.0, 35.0))
+            xs.append(robot.dynamics.step(xs[-1], us[-1], problem.dt))
+        states.append(xs)
+        controls.append(us)
+    costs = costs_of(problem, np.array(states), np.array(controls))
+    assert costs[0] == pytest.approx(solution.cost, rel=1e-9)
+    assert costs.min() > solution.cost * (1 - 1e-4)
 
 
 @pytest.mark.parametrize("turn", [6.1, *rarely(5.0, 2 * np.pi, 6.5, 8.0)])
