@@ -30,9 +30,9 @@ KINKED = (
     f" vanishes; the cost has not changed by {FLAT:g} of itself in {ENDS} iterations, but plans beside it may cost less"
 )
 UNSETTLED = (
-    "no gradient vanishes along the plan, as where a flat side of the robot lies along an obstacle, so that the"
-    f" derivatives of a distance jump; from two plans the search ended at costs within {FLAT:g} of each other, but"
-    " plans beside them may cost less"
+    "no gradient vanishes along the plan, as where a flat side of the robot lies along an obstacle and the derivatives"
+    f" of a distance jump; from two plans the search ended at costs within {FLAT:g} of each other, but plans beside"
+    " them may cost less"
 )
 # Distance from the plan at which derivatives are compared, relative to sizes of states and controls; and the difference
 # that is a jump, relative to the largest derivative: along arms without dry friction it is 1e-5 to 1e-4.
