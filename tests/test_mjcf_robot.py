@@ -1404,3 +1404,24 @@ def test_the_turn_of_a_wheel_is_no_goal_unless_it_is_named(wheel: str, rolls: bo
     assert has(goal, [1, 1, 2 * held, 0, 0, 0], weights={"m": 1.0, "rad": 2.0})
     assert has(goal, [1, 1, 2, 0, 0, 0], weights={"m": 1.0, "wheel": 2.0})
     assert has(robot.at(x=1.0, wheel=0.5), [100] * 6)
+
+
+def test_a_clearance_that_start_and_goal_lack_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As that of a boat on slides, whose water is a plane below it that it can never touch."""
+    path = tmp_path / "boat.xml"
+    path.write_text(
+        """<mujoco><worldbody><geom name="water" type="plane" size="9 9 1"/><geom name="buoy" size="0.2" pos="2 2 0"/>
+        <body pos="0 0 0.15"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+        <geom size="0.1" mass="1"/></body></worldbody>
+        <actuator><motor joint="x"/><motor joint="y"/></actuator></mujoco>"""
+    )
+    robot = ls.MjcfRobot(path)
+    robot.problem(robot.at(), robot.at(x=1.0), clearance=0.04)
+    assert not caplog.records
+    robot.problem(robot.at(), robot.at(x=1.0), clearance=0.1)
+    assert "'water' is 0.05 m from the robot at start and goal" in caplog.text
+    assert "buoy" not in caplog.text
+    other = ls.MjcfRobot(path, obstacles=["buoy"])  # the remedy
+    caplog.clear()
+    other.problem(other.at(), other.at(x=1.0), clearance=0.1)
+    assert not caplog.records

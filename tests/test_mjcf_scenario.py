@@ -31,7 +31,7 @@ def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> Non
     assert (problem.steps, problem.dt) == (20, pytest.approx(0.02))
     np.testing.assert_array_equal(problem.start, [0.1, 0.5, 0, 0])
     np.testing.assert_array_equal(problem.goal, [0.1, 3.0, 0, 0])
-    weighed = problem.final_cost
+    (weighed,) = terms_of(problem.final_cost)
     assert isinstance(weighed, ls.QuadraticCost)
     np.testing.assert_array_equal(np.diag(weighed.weight), [5, 7, 0, 0])
     efforts, velocities, limits = terms_of(problem.stage_cost)

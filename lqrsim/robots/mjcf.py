@@ -1,5 +1,6 @@
 """A robot from any MJCF: its dynamics are MuJoCo's own steps, and nothing is derived by hand."""
 
+import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -44,6 +45,8 @@ from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, solid_geoms
 from lqrsim.scenes.mjcf_text import listed
 from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
 from lqrsim.scenes.world import World
+
+_log = logging.getLogger("lqrsim")
 
 _SHARPNESS, _CONTACT_COST = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
 _LIMIT_MARGIN = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
@@ -386,6 +389,7 @@ class MjcfRobot(Robot):
         period = dynamics.period_near(_PERIOD) or dynamics.period if dt is None else dt
         constraints: list[Constraint] = []
         if clearance is not None:
+            self._warn_of_near(np.array([start, goal]), clearance)
             constraints.append(Clearance(self.scene.world, **self.shape, margin=clearance))
         if self_clearance is not None:
             constraint = self.self_clearance(self_clearance)
@@ -408,6 +412,19 @@ class MjcfRobot(Robot):
             control_limits=(controls.low, controls.high),
             constraints=constraints, control_rate=control_rate,
         )  # fmt: skip
+
+    def _warn_of_near(self, ends: Array, clearance: float) -> None:
+        """Log a warning if an obstacle is nearer than a clearance both at the start and at the goal, (2, n)."""
+        names = self.scene.world.names
+        if not names:
+            return
+        nearest = self.geoms.clearances(self.dynamics, self.scene.world, ends).max(axis=0)
+        for name, near in zip(names, nearest.tolist(), strict=True):
+            if near < clearance:
+                _log.warning(
+                    "%r is %.3g m from the robot at start and goal, where a clearance of %g m is wanted: ask for less,"
+                    " or give MjcfRobot other obstacles=", name, near, clearance,
+                )  # fmt: skip
 
     def _final_weights(self, weights: PerEntry, start: Array, goal: Array) -> PerEntry:
         """Weights without those of the turns of wheels, which roll on, unless they are named or the goal turns them."""
