@@ -66,7 +66,7 @@ def smooth(
       stop: "optimal" (gap and first-order optimality within tolerance; for smoothing, also the change of cost) or
         "cost", the paper's test, which considers the change of cost alone and can pass early.
       tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8;
-        1e-4 without Newton's method, and 1e-5 with constraints and the dynamics of an MJCF.
+        1e-4 without Newton's method, and 1e-5 with constraints that act and an MJCF's dynamics.
       gap_tolerance: tolerance of the gap (see `Iteration`).
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
         may use that many, including the further starts that are tried while no plan satisfies the constraints.
