@@ -418,7 +418,7 @@ class MjcfRobot(Robot):
         names = self.scene.world.names
         if not names:
             return
-        nearest = self.geoms.clearances(self.dynamics, self.scene.world, ends).max(axis=0)
+        nearest = self.geoms.in_world(self.dynamics, self.scene.world).clearances(ends).max(axis=0)
         for name, near in zip(names, nearest.tolist(), strict=True):
             if near < clearance:
                 _log.warning(
