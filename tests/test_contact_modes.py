@@ -183,9 +183,10 @@ def test_nothing_beside_a_plan_that_is_called_optimal_is_cheaper(seed: int) -> N
     for size in np.repeat([1e-9, 1e-7, 1e-5, 1e-3], 40):
         other = np.clip(descent.plan.controls + size * draws.standard_normal((STEPS, 1)), -1, 1)
         assert cost_of(other) >= own * (1 - 1e-6)
-    # The gradient says that it is not optimal: only with the multipliers of its switches it is.
+    # The gradient says that it is not optimal, by far more than the tolerance of the descent, 1e-6: only with the
+    # multipliers of its switches it is. The part of the cost that they hold back is 9e-4 for a goal near the limit.
     none = [Switches(one.names, 0 * one.values) for one in pulls]
-    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, none, limits)[0] > 1e-3
+    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, none, limits)[0] > 1e-4
     assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, pulls, limits)[0] < 2e-6
 
 

@@ -326,11 +326,15 @@ def test_where_no_control_helps_by_itself_some_do_together() -> None:
         dynamics=dynamics, dt=0.05, steps=40, initial=ls.FixedState(np.zeros(3)), stage_cost=ls.ControlCost([0.1, 0.1]),
         final_cost=ls.QuadraticCost([100.0, 100.0, 100.0], about=[0.0, 0.0, 1.0]),
     )  # fmt: skip
-    idle, found = ls.smooth(problem, start=np.zeros(2)), ls.smooth(problem)
-    assert idle.cost == pytest.approx(50.0)
+    assert ls.ilqr(problem, start=np.zeros(2)).cost == pytest.approx(50.0)
+    led, found = ls.smooth(problem, start=np.zeros(2)), ls.smooth(problem)
     # c counts twice the area that (a, b) encloses; the least effort goes round it in a circle, once. With a radius r,
     # 2 pi r^2 = 1 and a speed of 2 pi r / T, that is 1/2 0.1 (T / dt) (2 pi r / T)^2 = 0.1 pi / (dt T).
-    assert found.cost == pytest.approx(0.1 * np.pi / (0.05 * 2.0), rel=0.05)
+    for solution in (led, found):
+        assert solution.cost == pytest.approx(0.1 * np.pi / (0.05 * 2.0), rel=0.05)
+    # With a start no others are tried: there the saddle is left along a direction of negative curvature.
+    assert [one.start for one in led.candidates] == ["the given start", "beside a saddle"]
+    assert led.candidates[0].cost == pytest.approx(50.0)
     assert [one.start for one in found.candidates][:1] == ["nominal control"]
 
 
