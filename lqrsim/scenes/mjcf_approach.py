@@ -17,8 +17,8 @@ from lqrsim.scenes.mjcf_obstacles import touching_pairs
 from lqrsim.scenes.mujoco_log import unlogged
 
 # Fractions of the time at which the robot touches the body, and at which the body is at its goal: without time
-# left to return, and with it.
-_TIMES = (0.6, 1.0), (0.35, 0.7)
+# left to return, with it, and with more time to push what is heavy.
+_TIMES = (0.6, 1.0), (0.35, 0.7), (0.4, 1.0)
 _TOOLS, _PAIRS = 2, 1  # numbers of geoms that push and of pairs of geoms that grasp, the nearest first
 _ROUND = 1.3  # distance at which a tool goes round a body, relative to that at which it touches
 # Distances of fingers from the body's centre, relative to that at which they touch: open, and pressed, lightly or more.

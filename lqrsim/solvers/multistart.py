@@ -29,8 +29,9 @@ PATH_WEIGHT = 0.1  # weight of the path, relative to the curvature of an obstacl
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # sideways bend of the paths, relative to the distance from start to goal
 FOLD = 0.9  # bend for states that move collision spheres: an arm must fold up before it passes an obstacle
 # States that contacts hold, such as the tilt of a robot on a floor, are drawn to their start. HOLD is the weight,
-# relative to the path's, for a state that moves by 1. LEAST is the least range, relative to the largest of the unit.
-HOLD, LEAST = 0.01, 1e-3
+# relative to the path's, for a state that moves by 1. LEAST is the least range, relative to the largest of the unit: of
+# angles that is the angle by which wheels turn, 170 rad in half a minute.
+HOLD, LEAST = 0.01, 1e-4
 # Constant controls that are tried where the nominal ones lead out of the domain: fractions of the range between the
 # limits; where there is no limit, of this many units about the nominal control.
 LEVELS, UNLIMITED = (0.0, 0.25, 0.5, 0.75, 1.0), (1.0, 10.0, 100.0)
