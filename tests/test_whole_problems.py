@@ -82,6 +82,14 @@ def test_no_family_misleads(kind: str) -> None:
     holds()
 
 
+@pytest.mark.long
+def test_a_plan_beside_a_cheaper_one_leaves_its_contact_modes() -> None:
+    """Within its contact modes the plan was optimal; of the plans beside it one was cheaper, and it was STALLED."""
+    case = families.draw("contact", 1080)
+    solution = ls.smooth(case.problem, start=case.given, threads=1)
+    assert dense.contradictions(case, solution) == []
+
+
 def test_the_check_of_families_can_fail() -> None:
     """iLQR keeps to a symmetric start, and so ends at the saddle; other claims are made false by hand."""
     case = next(one for one in (families.draw("symmetric", i) for i in range(99)) if not one.problem.constraints)

@@ -314,6 +314,9 @@ class Search:
             self.keep()
         if self.may_go_on and not self.best[1].success:
             self.alternate()
+        if self.is_beside_cheaper:
+            with self._problem.dynamics.solving(self._solving):
+                self.leave_modes()
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
@@ -722,6 +725,23 @@ class Search:
             optimum = self._cheapest
             if not optimum.cost < before.cost - FELL * abs(before.cost):
                 return
+
+    @property
+    def is_beside_cheaper(self) -> bool:
+        """Whether the best plan ended within its contact modes, though a plan beside it is cheaper."""
+        (run, best), contacts = self.best, None
+        if best.certificate is not None:
+            contacts = best.certificate.contacts
+        if best.success or contacts is None or not self.may_go_on:
+            return False
+        return max(contacts.across, contacts.sampled) > run.final
+
+    def leave_modes(self) -> None:
+        """Descend from the best plan whatever its contact modes are."""
+        run = self._add(guess_from(self.best[1], "the best plan"), "the best plan, out of its contact modes")
+        with run.budget.limited(SOFT):
+            result = self._finish(run, refine)
+        self._offer(run, result, better=self._is_better(result))
 
     @property
     def _cheapest(self) -> RunResult:
