@@ -15,7 +15,7 @@ import sys
 import sysconfig
 import types
 import warnings
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -374,14 +374,15 @@ def _bytes(count: int) -> str:
     return f"{count:.3g} PB" if count < 1e6 else f"{count:.1e} PB"
 
 
-def renamed(old: str, new: str) -> property:
+def renamed(old: str, new: str) -> Callable[..., Any]:
     """The earlier name of a method, which warns, for programs of the version before."""
 
-    def method(self: Any) -> Any:
+    def method(self: Any, *arguments: Any, **options: Any) -> Any:
         warnings.warn(f"{old} is {new} now; the earlier name goes in lqrsim 0.4", FutureWarning, stacklevel=2)
-        return getattr(self, new)
+        return getattr(self, new)(*arguments, **options)
 
-    return property(method, doc=f"The earlier name of `{new}`.")
+    method.__doc__ = f"The earlier name of `{new}`."
+    return method
 
 
 def free_name(name: str, taken: Container[str]) -> str:

@@ -30,7 +30,7 @@ TALKATIVE = """
 import sys
 from lqrsim import cli
 from lqrsim.commands import console
-console.progress.__defaults__ = (0.0,)  # says at every frame how far it is
+console.LINE_EVERY = 0.0  # says at every frame how far it is
 sys.exit(cli.main())
 """
 REPRODUCE = """

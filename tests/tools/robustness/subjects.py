@@ -42,6 +42,7 @@ HOOKS |= {f"{kind}.{name}" for kind in ("Simulator", "RotorPy", "Crazyflow") for
 HOOKS |= {"with_added_state", "times", "moved_to", "final_states", "state_bounds", "of_residual"}
 HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
 HOOKS |= {"TrialScore.failure"}  # a field, whose default is a function
+HOOKS |= {"settled"}  # an earlier name
 
 RAISES = {"Results.read": (Damaged,)}
 
