@@ -150,11 +150,12 @@ def test_frozen_records_own_their_arrays(caller: Any) -> None:
     """What the caller writes into an array later changes no record that was made from it."""
     tried = 0
     for name, subject in caller.subjects.items():
-        kind: Any = subject.call
+        kind = subject.call
         if not (inspect.isclass(kind) and dataclasses.is_dataclass(kind)):
             continue
         copies = {key: value.copy() for key, value in subject.arguments.items() if isinstance(value, np.ndarray)}
-        if not copies or not kind.__dataclass_params__.frozen or kind is ls.disturbances.Effect:
+        frozen = kind.__dataclass_params__.frozen  # pyright: ignore[reportAttributeAccessIssue]
+        if not copies or not frozen or kind is ls.disturbances.Effect:
             continue
         made = kind(**{**subject.arguments, **copies})
         mine = [one for field in dataclasses.fields(made) for one in arrays_in(getattr(made, field.name, None))]
