@@ -1,1 +1,1 @@
-"""Scenes: files in MJCF and URDF, their kinematics and contacts, and the obstacles in them."""
+"""Scenes: MJCF and URDF files, what MuJoCo computes of them (kinematics, statics, contacts), and their obstacles."""
