@@ -1,4 +1,4 @@
-"""Records that functions return or take, for annotations and extensions."""
+"""Classes of what functions return or take, for annotations, and `source_of`, for costs and constraints of your own."""
 
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.chance_constrained import SafePlan
