@@ -213,7 +213,7 @@ def test_of_unknowns_only_white_ones_are_noise_of_readings(cage, plan, problem):
 
     u, exact = plan.trajectory.controls[t - 1], filter_of()
     control = [slope(*(row * exact.model.uncertainty.control), *np.zeros(6)) for row in np.eye(4)]
-    wanted = sensors.each("noise") ** 2 + np.square(control).sum(axis=0)
+    wanted = sensors.per_reading("noise") ** 2 + np.square(control).sum(axis=0)
     lasting = Unknown("force_x", 0.3), Unknown("force_z", 0.3, time_constant=0.5)
     white = Unknown({"force_y": 0.6, "force_z": 0.8}, 0.3, time_constant=0.0)
     for sensing in (exact, filter_of(*lasting)):
@@ -273,7 +273,7 @@ def test_estimates_are_least_squares(on_track, rates, late, biased, loss, seed):
                 row[own[:taken]] = 1.0
             rows.append(row)
             values.append(arriving[0, i] - nominal[taken][i])
-            variances.append(sensors.each("noise")[i] ** 2)
+            variances.append(sensors.per_reading("noise")[i] ** 2)
         u = run.control(t, arriving)[0]
         if rows:
             A, R = np.array(rows), np.diag(variances)
@@ -325,7 +325,7 @@ def test_the_file_says_what_is_not_given(cart, on_track):
     plant, solution = on_track[2], on_track[1]
     sensors = plant.sensors([Sensor("place"), Sensor("slow")])
     assert sensors.sensors[0] == Sensor("place", noise=0.2, rate=25.0, delay=0.02)
-    assert sensors.late(0.02) == [1, 0]
+    assert sensors.delay_periods(0.02) == [1, 0]
     run = ls.simulate(plant, controller=Reading(solution, sensors))
     read = np.array(run.controller_run.read)[:, 0]
     assert np.flatnonzero(np.isfinite(read[:, 0])).tolist() == list(range(1, 30, 2))

@@ -51,12 +51,12 @@ class SensorFilter:
     @cached_property
     def biased(self) -> npt.NDArray[np.intp]:
         """The numbers of the readings that have a bias, (B,)."""
-        return np.flatnonzero(self.sensors.each("bias") + self.sensors.each("bias_walk"))
+        return np.flatnonzero(self.sensors.per_reading("bias") + self.sensors.per_reading("bias_walk"))
 
     @cached_property
     def late(self) -> list[int]:
         """For each sensor, the number of periods after which its reading arrives."""
-        return self.sensors.late(self.model.plan.dt)
+        return self.sensors.delay_periods(self.model.plan.dt)
 
     @cached_property
     def _wrench(self) -> Array:
@@ -132,7 +132,7 @@ class SensorFilter:
         model, (_, controls, wrench) = self.model, self._slopes
         uncertainty, space = model.uncertainty, model.dynamics.control_coordinates
         shaken = controls * (per_entry("Uncertainty: control", uncertainty.control, space) * (not model.lagging))
-        variance = self.sensors.each("noise") ** 2 + np.vecdot(shaken, shaken)
+        variance = self.sensors.per_reading("noise") ** 2 + np.vecdot(shaken, shaken)
         for unknown in uncertainty.unknowns:
             values = np.array([unknown.shares.get(name, 0.0) for name in model.parameters])
             if unknown.white and values.any():
@@ -145,7 +145,7 @@ class SensorFilter:
         covariance = np.zeros((trials, size + biased, size + biased))
         covariance[:, :size, :size] = self.model.start_root @ self.model.start_root.T
         biases = size + np.arange(biased)
-        covariance[:, biases, biases] = self.sensors.each("bias")[self.biased] ** 2
+        covariance[:, biases, biases] = self.sensors.per_reading("bias")[self.biased] ** 2
         return Estimate(np.tile(z, (trials, 1)), np.zeros((trials, biased)), covariance)
 
     def predict(self, covariance: Array, knot: int) -> None:
@@ -156,7 +156,7 @@ class SensorFilter:
         covariance[:, :, :size] = covariance[:, :, :size] @ F.T
         covariance[:, :size, :size] += model.process_noise[t]
         biases = size + np.arange(len(self.biased))
-        covariance[:, biases, biases] += self.sensors.each("bias_walk")[self.biased] ** 2 * model.plan.dt
+        covariance[:, biases, biases] += self.sensors.per_reading("bias_walk")[self.biased] ** 2 * model.plan.dt
 
     def correct(self, covariance: Array, knot: int, known: npt.NDArray[np.bool_], off: Array) -> Array:
         """Correct covariances in place by the readings that are known (K, Y), one number after the other.

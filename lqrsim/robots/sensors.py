@@ -18,15 +18,14 @@ from lqrsim.robots.base import Robot, indices_in
 from lqrsim.scenes.scene import Scene
 
 _TYPES = mujoco.mjtSensor
-# What these read jumps, has no number in the state, or is of another program: no filter can be linearised about it.
+# Kinds whose readings jump, depend on the time, or are computed by a user's code: a filter cannot linearise these.
 _REFUSED = {
     getattr(_TYPES, f"mjSENS_{name}")
     for name in ("TOUCH", "CONTACT", "TACTILE", "INSIDESITE", "CLOCK", "USER", "PLUGIN", "GEOMNORMAL", "GEOMFROMTO")
 }
 _NO_HIT = -1.0  # what a rangefinder reads if its ray meets nothing
 _QUATERNIONS = _TYPES.mjSENS_FRAMEQUAT, _TYPES.mjSENS_BALLQUAT  # a reading of these and its negative mean the same
-# Of a period: a time that is a knot, up to rounding, is that knot.
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # fraction of a control period within which a time counts as that of a knot
 
 # (states (K, n), controls (K, m), force and torque in the world's axes (K, 6)) -> readings (K, Y)
 Reader = Callable[[Array, Array, Array], Array]
@@ -61,13 +60,13 @@ class Sensor:
 
 
 class RobotSensors:
-    """Sensors of the MJCF that a robot is in; `plant.sensors(...)` makes it.
+    """Sensors of a robot's MJCF, made by `plant.sensors(...)`. Their readings (K, Y) are those of all sensors in turn.
 
     Attributes:
-      sensors: the sensors, with the file's numbers where none were given.
-      columns: where each one's numbers are in the readings.
-      drag: the robot's, through which wind acts as a force.
-      quaternions: for each sensor, whether a reading and its negative mean the same.
+      sensors: the sensors, with the file's noise, rate and delay where none were given.
+      columns: the columns of each sensor in the readings. names: of the columns, (Y,).
+      drag: the robot's, in N s/m, by which a wind is a force.
+      quaternions: for each sensor, whether it reads a quaternion: this and its negative mean the same.
     """
 
     _prefix = ""
@@ -107,8 +106,8 @@ class RobotSensors:
         if coordinates.names != others.names:
             raise InputError(f"sensors: got those of robot {self._robot.name}, want those of the problem's robot")
 
-    def each(self, field: str) -> Array:
-        """A field of the sensors, for each number of the readings, (Y,)."""
+    def per_reading(self, field: str) -> Array:
+        """The values of a field of `Sensor` for each column of the readings, (Y,)."""
         return np.repeat([float(getattr(sensor, field)) for sensor in self.sensors], self._sizes)
 
     def due(self, knot: int, dt: float) -> npt.NDArray[np.bool_]:
@@ -117,23 +116,23 @@ class RobotSensors:
         per_period = np.minimum(rates, 1 / dt) * dt  # multiples of the interval in a period
         return np.floor(knot * per_period + _ROUNDING) > np.floor((knot - 1) * per_period + _ROUNDING)
 
-    def late(self, dt: float) -> list[int]:
+    def delay_periods(self, dt: float) -> list[int]:
         """The number of control periods of dt seconds after which the reading of each sensor arrives."""
         return [int(np.ceil((sensor.delay or 0.0) / dt - _ROUNDING)) for sensor in self.sensors]
 
     def readings(self, sensordata: Array) -> Array:
-        """The readings (K, Y) in MuJoCo's `sensordata` (K, any); NaN where a rangefinder meets nothing."""
+        """The readings (K, Y) from MuJoCo's `sensordata` (K, any); NaN where a rangefinder's ray meets nothing."""
         readings = sensordata[:, self._places]
         readings[(readings == _NO_HIT) & self._rangefinders] = np.nan
         return readings
 
     def reader(self) -> Reader:
-        """A function that computes exact readings by MuJoCo, for one thread; see `Reader`.
+        """A function that computes readings without errors by MuJoCo, for one thread; see `Reader`.
 
-        Each row is computed from nothing but its own numbers.
+        A row's readings do not depend on the other rows: MuJoCo's solver is not warm-started.
         """
         robot, model = self._robot, copy.copy(self._scene.model)
-        at_once(model)
+        ignore_timing(model)
         data, body = mujoco.MjData(model), int(model.body(robot.body).id)
         in_qpos, in_qvel, in_ctrl = indices_in(robot, model)
 
@@ -154,7 +153,7 @@ class RobotSensors:
 
 
 def _completed(sensor: Sensor, model: mujoco.MjModel, number: int) -> Sensor:
-    """The sensor with the file's numbers where none are stated."""
+    """The sensor with the file's noise, rate and delay where none are given."""
     interval = float(model.sensor_interval[number, 0])  # 0 for each physics step
     return replace(
         sensor,
@@ -176,6 +175,6 @@ def _number_of(model: mujoco.MjModel, name: str) -> int:
     return number
 
 
-def at_once(model: mujoco.MjModel) -> None:
-    """Let MuJoCo's `sensordata` be the readings of the present: delays and intervals are the closed loop's."""
+def ignore_timing(model: mujoco.MjModel) -> None:
+    """Let MuJoCo read all sensors at each step, without delay: the closed loop applies their rates and delays."""
     model.sensor_delay[:], model.sensor_interval[:] = 0.0, 0.0

@@ -156,7 +156,7 @@ class Readings:
         if not isinstance(physics, MujocoPhysics):
             raise InputError("controller: got one that reads sensors of the MJCF, want a plant moved by MuJoCo")
         self._sensors, self._effects, self._physics, self._dt = sensors, effects, physics, dt
-        self._late, self._readings = sensors.late(dt), dict[int, Array]()
+        self._late, self._readings = sensors.delay_periods(dt), dict[int, Array]()
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """The exact readings that arrive at a knot of the plan, before the run begins; as `arriving`."""

@@ -20,7 +20,7 @@ from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot, indices_in
-from lqrsim.robots.sensors import RobotSensors, Sensor, at_once
+from lqrsim.robots.sensors import RobotSensors, Sensor, ignore_timing
 from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
@@ -290,7 +290,7 @@ class Plant(OneVersion):
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
         model = compiled(spec)
-        at_once(model)
+        ignore_timing(model)
         return model
 
 

@@ -70,10 +70,10 @@ class SensorErrors(Disturbance):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         known, knots = plant.sensors(self.known), plan.steps + 1
         size = len(known.names)
-        errors = known.each("noise") * normal(generators, knots, size)
-        errors += known.each("bias") * normal(generators, 1, size)
+        errors = known.per_reading("noise") * normal(generators, knots, size)
+        errors += known.per_reading("bias") * normal(generators, 1, size)
         walks = normal(generators, plan.steps, size).cumsum(axis=1)
-        errors[:, 1:] += known.each("bias_walk") * np.sqrt(plan.dt) * walks
+        errors[:, 1:] += known.per_reading("bias_walk") * np.sqrt(plan.dt) * walks
         losses = np.array([sensor.loss for sensor in known.sensors])
         lost = uniform(generators, knots, len(losses)) < self.strength * losses
         errors *= self.strength
