@@ -1,7 +1,7 @@
-"""Policies as C99, for a microcontroller. The texts are in `templates/c/`; here they get their numbers.
+"""Policies as C99, for a microcontroller. This module fills in the templates in `templates/c/`.
 
-The laws are written about their nominal states, `planned + gain (state - nominal)`, which equals `gain state + offset`.
-Rounding to float or to 16 bits then acts on deviations only.
+Feedback laws are written about their nominal states, `planned + gain (state - nominal)`, which equals
+`gain state + offset`. Rounding a gain to float or to 16 bits then acts on deviations only.
 """
 
 import os
@@ -26,8 +26,8 @@ from lqrsim.results.solution import Solution
 TEMPLATES = Path(__file__).parent.parent / "templates" / "c"
 PREFIX = "my_policy"  # the name in the templates
 STATIC = ("CMakeLists.txt", "main.c", "stm32f405.c", "stm32f405.ld")
-# Headers of C and C++, and those that they include from the C library. A file of such a name would be found in their
-# place wherever the folder is on the include path.
+# Headers of C and C++, and those that they include from the C library. A file of such a name would be included in
+# their place wherever the folder is on the include path.
 HEADERS = (
     "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic"
     " stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
@@ -37,7 +37,7 @@ HEADERS = (
 LARGEST = 32767  # largest integer in 16 bits
 # The tolerance of main.c, relative to the largest sum of magnitudes in a command: well above rounding, about 1e-15
 # in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
-SHARES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
+TOLERANCES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
 NUMBERS, GAINS = ("float", "double"), ("full", "int16")
 EXPORTED = "a Solution, an AffinePolicy, such as of track, or an OutputFeedbackPolicy, such as OffsetFree(...).policy"
 DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
@@ -49,7 +49,7 @@ class ExportedC:
     """The result of `export_c`.
 
     Attributes:
-      sha256: hash of the policy's content, as in its file; it is also in the header.
+      sha256: hash of the policy's content, as in its file; it is also in the header. controls: names with units.
       rounding: (m,), the largest change of each control by rounding the gains, in the control's unit, if every state,
         including the filter's, is off its nominal value by one unit.
     """
@@ -61,8 +61,8 @@ class ExportedC:
     controls: Annotated[tuple[Line, ...], "m"]
 
     def summary(self) -> str:
-        """A summary of the files and of the largest errors of the commands."""
-        lines = [f"SHA-256 {self.sha256}, tables of {self.table_bytes:,} bytes", f"{OFF}:"]
+        """The hash, the size of the tables, and by how much rounding the gains changes each control."""
+        lines = [f"SHA-256 {self.sha256}, tables of {self.table_bytes:,} bytes", f"{ROUNDING_MEANING}:"]
         return "\n".join([*lines, *_bounds(self.controls, self.rounding)])
 
 
@@ -91,7 +91,7 @@ def export_c(
       folder: the folder for the files. Files of these names are replaced.
       number: the type of all numbers except the time, "float" or "double".
       gains: "full" or "int16": whether matrices are stored in 16 bits, each entry relative to its largest magnitude.
-      interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
+      interpolate: whether to interpolate between the laws of two knots, as `AffinePolicy` does; not with a filter.
       name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter;
         not that of a header of C, such as math.
     """
@@ -111,8 +111,8 @@ def export_c(
     low, high = _limits(law.control_coordinates, DTYPES[number])
     tables.plain("lowest", low)
     tables.plain("highest", high)
-    share = SHARES["int16" if gains == "int16" else number]
-    rows, tolerance = _rows(law, measured, values, DTYPES[number], share, interpolate)
+    relative = TOLERANCES["int16" if gains == "int16" else number]
+    rows, tolerance = _test_rows(law, measured, values, DTYPES[number], relative, interpolate)
     sha, parts = hash_of(policy), kind | (BLENDED if interpolate else HELD)
     parts |= {
         "version": version("lqrsim"), "rounding": _rounding_text(law, tables, number, gains), "sha256": sha,
@@ -120,7 +120,7 @@ def export_c(
         "period": repr(law.dt), "horizon": f"{law.steps * law.dt:.6g}", "T": str(law.steps),
         "n": str(len(law.state_coordinates)), "Y": str(len(measured)), "m": str(len(law.control_coordinates)),
         "Z": str(law.nominal.shape[1]), "bytes": str(tables.bytes), "real": number, "tables": tables.text(),
-        "nearest": _nearest(law, number), "share": f"{share:g}", "tolerance": _list(map(repr, tolerance.tolist())),
+        "nearest": _nearest(law, number), "share": f"{relative:g}", "tolerance": _list(map(repr, tolerance.tolist())),
         "rows": rows,
     }  # fmt: skip
     files, templates = [], {f"{name}.h": "my_policy.h", f"{name}.c": kind["source"]} | {file: file for file in STATIC}
@@ -137,7 +137,7 @@ def export_c(
     )  # fmt: skip
 
 
-# The template of the source, and the text of the header.
+# The template of the source, and what the header says of it.
 FEEDBACK = {"source": "feedback.c", "what": "A feedback law", "lost": "", "or": ", or measured is NULL"}
 FILTER = {
     "source": "filter.c", "what": "A filter and the law of its estimates",
@@ -162,18 +162,18 @@ class _Tables:
     Attributes:
       rounding: name of a table of matrices (T, rows, columns) -> the sum over the columns of the largest rounding error
         of each entry, (rows,).
-      share: the largest rounding error of an entry, relative to the entry's largest magnitude over the steps.
+      relative_error: the largest rounding error of an entry, relative to the entry's largest magnitude over the steps.
     """
 
     def __init__(self, number: str, gains: str) -> None:
         self._number, self._short = number, gains == "int16"
         self._lines: list[str] = []
-        self.bytes, self.rounding, self.share = 0, dict[str, Array](), 0.0
+        self.bytes, self.rounding, self.relative_error = 0, dict[str, Array](), 0.0
 
     def add(self, name: str, array: Array) -> None:
-        """Add a table (T, rows) or (T, rows, columns), read by a macro: NAME(k, i, j).
+        """Add a table (T, rows) or (T, rows, columns), and the macro that reads it: NAME(k, i, j).
 
-        Entries that are the same in all steps, such as the entries of a filter's unknowns, are stored once.
+        Entries that are the same in all steps, as those of a filter's unknowns, are stored once.
         """
         if not np.isfinite(array).all():
             raise InputError(f"policy: {name}: got NaN or infinity in it, want finite numbers")
@@ -203,11 +203,11 @@ class _Tables:
         if array.ndim == 3:
             off, largest = np.abs(stored - array).max(axis=0), np.abs(array).max(axis=0)
             self.rounding[name] = off.sum(axis=-1)
-            shares = np.divide(off, largest, out=np.zeros_like(off), where=largest > 0)
-            self.share = max(self.share, float(shares.max()))
+            relative = np.divide(off, largest, out=np.zeros_like(off), where=largest > 0)
+            self.relative_error = max(self.relative_error, float(relative.max()))
 
     def plain(self, name: str, array: Array) -> None:
-        """Add an array of numbers that fit the type."""
+        """Add an array whose numbers the type represents exactly."""
         self._write(name, array, "real")
 
     def text(self) -> str:
@@ -314,31 +314,33 @@ def _entries(measured: Coordinates, start: Array, controls: Coordinates) -> str:
 def _rounding_text(law: AffinePolicy | OutputFeedbackPolicy, tables: _Tables, number: str, gains: str) -> str:
     lines = [f"Numbers are stored as {number}."]
     if gains == "int16":
-        lines = [f"Matrices are stored in 16 bits, each entry with an error of at most {_up(tables.share)} of its"]
+        most = _rounded_up(tables.relative_error)
+        lines = [f"Matrices are stored in 16 bits, each entry with an error of at most {most} of its"]
         lines += [f"largest magnitude over the steps; other numbers as {number}."]
-    lines += [*f"{OFF}:".split("\n"), *_bounds(law.control_coordinates.labels, tables.rounding["gain"])]
+    lines += [*f"{ROUNDING_MEANING}:".split("\n"), *_bounds(law.control_coordinates.labels, tables.rounding["gain"])]
     return "\n * ".join(map(_comment, lines))
 
 
-# The quantity that `rounding` bounds.
-OFF = """Rounding the gains changes each command by at most this, where everything that they multiply is off its nominal
+# What `ExportedC.rounding` bounds, in words.
+ROUNDING_MEANING = """\
+Rounding the gains changes each command by at most this, where everything that they multiply is off its nominal
 value by 1 in its unit"""
 
 
 def _bounds(labels: Iterable[str], rounding: Iterable[float]) -> list[str]:
-    return [f"  {label}: {_up(most)}" for label, most in zip(labels, rounding, strict=True)]
+    return [f"  {label}: {_rounded_up(most)}" for label, most in zip(labels, rounding, strict=True)]
 
 
-def _up(value: float) -> str:
+def _rounded_up(value: float) -> str:
     """A bound with three digits, rounded up."""
     return f"{value * 1.005:.2e}"
 
 
-def _rows(
+def _test_rows(
     law: AffinePolicy | OutputFeedbackPolicy, space: Coordinates, values: dict[str, Array], dtype: npt.DTypeLike,
-    share: float, interpolate: bool,
+    relative: float, interpolate: bool,
 ) -> tuple[str, Array]:  # fmt: skip
-    """The rows of main.c, with Python's commands for random measurements, and the tolerance of each control (m,)."""
+    """The rows of main.c's test, Python's commands for random measurements; and the tolerance of each control (m,)."""
     rng, rows = np.random.default_rng(0), []
     largest = np.zeros(len(law.control_coordinates))
     filtered = isinstance(law, OutputFeedbackPolicy)
@@ -346,7 +348,7 @@ def _rows(
     times = np.arange(12.0) if filtered else np.abs(periods)
     z = law.start() if filtered else law.nominal[0]
     expected = values.get("expected", law.nominal)
-    # A filter interprets the spread of its measurements as fast motion, so the spread is smaller here.
+    # A filter takes the scatter of its measurements for fast motion, so there is less of it.
     spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if filtered else 1)
     for place, period in enumerate(times):
         t, k = float(period) * law.dt, min(int(period), law.steps - 1)
@@ -365,4 +367,4 @@ def _rows(
         )
         sums = np.abs(values["gain"][k]) @ (np.abs(state) + np.abs(law.nominal[k])) + np.abs(values["planned"][k])
         largest = np.maximum(largest, sums)
-    return "\n".join(rows), share * largest
+    return "\n".join(rows), relative * largest
