@@ -18,7 +18,7 @@ from lqrsim.control.collision_chance import Surroundings, both_below, collision_
 from lqrsim.control.controllers import Feedback
 from lqrsim.control.linear_loop import LinearLoop, kernels
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import Counted, SampledLoop, sample_loop
+from lqrsim.control.sampled_loop import DeviationNorm, SampledLoop, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 from lqrsim.kernels.records import LoopMoments
@@ -309,8 +309,8 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
         offset = np.einsum("tij,tj->ti", policy.gain, system.plan.states[:-1]) + policy.offset - system.plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, (np.full(1, -1e6), np.full(1, 1e6)))
     moments, n = loop.moments(), loop.model.n
-    surroundings, counted = Surroundings.of(system.problem, 0.0), Counted.of(system.solution, ())
-    found = sample_loop(loop.model, controller, loop.limits, surroundings, counted, 20_000, 0).moments
+    surroundings, norm = Surroundings.of(system.problem, 0.0), DeviationNorm.of(system.solution, ())
+    found = sample_loop(loop.model, controller, loop.limits, surroundings, norm, 20_000, 0).moments
     std = np.sqrt(np.diagonal(moments.covariance[:, :n, :n], axis1=1, axis2=2))
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), std, rtol=0.05)
     assert (np.abs(found.mean - moments.mean[:, :n]) < 5 * std / np.sqrt(20_000)).all()
@@ -383,7 +383,7 @@ def test_the_nearest_obstacle_of_each_trial_is_where_it_was_displaced_to() -> No
 @pytest.mark.parametrize("collided", [0, 1, 7, 40, 1000])
 @pytest.mark.parametrize("predicted", [0.0, 1e-9, 1e-3, 0.05, 0.9])
 def test_a_chance_is_between_the_predicted_and_the_counted_one(collided: int, predicted: float) -> None:
-    """And the counted one, none as a half, where an exact interval of 95 % does not have the predicted one."""
+    """And the norm one, none as a half, where an exact interval of 95 % does not have the predicted one."""
     trials = 1000
     hit = np.arange(trials) < collided
     none = LoopMoments(*[np.zeros((0, 0))] * 5)

@@ -18,7 +18,7 @@ from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
-from lqrsim.control.sampled_loop import Counted
+from lqrsim.control.sampled_loop import DeviationNorm
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.control.tracking import (
     Predictions,
@@ -269,7 +269,7 @@ def with_margin(
     """
     uncertainty = stated.uncertainty.steady(np.inf)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
+    norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
     none = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
     truths = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, none)]
@@ -283,7 +283,7 @@ def with_margin(
             lost = np.asarray(~np.isfinite(moments.covariance).all(axis=(-3, -2, -1)))
         for moment in moments:
             moment[lost] = 0.0
-        finite = predictions(solution, surroundings, counted, moments)
+        finite = predictions(solution, surroundings, norm, moments)
         return Predictions(*(np.where(lost, gone, value) for gone, value in zip(GONE, finite, strict=True)))
 
     outcomes = predicted(design)

@@ -1,9 +1,9 @@
-"""Trials of a closed loop, simulated with the filter's prediction model, and the chance of collision that they show.
+"""Monte Carlo trials of a closed loop in a filter's nonlinear model, and the chance of collision by them.
 
 The moments of `linear_loop.py` are valid for small deviations. A robot whose commands stay at their limits leaves its
-plan, and far from the plan its dynamics differ. These trials run the nonlinear dynamics without MuJoCo, with limits,
-lag, delays, and lost commands and measurements. A seed draws the same numbers for all plans and laws, so that two of
-them are compared on the same trials.
+plan, and far from the plan its dynamics are not those linearised there. These trials run the nonlinear dynamics without
+MuJoCo, with limits, lag, delays, and lost commands and measurements. A seed draws the same numbers for all plans and
+laws, so that two of them are compared on the same trials.
 """
 
 from collections import deque
@@ -24,16 +24,16 @@ from lqrsim.kernels.records import LoopMoments
 from lqrsim.results.goal import scale_of
 from lqrsim.results.solution import Solution
 
-# The weight of a predicted chance, as a number of collisions that is combined with the collisions of the trials. If the
-# trials have fewer, the prediction is the more precise of the two.
+# The number of collisions that the linear model's chance counts as, when it is combined with those of the trials: with
+# fewer in the trials, it weighs more than they do.
 PRIOR = 4.0
-REFUTED = 0.025  # a prediction is refuted if the trials' number of collisions has a tail probability below this
+REFUTED = 0.025  # tail probability, on either side, of the trials' collisions below which they refute that chance
 
 
-class Counted(NamedTuple):
-    """The states in which a distance from the plan is measured: the position, or else what the goal asks for."""
+class DeviationNorm(NamedTuple):
+    """The norm of deviations from a plan: of the position in m, or without one of the goal's states, each scaled."""
 
-    states: list[int]  # their indices
+    states: list[int]  # indices of the states that count
     scale: Array  # (C,) what each is divided by: 1, or its range over the plan
 
     @classmethod
@@ -43,8 +43,8 @@ class Counted(NamedTuple):
         counts = np.flatnonzero(np.isfinite(solution.target.state)).tolist()
         return cls(counts, scale_of(solution.trajectory.states)[counts])
 
-    def distance(self, off: Array) -> Array:
-        """Of deviations (..., n)."""
+    def __call__(self, off: Array) -> Array:
+        """The norms (...) of deviations (..., n)."""
         return np.linalg.norm(off[..., self.states] / self.scale, axis=-1)
 
 
@@ -54,10 +54,10 @@ class SampledLoop:
 
     moments: LoopMoments  # of the deviations from the plan and the commands, over the trials whose states stay finite
     collided: npt.NDArray[np.bool_]  # (K,) whether each trial collides at a knot, or its state is not finite
-    farthest: Array  # (K,) largest distance of each trial from its plan, in m, or as `Counted` has it
+    farthest: Array  # (K,) largest deviation of each trial from its plan, by the `DeviationNorm`
 
     def chance(self, predicted: float) -> float:
-        """The chance of collision by these trials and a prediction. 0 only if both have none."""
+        """The chance of collision by these trials and the linear model's, `predicted`. 0 only if both have none."""
         trials, collisions = len(self.collided), int(self.collided.sum())
         low = float(betaincinv(collisions, trials - collisions + 1, REFUTED)) if collisions else 0.0
         high = float(betaincinv(collisions + 1, trials - collisions, 1 - REFUTED)) if collisions < trials else 1.0
@@ -68,9 +68,13 @@ class SampledLoop:
 
 def sample_loop(
     model: PlanModel, controller: Controller, limits: tuple[Array, Array], surroundings: Surroundings,
-    counted: Counted, trials: int, seed: int,
+    norm: DeviationNorm, trials: int, seed: int,
 ) -> SampledLoop:  # fmt: skip
-    """Run K trials of a controller in the model of the true system, within limits of the controls, (m,) each."""
+    """Run K trials of a controller about its plan.
+
+    Args:
+      model: the true system. limits: of the controls, (m,) each. surroundings: the obstacles.
+    """
     plan, n = model.plan, model.n
     robots, run = _Robots(model, limits, trials, np.random.default_rng(seed)), controller.start(trials)
     displaced = surroundings.displacements(robots.rng, trials)
@@ -82,7 +86,7 @@ def sample_loop(
             finite = np.isfinite(states[t]).all(axis=1)
             collided |= ~finite
             collided[finite] |= surroundings.nearest(states[t, finite], [moved[finite] for moved in displaced]) < 0
-            off = counted.distance(states[t] - plan.states[t])
+            off = norm(states[t] - plan.states[t])
             farthest = np.maximum(farthest, np.where(finite, off, np.inf))
             if t < plan.steps:
                 commands[t] = robots.advance(t, run.control(t, robots.measure(t)))
@@ -100,7 +104,10 @@ def sample_loop(
 
 
 class _Robots:
-    """The true systems of K trials: their z as in `plan_model.py`, but in absolute numbers; and the links to them."""
+    """K simulated robots, and the links that carry measurements and commands.
+
+    Their z is that of `plan_model.py`, but of states themselves in place of deviations from the plan.
+    """
 
     def __init__(self, model: PlanModel, limits: tuple[Array, Array], trials: int, rng: np.random.Generator) -> None:
         plan, uncertainty = model.plan, model.uncertainty
@@ -108,8 +115,8 @@ class _Robots:
         start = np.concatenate([plan.states[0], model.reached[0], np.zeros(len(model.transition))])
         self.z = start + self._normal(model.size) @ model.start_root.T
         # Noise on controls is added before the limits, so it does not count as noise on states.
-        self._shaken = per_entry("Uncertainty: control", uncertainty.control, model.dynamics.control_coordinates)
-        self._roots = replace(model, uncertainty=replace(uncertainty, control=0.0)).process_root
+        self._control_std = per_entry("Uncertainty: control", uncertainty.control, model.dynamics.control_coordinates)
+        self._process_roots = replace(model, uncertainty=replace(uncertainty, control=0.0)).process_root
         arrived = Lag.of(uncertainty.lag, plan.dt)
         predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
         self._command = np.zeros((trials, model.m))
@@ -146,8 +153,8 @@ class _Robots:
         self._late_commands.append(commands)
         lost = self.rng.random((self._trials, 1)) < uncertainty.command_loss
         self._applied = np.where(lost, self._applied, self._late_commands.popleft())
-        np.clip(self._applied + self._normal(model.m) * self._shaken, *self.limits, out=self._command)
+        np.clip(self._applied + self._normal(model.m) * self._control_std, *self.limits, out=self._command)
         with model.dynamics.quiet():
             self._predict()
-        self.z += self._normal(model.size) @ self._roots[t].T
+        self.z += self._normal(model.size) @ self._process_roots[t].T
         return self._command

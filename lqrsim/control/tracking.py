@@ -27,7 +27,7 @@ from lqrsim.control.controllers import Feedback
 from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.linear_loop import LinearLoop, moments_of
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import Counted, sample_loop
+from lqrsim.control.sampled_loop import DeviationNorm, sample_loop
 from lqrsim.control.tracking_laws import AT_END, Averse, Laws, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
@@ -90,7 +90,7 @@ def choose_tolerances(
       moments: predicts the states' moments under C laws.
       truth: model with the unknowns, for trials of laws that act on the measured state itself.
     """
-    counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
+    norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     tried, limits = (
         tolerances_to_try(model, effort, at_end, solution.target),
@@ -98,19 +98,19 @@ def choose_tolerances(
     )
     laws = tracking_laws(model, tried)
     loop_moments = moments(laws)
-    predicted = predictions(solution, surroundings, counted, loop_moments)
+    predicted = predictions(solution, surroundings, norm, loop_moments)
     least = narrowest(model, predicted.width)
     scores = predicted.scores(least)
 
     def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
         law = laws.pick(i)
         limited = moments.saturation[i].mean() > LIMITED
-        farthest = LOST * np.sqrt(_squares(counted, moments.covariance[i]).max())
-        count = runs_lost(problem, solution, law, moments.mean[i], moments.covariance[i], counted, farthest)
+        farthest = LOST * np.sqrt(_squares(norm, moments.covariance[i]).max())
+        count = runs_lost(problem, solution, law, moments.mean[i], moments.covariance[i], norm, farthest)
         if count or not limited or truth is None or not truth.uncertainty.unknowns:
             return count
         run = Feedback(_policy_of(solution, law))
-        return int((sample_loop(truth, run, limits, OPEN, counted, TRIALS, 0).farthest > farthest).sum())
+        return int((sample_loop(truth, run, limits, OPEN, norm, TRIALS, 0).farthest > farthest).sum())
 
     runs = dict[int, int]()  # the number of lost runs of each law
     for best in sorted(range(len(scores)), key=lambda i: (scores[i], -i)):  # of equals the gentlest first
@@ -135,7 +135,7 @@ def choose_tolerances(
     stressing = chosen[0].stressing(emphasis, EMPHASIS)
     laws = tracking_laws(model, stressing)
     loop_moments = moments(laws)
-    stressed = predictions(solution, surroundings, counted, loop_moments).scores(least)
+    stressed = predictions(solution, surroundings, norm, loop_moments).scores(least)
     i = int(np.argmin(stressed))
     better = stressed[i] < scores[best] and lost(loop_moments, laws, i) <= runs[best]
     return (stressing.pick(i), laws.pick(i)) if better else chosen
@@ -158,19 +158,22 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     )
 
 
-def predictions(solution: Solution, surroundings: Surroundings, counted: Counted, moments: LoopMoments) -> Predictions:
+def predictions(
+    solution: Solution, surroundings: Surroundings, norm: DeviationNorm, moments: LoopMoments
+) -> Predictions:
     """The predictions for laws with these moments of the states, (..., T+1, n) and so on."""
     mean, covariance = moments.mean, moments.covariance
     collide = collision_chance(solution.trajectory.states + mean, covariance, moments.across, surroundings)[1]
-    squares = _squares(counted, covariance) + counted.distance(mean) ** 2
+    squares = _squares(norm, covariance) + norm(mean) ** 2
     width = np.sqrt(squares.mean(axis=-1))
     miss = _chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
     return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
 
 
 def runs_lost(
-    problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array, counted: Counted, farthest: float
-) -> int:
+    problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array, norm: DeviationNorm,
+    farthest: float,
+) -> int:  # fmt: skip
     """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
 
     The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n). A run that gets
@@ -184,14 +187,14 @@ def runs_lost(
         for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
             states, _ = rollout(problem, gain[t:], offset[t:], start)
             with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
-                distance = counted.distance(states - plan.states[t:])
+                distance = norm(states - plan.states[t:])
             lost += not (distance <= farthest).all()
     return lost
 
 
-def _squares(counted: Counted, covariance: Array) -> Array:
+def _squares(norm: DeviationNorm, covariance: Array) -> Array:
     """The mean squared distance from the mean, by covariances (..., n, n)."""
-    return (np.diagonal(covariance, axis1=-2, axis2=-1)[..., counted.states] / counted.scale**2).sum(axis=-1)
+    return (np.diagonal(covariance, axis1=-2, axis2=-1)[..., norm.states] / norm.scale**2).sum(axis=-1)
 
 
 def narrowest(model: PlanModel, widths: Array) -> float:

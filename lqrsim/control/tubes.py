@@ -20,7 +20,7 @@ from lqrsim.control.controllers import ControllerLike, Feedback
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import Counted, sample_loop
+from lqrsim.control.sampled_loop import DeviationNorm, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind
@@ -151,8 +151,8 @@ def predict_tube(
             f"predict_tube: samples: got 0 and a {' and a '.join(late)} control periods, which the moments do not have,"
             " want more than 0"
         )
-    counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
-    trials = sample_loop(loop.model, law, loop.limits, surroundings, counted, samples, seed) if samples else None
+    norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
+    trials = sample_loop(loop.model, law, loop.limits, surroundings, norm, samples, seed) if samples else None
     moments, estimate = trials.moments if late and trials else loop.moments(), None
     model, n = loop.model, loop.model.n
     if not late and loop.filter_gain is not None:
@@ -163,7 +163,7 @@ def predict_tube(
     chance, linear = collision_chance(plan.states + mean, covariance, across, surroundings)
     strays = None
     if trials is not None:
-        scaled = covariance[:, counted.states][:, :, counted.states] / np.outer(counted.scale, counted.scale)
+        scaled = covariance[:, norm.states][:, :, norm.states] / np.outer(norm.scale, norm.scale)
         widest = np.sqrt(max(np.linalg.eigvalsh(scaled).max(), 0.0))
         strays = float((trials.farthest > STRAY * widest).mean())
     return Tube(
