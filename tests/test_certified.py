@@ -37,9 +37,9 @@ class TestCertificate:
         ],
     )
     def test_each_of_its_numbers_can_fail(self, field: str, value: float, says: str) -> None:
-        assert faults(GOOD, claimed=36.0, rest=0.0, tolerance=1e-4) == ""
+        assert faults(GOOD, claimed=36.0, rounding=0.0, tolerance=1e-4) == ""
         bad = dataclasses.replace(GOOD, **{field: value})
-        assert says in faults(bad, claimed=36.0, rest=0.0, tolerance=1e-4)
+        assert says in faults(bad, claimed=36.0, rounding=0.0, tolerance=1e-4)
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_plan_that_fails_it_is_no_success(

@@ -11,20 +11,19 @@ from lqrsim.kernels.records import CERTIFICATE, CostToGo
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Certificate
 
-# Tolerances for rounding. A policy's control is a sum of a few terms; a step of the dynamics is some hundred
-# operations, which amplify each other's rounding errors.
+# Tolerances for rounding: of the residuals of policy and dynamics, and of the cost, relative to it. A policy's control
+# is a sum of a few terms; a step of the dynamics is some hundred operations, which amplify each other's rounding.
 LAW, MOTION, COST = 1e-11, 1e-8, 1e-8
-# If the terms of a cost cancel, a rounding error remains that is relative to the terms.
-REST = 1e-13
-# An optimal cost may be zero, or next to it. A decrease is then relative to this part of the cost of typical changes.
+CANCELLATION = 1e-13  # rounding error of a cost, relative to the size of its terms, which may cancel
+# An optimal cost may be almost zero. Optimality is then relative to this fraction of the cost of typical changes.
 TYPICAL = 1e-6
-# The optimality is computed about the plan; the solver computes its own about states within the gap tolerance of the
-# plan. The certificate's optimality may therefore be slightly larger.
+# Factor by which a certificate's optimality may exceed the tolerance. It is computed about the plan; the solver's own,
+# about states that are within the gap tolerance of the plan.
 SLACK = 2.0
 
 
 def no_value(states: Array) -> CostToGo:
-    """An empty cost-to-go along states (T+1, n)."""
+    """A cost-to-go of zero along states (T+1, n): arguments where there is none."""
     knots, n = states.shape
     return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
@@ -32,9 +31,10 @@ def no_value(states: Array) -> CostToGo:
 def certificate_of(
     problem: Problem, row: np.void, states: Array, *, violation: float, least: float = 0.0
 ) -> Certificate:
-    """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote.
+    """Make the certificate of a plan with states (T+1, n) from the numbers that `kernels/certificate.py` wrote.
 
-    `least` is the least cost to which the optimality is relative, as that of time where the duration was free.
+    The optimality is the predicted decrease of the cost relative to the cost, or to `least` if that is more: with a
+    free duration, the cost of time.
     """
     cost, scale, typical, motion, law, beyond, decrease, _ = (float(row[name]) for name in CERTIFICATE.names or ())
     start = 0.0
@@ -42,8 +42,9 @@ def certificate_of(
         start = float(np.abs(states[0] - problem.initial.numbers).max())
     if not np.isfinite(cost):
         decrease = np.inf
-    # A cost in whose rounding typical changes are lost, as of noise that no control damps, says nothing about them.
-    size = typical if 0 < typical < REST * abs(cost) else abs(cost)
+    # Where typical changes are less than the rounding of the cost, as beside the cost of noise that no control damps,
+    # the decrease is relative to them.
+    size = typical if 0 < typical < CANCELLATION * abs(cost) else abs(cost)
     least = max(size, least, TYPICAL * typical, 1e-26 * scale, 1e-300)
     optimality = decrease / least if np.isfinite(decrease) else np.inf
     return Certificate(
@@ -53,14 +54,14 @@ def certificate_of(
 
 
 def faults(
-    certificate: Certificate, *, claimed: float, rest: float, tolerance: float | None, kept: bool = False
+    certificate: Certificate, *, claimed: float, rounding: float, tolerance: float | None, kept: bool = False
 ) -> str:
     """List, in words, all contradictions to a claim of convergence; empty if there are none.
 
     Args:
-      claimed: the last cost in the log. rest: the rounding error of a cost whose terms cancel.
-      tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether the violation comes from
-        equalities within their tolerance.
+      claimed: the last cost in the log. rounding: the error of a cost whose terms cancel.
+      tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether all constraints are kept
+        within their tolerances, so that a violation above 0 is no fault.
     """
     contradictions = []
     if certificate.start != 0:
@@ -73,7 +74,7 @@ def faults(
         contradictions.append(f"a control is {certificate.limits:.2g} beyond its limit")
     if certificate.violation > 0 and not kept:
         contradictions.append(f"a constraint is missed by {certificate.violation:.2g}")
-    if not abs(certificate.cost - claimed) <= COST * abs(certificate.cost) + rest:
+    if not abs(certificate.cost - claimed) <= COST * abs(certificate.cost) + rounding:
         contradictions.append(f"it costs {certificate.cost:.9g}, not {claimed:.9g}")
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         contradictions.append(f"its optimality is {certificate.optimality:.2g}, not below {tolerance:g}")

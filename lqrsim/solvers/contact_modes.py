@@ -467,7 +467,7 @@ def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, statu
     certificate = replace(certificate, optimality=optimality, contacts=contacts)
     detail = f"within its contact modes, against {contacts.pressed} switches"
     if status is Status.CONVERGED:
-        wrong = faults(certificate, claimed=plan.cost, rest=0.0, tolerance=run.final)
+        wrong = faults(certificate, claimed=plan.cost, rounding=0.0, tolerance=run.final)
         if max(contacts.across, contacts.sampled) > run.final:
             wrong = f"{wrong}, a plan beside it is cheaper".removeprefix(", ")
         if wrong:

@@ -41,7 +41,7 @@ from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Ite
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
-from lqrsim.solvers.certify import REST, SLACK, certificate_of, faults, no_value
+from lqrsim.solvers.certify import CANCELLATION, SLACK, certificate_of, faults, no_value
 from lqrsim.solvers.curvature import FLAT, CurvatureCheck, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
@@ -486,8 +486,8 @@ class SolveRun:
                 evaluated, _ = self._checked(declarations.EVALUATE, result, no_value(result.states), violation)
                 certificate = replace(certificate, optimality=evaluated.optimality)
             wrong = faults(
-                certificate, claimed=self.budget.log[-1].cost, rest=REST * scale, tolerance=tolerance,
-                kept=self.work.keeps(values),
+                certificate, claimed=self.budget.log[-1].cost, rounding=CANCELLATION * scale,
+                tolerance=tolerance, kept=self.work.keeps(values),
             )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
             # The expected cost without penalties of constraints, which the cost-to-go of the solver has.
