@@ -1,6 +1,7 @@
-"""Output feedback without steady errors, by the linear model.
+"""Offset-free output feedback: no steady error under constant disturbances and wrong parameters.
 
 A Kalman filter estimates the state, the actuators' outputs and the unknowns. A tracking law acts on all the estimates.
+Both are designed with the linear model about the plan.
 """
 
 from collections.abc import Mapping
@@ -39,19 +40,18 @@ from lqrsim.results.policy import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
 from lqrsim.robots.sensors import RobotSensors
 
-MEMORY = 5.0  # s
-# Weight of a failure without the lag, relative to a failure with it. The value is our choice: with a larger one,
-# designs lose performance with the lag.
-ABSENT = 0.3
-# The increase in the chance of failure without the lag from which other designs compete; a tube of six times the width
-# counts as much.
-CLIFF = 0.1
-# What milder filters assume: a fraction of the stated lag, and noise that bypasses the actuators, relative to the
-# tolerated effort times `Lag.mean`.
+MEMORY = 5.0  # s, the default of `OffsetFree`
+# Choice of a design that tolerates the absence of the stated lag; see `robust_to_lag`. Weight of the score without the
+# lag, relative to the score with it. The value is our choice: with a larger one, designs lose performance with the lag.
+WITHOUT_LAG = 0.3
+# How much higher the score without the lag must be for milder designs to compete: as much as a chance of failure of
+# 0.1, or as a tube of six times the width.
+MUCH_WORSE = 0.1
+# What the filters of milder designs assume: a fraction of the stated lag; and noise on the controls that bypasses the
+# actuators, as in `PlanModel.assumed`.
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
-# The largest width of the tube with the lag, relative to the narrowest.
-WIDER = 1.25
-GONE = (1.0, 1e30, 1.0)  # the predictions for a loop whose moments are not finite
+WIDEST = 1.25  # the largest width of the chosen tube with the lag, relative to the narrowest of all designs
+UNSTABLE = (1.0, 1e30, 1.0)  # the `Predictions` for a loop whose moments are not finite
 
 
 class OffsetFree(Controller):
@@ -60,11 +60,11 @@ class OffsetFree(Controller):
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted; one that is late by
     `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so there
-    is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and
+    is no windup. The filter never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and
     predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
-    unknown by at most six standard deviations of such a correction; see `kalman.py`. If the robot would leave its
-    plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
-    `with_margin`. `model.uncertainty` is the uncertainty that the filter assumes.
+    unknown by at most six standard deviations of such a correction; see `kalman.py`. If a design for the stated lag
+    would do much worse without the lag, a milder one is chosen, whose tube with the lag is at most a quarter wider:
+    see `robust_to_lag`. `model.uncertainty` is the uncertainty that the filter assumes.
 
     The other arguments are as in `track`.
 
@@ -75,8 +75,8 @@ class OffsetFree(Controller):
         SymPy symbols, as in `Dynamics`, that does not depend on u; or sensors of the MJCF, `plant.sensors(...)`, each
         with its own noise, bias, rate, delay and loss: see `sensor_filter.py`. With these the uncertainty says nothing
         of measurements, a stated lag makes nothing milder, and only `simulate` runs the law.
-      memory: by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as stated, and a
-        steady disturbance then leaves an error.
+      memory: seconds; by default 5, or the plan's horizon if that is shorter. np.inf takes the uncertainty as stated,
+        and a steady disturbance then leaves an error.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
       replan_every: seconds between two checks, rounded to control periods; by default there are none. A check simulates
         the model from the estimated state, with the estimated constants. If the law no longer leads to the goal without
@@ -91,7 +91,7 @@ class OffsetFree(Controller):
     has the new `plans` of each trial, by the step at which they begin, and a `log`, as a `Replanner`.
 
     Attributes:
-      options: the keyword arguments.
+      options: the keyword arguments as given, `memory` in seconds.
       model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
       filter: the filter's gains and covariances.
       weights: the law's weights of deviations from the plan; `weights.emphasis` is None with given tolerances.
@@ -143,7 +143,7 @@ class OffsetFree(Controller):
             design = Design.of(self.model, self.filter, weights)
         if uncertainty.lag > 0 and memory < np.inf and self._sensing is None:
             ends = at_end if tolerate is None else None
-            design = with_margin(problem, solution, stated, design, memory, efforts, ends)
+            design = robust_to_lag(problem, solution, stated, design, memory, efforts, ends)
         self.model, self.filter, self.weights = design.model, design.filter, design.weights
         self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
@@ -189,7 +189,7 @@ class OffsetFree(Controller):
         return None if self._sensing is None else self._sensing.sensors
 
     def _check_in_advance(self, what: str) -> None:
-        """Raise InputError if matrices are not known in advance: about later plans, or gains after losses."""
+        """Raise InputError if the loop's matrices depend on the run: on later plans, or on lost readings."""
         if self._sensing is not None:
             raise InputError(f"OffsetFree: {what}: got a law that reads sensors of the MJCF, want measured states")
         if self._rule is not None:
@@ -247,48 +247,48 @@ class OffsetFree(Controller):
         return spaces_of(self.solution.policy)
 
 
-def with_margin(
+def robust_to_lag(
     problem: Problem, solution: Solution, stated: PlanModel, design: Design, memory: float, effort: Array,
     at_end: float | None,
 ) -> Design:  # fmt: skip
-    """The design, or a milder one if it is much worse without the lag.
+    """The design, or a milder one if the design is much worse without the lag.
 
     A filter and a law that assume a lag compensate for it: the law commands more, and the filter explains unexpected
     motion by actuators that run ahead of their commands. Without the lag, both overcompensate. Such a loop may be
     unstable with any tolerances, and the robot then leaves its plan even undisturbed.
 
-    Each design is therefore also predicted without the lag. If that is much worse, milder designs compete with it: the
-    filter assumes noise on the controls that bypasses the actuators, which is the effect of an unknown lag, and maybe
-    only a part of the lag. Among the designs that stay about as near to the plan if the lag exists, the one
-    with the least chance of failure with and without the lag is chosen. A lag of several control periods leaves little
-    choice: without it the robot stays near its plan, but may miss its goal.
+    The design is therefore also scored without the lag. If that score is much worse, milder designs compete with it:
+    their filters assume noise on the controls that bypasses the actuators, which is the effect of an unknown lag, and
+    some only a part of the lag. Of the designs whose tube with the lag is not much wider than the narrowest, the one
+    with the best weighted sum of the scores with and without the lag is chosen. A lag of several control periods leaves
+    little choice: without it the robot stays near its plan, but may miss its goal.
 
     Args:
-      stated: model of the true system, with a lag. memory, effort: as in `PlanModel.assumed`.
-      at_end: as in `tolerances_to_try`, which has the tolerances that compete; None to keep those of the design.
+      stated: model of the true system, with the stated lag. memory, effort: as in `PlanModel.assumed`.
+      at_end: as in `tolerances_to_try`, whose tolerances compete; None to keep those of the design.
     """
     uncertainty = stated.uncertainty.steady(np.inf)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
     none = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
-    truths = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, none)]
+    systems = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, none)]
 
     def predicted(design: Design) -> Predictions:
-        """The predictions for C laws, with the lag and without it: (2, C)."""
+        """The predictions for C laws, (2, C): with the lag, and without it."""
         limits = solution.policy.control_coordinates.limits
-        loop = LinearLoop(truths[0], *design.laws, design.filter.gain, limits, design.model)
+        loop = LinearLoop(systems[0], *design.laws, design.filter.gain, limits, design.model)
         with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
-            moments = loop.in_systems(truths, stated.n)
+            moments = loop.in_systems(systems, stated.n)
             lost = np.asarray(~np.isfinite(moments.covariance).all(axis=(-3, -2, -1)))
         for moment in moments:
             moment[lost] = 0.0
         finite = predictions(solution, surroundings, norm, moments)
-        return Predictions(*(np.where(lost, gone, value) for gone, value in zip(GONE, finite, strict=True)))
+        return Predictions(*(np.where(lost, worst, value) for worst, value in zip(UNSTABLE, finite, strict=True)))
 
     outcomes = predicted(design)
     scores = outcomes.scores(narrowest(stated, outcomes.width[0]))
-    if scores[1, 0] <= scores[0, 0] + CLIFF:
+    if scores[1, 0] <= scores[0, 0] + MUCH_WORSE:
         return design
     if at_end is None:
         weights = design.weights.pick(None)
@@ -303,6 +303,6 @@ def with_margin(
     widths = np.array([outcome.width[0] for outcome in outcomes])
     least = narrowest(stated, widths)
     scores = np.array([outcome.scores(least) for outcome in outcomes])
-    scores = np.where(widths > WIDER * least, np.inf, scores[:, 0] + ABSENT * scores[:, 1])
+    scores = np.where(widths > WIDEST * least, np.inf, scores[:, 0] + WITHOUT_LAG * scores[:, 1])
     i, j = np.unravel_index(int(np.argmin(scores)), scores.shape)
     return designs[i].pick(int(j))

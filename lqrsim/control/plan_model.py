@@ -403,7 +403,7 @@ class PlanModel:
         Args:
           effort: tolerated effort of the controls, (m,).
           bypass: noise on the controls that bypasses the actuators, relative to the effort times `Lag.mean`; see
-            `with_margin`.
+            `robust_to_lag`.
         """
         stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
         steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss
