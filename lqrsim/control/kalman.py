@@ -17,15 +17,15 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels import square_root_filter
 from lqrsim.kernels.records import FilterModel, FilterRoots, FilterSizes, zeros_of
 
-# The least noise of a measured number, relative to the standard deviation of its prediction. It makes the covariance of
-# exact or redundant sensors invertible. A decision on the rank would also be discontinuous.
+# The least standard deviation of a measured number's noise, relative to that of its prediction. It makes the innovation
+# covariance of exact or redundant sensors invertible. To decide on its rank instead would be discontinuous.
 RESOLUTION = 1e-6
-NOTHING = 1e-150  # the least noise if the prediction is certain: its square is still a positive number
-# The largest correction of an unknown by one measurement, in standard deviations of that correction. If all is as
-# stated, one correction in 5e8 is larger. In a run, such corrections have other causes: a command or the first
-# measurement was lost, or there was a push that nobody stated. Attributed to a mass, the error of a state can make the
-# mass negative. The limit doubles with each measurement that exceeds it. A gate, which rejects measurements, could lock
-# out for good what differs far from its statement.
+LEAST_STD = 1e-150  # the same, absolute, if the prediction is certain: its square is still a positive number
+# The largest correction of an unknown by one measurement, in standard deviations of it. If the model is right,
+# one correction in 5e8 is larger. In a run, such corrections have other causes: a lost command or first measurement or
+# a push that the uncertainty lacks. Attributed to a mass, the error of a state can make the mass negative. The limit
+# doubles with each measurement that exceeds it. A validation gate, which rejects such measurements, could reject a
+# parameter that is far from its stated value for ever.
 PLAUSIBLE = 6.0
 
 
@@ -35,22 +35,22 @@ class KalmanFilter(NamedTuple):
     gain: Array  # K, (T+1, Z, Y)
     predicted: Array  # (T+1, Z, Z), covariance of the error of z before the measurement of each knot
     corrected: Array  # (T+1, Z, Z), the same after it
-    corrected_root: Array  # lower triangular square roots of `corrected`, with nonnegative diagonals
+    corrected_root: Array  # (T+1, Z, Z), lower triangular square roots of `corrected`, with nonnegative diagonals
     innovation: Array  # (T+1, Y, Y), covariance of the measurement minus its prediction
     limit: Array  # (T+1, D), largest correction of each state of the unknowns by one measurement; see `PLAUSIBLE`
 
 
 def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
-    """The filter of a plan's model.
+    """The filter for a plan's model.
 
     Args:
-      known: square root (Z, Z) of the covariance after the measurement of the first knot, if that measurement has been
-        used already; the gain there is then zero. By default the filter begins before that measurement, with the
-        model's start.
+      known: a square root (Z, Z) of the covariance after the measurement of the first knot, if the filter about an
+        earlier plan has used that measurement; the gain there is then zero. By default the filter begins before that
+        measurement, with the model's `start_root`.
     """
     size, measured, n, disturbing = model.size, model.sensor.size, model.n, model.disturbing
     sizes = FilterSizes(
-        model.plan.steps + 1, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING
+        model.plan.steps + 1, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, LEAST_STD
     )
     work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
     arrays = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
@@ -58,26 +58,26 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     system = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
     filter_along = module_of(source_of(square_root_filter), "Kalman filters").filter_along
     filter_along(sizes, system, FilterRoots(*map(np.ravel, roots)))
-    _, before, after, innovation_root, learned, _ = roots
-    limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
+    _, before, after, innovation_root, correction_root, _ = roots
+    limit = PLAUSIBLE * np.sqrt((correction_root[:, n + model.lagging :] ** 2).sum(axis=2))
     predicted, corrected, innovation = (root @ root.transpose(0, 2, 1) for root in (before, after, innovation_root))
-    return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)
+    return KalmanFilter(_gains(correction_root, innovation_root), predicted, corrected, after, innovation, limit)
 
 
-def _gains(learned: Array, root: Array) -> Array:
-    """K of K S = learned (T+1, Z, Y), for lower triangular S (T+1, Y, Y), of all knots at once.
+def _gains(correction_root: Array, root: Array) -> Array:
+    """The K of K S = `correction_root` (T+1, Z, Y), for lower triangular S = `root` (T+1, Y, Y), at all knots at once.
 
-    OpenBLAS solves even such small systems with all its threads, which then wait for each other.
+    By substitution: OpenBLAS solves even such small systems with all its threads, which then wait for each other.
     """
-    gain = np.empty_like(learned)
+    gain = np.empty_like(correction_root)
     for j in range(root.shape[1] - 1, -1, -1):
         solved = (gain[:, :, j + 1 :] @ root[:, j + 1 :, j, None])[:, :, 0]
-        gain[:, :, j] = (learned[:, :, j] - solved) / root[:, j, j, None]
+        gain[:, :, j] = (correction_root[:, :, j] - solved) / root[:, j, j, None]
     return gain
 
 
 def check_observable(model: PlanModel) -> None:
-    """Raise InputError, with the name, for an unknown that moves the robot but changes no measurement."""
+    """Raise InputError that names an unknown, if it moves the robot but changes no measurement of the plan's model."""
     first = model.n + model.lagging
     effect, groups = np.eye(model.size)[:, first:], [list(indices) for indices in model.own_states]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)

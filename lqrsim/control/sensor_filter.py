@@ -19,7 +19,7 @@ import numpy.typing as npt
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import turn_to_nearest
 from lqrsim.control.filter_law import FilterLaw, FilterRun
-from lqrsim.control.kalman import NOTHING, RESOLUTION, KalmanFilter
+from lqrsim.control.kalman import LEAST_STD, RESOLUTION, KalmanFilter
 from lqrsim.control.plan_model import STEP, PlanModel
 from lqrsim.control.uncertainty import per_entry, triangular_root
 from lqrsim.errors import Array, InputError
@@ -169,7 +169,7 @@ class SensorFilter:
             row = self.H[t, i]
             seen = np.vecdot(covariance, row)
             variance = np.vecdot(seen, row)
-            variance += np.maximum(self.noise[t, i], RESOLUTION**2 * variance) + NOTHING**2
+            variance += np.maximum(self.noise[t, i], RESOLUTION**2 * variance) + LEAST_STD**2
             gain = np.where(known[:, i, None], seen / variance[:, None], 0.0)
             moved += gain * np.where(known[:, i], off[:, i] - np.vecdot(moved, row), 0.0)[:, None]
             covariance -= gain[:, :, None] * seen[:, None, :]
