@@ -1,4 +1,4 @@
-"""The constraint that a robot keeps clear of obstacles: class and kernel."""
+"""The constraint that keeps a robot away from obstacles: class and kernel."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -20,21 +20,25 @@ from lqrsim.scenes.world import World
 
 
 class Clearance(KeepsClear, Constraint):
-    """`distance(x_t, obstacle) - radius >= margin` for each obstacle, walls included, at the steps.
+    """`distance(x_t, obstacle) - radius >= margin` for each obstacle of the world, at the knots.
 
         ls.Clearance(scene.world, radius=robot.radius, margin=0.05)
 
-    The constraint does not act at a start that is given exactly. Between two steps a plan can come nearer: by `v^2 dt^2
-    / 8 r` at the speed v, where r is the sum of the radii of robot and obstacle. It can also step over obstacles
-    thinner than a step. Add an ObstacleCost, even one with a small weight: it guides the search around the obstacles.
+    The constraint does not act at a start that is given exactly. Between two knots a plan can come nearer: by `v^2 dt^2
+    / 8 r` at the speed v, where r is the sum of the radii of robot and obstacle. It can also jump over obstacles that
+    are thinner than the way between two knots. Add an ObstacleCost, even one with a small weight: it guides the search
+    around the obstacles.
 
     Args:
-      world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
+      world: the obstacles. For a robot in a plane they are reduced to that plane; see `World.seen_by`.
       radius: radius of the robot in metres, as for an ObstacleCost. Give exactly one of `radius`, `balls` and `geoms`.
+      balls: the robot's balls, as for an ObstacleCost: one distance for each ball, or for each hull of several, and
+        obstacle.
       geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
         obstacle.
       margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
-        Those of knots move with time when a `Replanner` plans again, as a reference does; see `QuadraticCost`.
+        Margins of knots belong to their times: when a `Replanner` plans again, they shift as a reference does; see
+        `QuadraticCost`.
     """
 
     @checked
@@ -102,13 +106,13 @@ class Clearance(KeepsClear, Constraint):
 
 
 # The kernel: distances to obstacles minus the required distances. The robot is a point at its position, or a set of
-# parts: balls, or hulls of these. For parts, `value` and `slope` take the centres of all balls and their Jacobian in
-# place of state and control; see `augmented_lagrangian.py`.
+# parts: balls, or convex hulls of some of these. For parts, `value` and `slope` take the centres of all balls and their
+# Jacobian in place of state and control; see `augmented_lagrangian.py`.
 #
-# From AT on, `data` has the numbers below, then the margins and the tables, step by step. The last margins and the last
-# table hold from their step on. There is a row for each obstacle, first for the first part, then for the next. Its
-# margin has the index `row` modulo the number of margins per step. AT is 0 for a point. For balls, the entries before
-# AT are those that `places` reads.
+# From AT on, `data` has the numbers below; then the margins, step by step; then tables of obstacles, which may move,
+# step by step. The last margins and the last table hold from their step on. There is a row for each obstacle, first for
+# the first part, then for the next. Its margin has the index `row` modulo the number of margins per step. AT is 0 for a
+# point. For balls, the entries before AT are those that `places` reads.
 AT = 0
 # From there on: numbers of steps with margins, of margins at a step, of obstacles, and of steps with a table of these;
 # then the radius of each part, or of the point; for hulls the first ball of each, and the end of the last.
@@ -120,7 +124,7 @@ AXES = (0, 1, 2)  # states that are the position of a point; two in a plane, wit
 
 
 def value(x, u, t, row, data):
-    """The distance of one part to one obstacle, minus its radius and the margin."""
+    """The distance from one part to one obstacle, minus the part's radius and the margin."""
     part, steps, each = part_of(row, data), int(data[AT + STEPS]), int(data[AT + EACH])
     least = data[AT + RADII + part] + data[margins_from() + min(t, steps - 1) * each + row % each]
     if HULLS:
@@ -162,7 +166,7 @@ def place(x, row, data):
 
 
 def part_of(row, data):
-    """The number of the part that a row is about; 0 for a point."""
+    """The index of a row's part; 0 for a point."""
     return row // int(data[AT + OBSTACLES]) if BALLS else 0
 
 
