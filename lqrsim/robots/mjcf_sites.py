@@ -39,7 +39,7 @@ from lqrsim.scenes.world import SPACE
 
 
 class _Pose:
-    """The desired position (3,) and orientation (4,) of a site, checked; `what` names them in messages."""
+    """The desired position (3,), orientation (4,), or both of a site, checked; `what` is the class for messages."""
 
     def __init__(self, what: str, site: str, position: npt.ArrayLike | None, orientation: npt.ArrayLike | None) -> None:
         self.what, self.site = what, check_text(f"{what}: site", site, "the name of a site", at_most=1000)
@@ -61,7 +61,7 @@ class _Pose:
         return f"{self.site!r}{placed}{turned}"
 
     def bind(self, dynamics: Dynamics) -> Residual:
-        """The errors, for a system. Raises InputError."""
+        """The errors of the pose as functions of the state. Raises InputError if the dynamics have no such site."""
         if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
             raise InputError(f"{self.what}: got {dynamics.name}, want the dynamics of an MjcfRobot")
         model = mjcf_dynamics.physics.model
@@ -78,7 +78,9 @@ class _Pose:
 
 
 class SiteCost(Cost):
-    """`1/2 weight |place - position|^2 + 1/2 turn_weight |angle|^2` of a site of a robot from an MJCF.
+    """`1/2 weight |p - position|^2 + 1/2 turn_weight |r|^2` of a site of a robot from an MJCF.
+
+    p is the position of the site, and r the rotation vector from the desired orientation to the site's.
 
         ls.SiteCost("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0), weight=1e4, turn_weight=1e3)
 
@@ -86,8 +88,8 @@ class SiteCost(Cost):
 
     Args:
       position: (3,) the desired position in the world, in metres; None for any.
-      orientation: (4,) the desired orientation in the world, as a quaternion (w, x, y, z); None for any. The angle is
-        that of the rotation from the desired orientation, less than half a turn.
+      orientation: (4,) the desired orientation in the world, as a quaternion (w, x, y, z); None for any. |r| is the
+        angle of the rotation, less than half a turn.
       weight: weight of the position error: one number, or one per world axis, (3,).
       turn_weight: weight of the orientation error: one number, or one per axis of the desired orientation, (3,).
     """
@@ -111,9 +113,9 @@ class SiteCost(Cost):
         return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        errors, (placed, turned) = self.pose.bind(dynamics), self.weights
-        used = [placed] if self.pose.position is not None else []
-        weights = np.concatenate([*used, *([turned] if self.pose.axes is not None else [])])
+        errors, (of_position, of_turn) = self.pose.bind(dynamics), self.weights
+        used = [of_position] if self.pose.position is not None else []
+        weights = np.concatenate([*used, *([of_turn] if self.pose.axes is not None else [])])
         return CostTerm.of_residual(errors, source_of(__name__, AT=errors.numbers), weights)
 
 
@@ -151,10 +153,10 @@ class SiteConstraint(Constraint):
         )  # fmt: skip
 
 
-# The kernel: the errors of position and orientation. `data` has the address that `mjcf_dynamics.py` calls p, the site's
-# body, its position and axes (3 x 3) in the body's axes, and the desired position and axes; for a cost, from AT on a
-# weight for each row. The rows are three for the position, in world axes; or three for the rotation vector from the
-# desired axes to the site's; or both.
+# The kernel: the errors of position and orientation. `data` has the address of the numbers p of an `MjcfPhysics`; the
+# site's body; its position and axes (3 x 3) in the body's axes; and the desired position and axes. For a cost, from AT
+# on, it has a weight for each row. The rows are three for the position, in world axes; or three for the rotation vector
+# from the desired axes to the site's, in the desired axes; or both.
 AT = 0
 PLACED = 1  # whether there are rows of the position
 TURNED = 1  # whether there are rows of the orientation
@@ -162,7 +164,7 @@ BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # layout of data
 
 
 def residual(x, data, out):
-    """Write the rows."""
+    """Write the errors, a row each."""
     p = at(data[0])
     slot = claim_slot(p)
     arrays, point = at(p[SLOTS] + 8 * SLOT * slot), stack(3)
@@ -173,7 +175,7 @@ def residual(x, data, out):
 
 
 def residual_jacobian(x, data, out, slopes):
-    """Write the rows and their derivatives in the states (any, N), which are zero on entry."""
+    """Write the errors, and their derivatives in the states (rows, N), which are zero on entry."""
     p = at(data[0])
     slot, nv, body = claim_slot(p), int(p[NV]), int(data[BODY])
     arrays, point, moves, turns = at(p[SLOTS] + 8 * SLOT * slot), stack(3), stack(3 * N), stack(3 * N)
@@ -202,7 +204,7 @@ def residual_jacobian(x, data, out, slopes):
 
 
 def write_errors(arrays, data, out, point):
-    """Write the rows, and the position of the site, for an MjData with computed positions."""
+    """Write the errors, and the position of the site as `point`, after MuJoCo's kinematics."""
     body = int(data[BODY])
     origins, axes = at(arrays[XPOS]), at(arrays[XMAT])
     for i in range(3):
@@ -212,17 +214,17 @@ def write_errors(arrays, data, out, point):
         if PLACED:
             out[i] = point[i] - data[WANTED + i]
     if TURNED:
-        turned, own, first = stack(3, 3), stack(3, 3), 3 * PLACED
-        clear(own, 3, 3)
+        site_axes, turned, first = stack(3, 3), stack(3, 3), 3 * PLACED
+        clear(site_axes, 3, 3)
         clear(turned, 3, 3)
         for i in range(3):
             for j in range(3):
                 for k in range(3):
-                    own[i, j] += axes[9 * body + 3 * i + k] * data[AXES + 3 * k + j]
+                    site_axes[i, j] += axes[9 * body + 3 * i + k] * data[AXES + 3 * k + j]
         for i in range(3):
             for j in range(3):
                 for k in range(3):
-                    turned[i, j] += data[WANTED_AXES + 3 * k + i] * own[k, j]
+                    turned[i, j] += data[WANTED_AXES + 3 * k + i] * site_axes[k, j]
         out[first] = 0.5 * (turned[2, 1] - turned[1, 2])
         out[first + 1] = 0.5 * (turned[0, 2] - turned[2, 0])
         out[first + 2] = 0.5 * (turned[1, 0] - turned[0, 1])
@@ -236,7 +238,7 @@ def write_errors(arrays, data, out, point):
 
 
 def write_inverse(out, first, inverse):
-    """Write the matrix from an angular velocity in the wanted axes to the rate of the rotation vector."""
+    """Write the matrix from an angular velocity in the desired axes to the rate of the rotation vector."""
     a, b, c = out[first], out[first + 1], out[first + 2]
     square = a * a + b * b + c * c
     ratio = cotangent_ratio(square)
