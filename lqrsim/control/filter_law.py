@@ -1,4 +1,4 @@
-"""A Kalman filter with the law that follows its estimates: matrices about a plan, runs of K trials, and the export.
+"""A Kalman filter with the law that acts on its estimates: matrices about a plan, runs of K trials, and the export.
 
 A run predicts with the nonlinear dynamics. The export, an `OutputFeedbackPolicy`, is linear about the plan.
 """
@@ -29,7 +29,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A filter with the law that follows it, or with C laws."""
+    """A filter with the law that acts on its estimates, or with C laws to choose from, for deviations from the plan."""
 
     model: PlanModel
     filter: KalmanFilter
@@ -47,7 +47,7 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class FilterLaw:
-    """A filter and the law `u = gain z + offset` of its estimates z, about one plan."""
+    """A chosen `Design` for a run: the filter, and the law `u = gain z + offset` of its estimates z, about one plan."""
 
     plan: Plan
     model: PlanModel
@@ -58,13 +58,13 @@ class FilterLaw:
     nominal: Array  # (T+1, Z), z in an undisturbed run
 
     @classmethod
-    def of(cls, plan: Plan, design: Design, granted: Array | None = None) -> "FilterLaw":
-        """The law about the model's plan. `granted` are the unknowns' states (D,) that it assumes; 0 by default."""
+    def of(cls, plan: Plan, design: Design, in_plan: Array | None = None) -> "FilterLaw":
+        """The law about a plan. `in_plan` are the unknowns' states (D,) with which it was planned; 0 by default."""
         model, (gain, offset) = design.model, design.laws
         trajectory = model.plan
-        granted = np.zeros(len(model.transition)) if granted is None else granted
-        # From deviations to the filter's own numbers.
-        unknowns = np.tile(granted, (trajectory.steps + 1, 1))
+        in_plan = np.zeros(len(model.transition)) if in_plan is None else in_plan
+        # From deviations to the filter's estimates themselves.
+        unknowns = np.tile(in_plan, (trajectory.steps + 1, 1))
         nominal = np.concatenate([trajectory.states, model.reached, unknowns], axis=1)
         offset = trajectory.controls + offset - np.einsum("tij,tj->ti", gain, nominal[:-1])
         return cls(plan, model, design.filter, design.weights, in_c_order(gain), offset, nominal)
@@ -85,8 +85,8 @@ class FilterRun(ControllerRun):
         # If the first measurement is lost, it counts as the plan's first state.
         self._last_measured = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
-        self._differences = np.empty((trials, law.model.sensor.size))
-        self._wider = np.ones(trials)  # see `correct`
+        self._innovation = np.empty((trials, law.model.sensor.size))
+        self._limit_factors = np.ones(trials)  # factors on the limits of corrections; see `kernels/estimation.py`
         shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
         self.estimates, self.innovations = (np.full((*shape, size), np.nan) if record else None for size in sizes)
         self._limits = Limits(*law.plan.policy.control_coordinates.limits)
@@ -115,12 +115,12 @@ class FilterRun(ControllerRun):
         self._last_measured[:] = measured
         model.compiled.correct(
             self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
-            law.filter.gain[knot], law.filter.limit[knot], self._wider, model.compiled_sensor, model.turning,
-            self.z, self._differences,
+            law.filter.gain[knot], law.filter.limit[knot], self._limit_factors, model.compiled_sensor, model.turning,
+            self.z, self._innovation,
         )  # fmt: skip
         at = step - self._latency
         if self.estimates is not None and self.innovations is not None and at < len(self.estimates):
-            self.estimates[at], self.innovations[at] = self.z, self._differences
+            self.estimates[at], self.innovations[at] = self.z, self._innovation
 
     def command(self, step: int) -> Array:
         """The controls of a step, after its measurement was used."""
@@ -154,14 +154,14 @@ class ReplannedRun(ControllerRun):
 
     At each check of the rule, the law is simulated with the model, from the estimated state and with the unknown
     constants at their estimated values. If that run collides or misses the goal, or `always`, the rest of the horizon
-    is solved from that state, and law and filter are recomputed about the new plan. Otherwise a new plan would do harm:
-    it would have a lower cost, and go as close to obstacles as its constraints permit. The estimates continue
+    is solved from that state, and law and filter are recomputed about the new plan. A law that still leads to the goal
+    stays: a new plan would cost less, but go as close to obstacles as its constraints permit. The estimates continue
     unchanged, and the law acts on their difference from the values that the new plan assumes. Some disturbances are
     left to the law: gusts, because they pass and plans do not model them; and gains and offsets of the controls and the
     lag of the actuators, which are no parameters of the model. A solve takes no time in the simulation.
 
     Attributes:
-      plans: plans of each trial, by the step at which they begin; without the first plan.
+      plans: the new plans of each trial, by the step at which they begin.
       estimates, innovations: as in `FilterRun`.
     """
 
@@ -215,11 +215,11 @@ class ReplannedRun(ControllerRun):
         n, done = model.n, step - run.first
         # The unknowns' states that are constant to the end of the horizon and change only parameters.
         on_controls = (model.output[len(model.parameters) :] != 0).any(axis=0)
-        known = (model.output != 0).any(axis=0) & ~on_controls
+        modelled = (model.output != 0).any(axis=0) & ~on_controls
         for unknown, states in zip(model.remembered, model.own_states, strict=True):
-            known[list(states)] &= unknown.constant
-        granted = np.where(known, z[n + model.lagging :], 0.0)
-        changes = model.output[: len(model.parameters)] @ granted
+            modelled[list(states)] &= unknown.constant
+        in_plan = np.where(modelled, z[n + model.lagging :], 0.0)
+        changes = model.output[: len(model.parameters)] @ in_plan
         values = {
             name: float(model.dynamics.parameters[name] + change)
             for name, change in zip(model.parameters, changes, strict=True)
@@ -232,7 +232,7 @@ class ReplannedRun(ControllerRun):
             return
         # In that model the actuators have no lag, gains or offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
-        fixed = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
+        fixed = np.concatenate([reached, np.tile(in_plan, (len(gain), 1))], axis=1)
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
         gain = in_c_order(gain[:, :, :n])
@@ -249,7 +249,7 @@ class ReplannedRun(ControllerRun):
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         weights = replace(law.weights, emphasis=None)  # that of another plan
-        run.law, run.first = FilterLaw.of(solution, Design.of(about, kalman, weights), granted), step
+        run.law, run.first = FilterLaw.of(solution, Design.of(about, kalman, weights), in_plan), step
 
 
 def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
@@ -259,8 +259,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     periods, z is k periods behind, and the law acts on the prediction of z with the commands since, which is linear.
     """
     model, plan = law.model, law.model.plan
-    late, steps, m = model.uncertainty, plan.steps, model.m
-    latency, delay = late.latency, late.delay
+    steps, m, latency, delay = plan.steps, model.m, model.uncertainty.latency, model.uncertainty.delay
     size, width = model.size, model.size + (latency + delay) * m
     F, G, nominal = model.F, model.G, law.nominal
     f = nominal[1:] + model.c - np.einsum("tij,tj->ti", F, nominal[:-1]) - np.einsum("tij,tj->ti", G, plan.controls)
@@ -292,7 +291,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
         arrays["nominal"][t, :size] = nominal[knot]
         places = np.clip(t + delay - np.arange((latency + delay), 0, -1), 0, steps - 1)
         arrays["nominal"][t, size:] = plan.controls[places].ravel()
-        _advance({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
+        _write_step({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
     return OutputFeedbackPolicy(
         **arrays, dt=plan.dt, state_coordinates=law.plan.policy.state_coordinates,
         control_coordinates=law.plan.policy.control_coordinates,
@@ -300,17 +299,17 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     )  # fmt: skip
 
 
-def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, started: bool) -> None:
+def _write_step(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, started: bool) -> None:
     """Write one period's transition, input and drift. Without `started`, z waits for the first measurement."""
-    (F, G, f), m, late = step, now["input"].shape[1], len(now["drift"]) > size
+    (F, G, f), m, under_way = step, now["input"].shape[1], len(now["drift"]) > size
     now["transition"][:size, :size] = np.eye(size)
     if started:
         now["transition"][:size, :size], now["drift"][:size] = F, f
-        if late:  # the oldest command acts
+        if under_way:  # the oldest command acts
             now["transition"][:size, size : size + m] = G
         else:
             now["input"][:size] = G
-    if late:  # all commands move up, and the new one is the last
+    if under_way:  # all commands move up, and the new one is the last
         count = len(now["drift"]) - size - m
         now["transition"][size : size + count, size + m :] = np.eye(count)
         now["input"][-m:] = np.eye(m)
