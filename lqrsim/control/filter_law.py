@@ -71,7 +71,7 @@ class FilterLaw:
 
 
 class FilterRun(ControllerRun):
-    """K trials of a run, with their estimates z (K, Z) at the knot of the newest measurement.
+    """A run of `OffsetFree` with K trials: their estimates z (K, Z) at the knot of the newest measurement.
 
     If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
     commands since, to the time at which the next command acts. The law's plan begins at the step `first`.
@@ -150,7 +150,7 @@ class FilterRun(ControllerRun):
 
 
 class ReplannedRun(ControllerRun):
-    """A run in which each trial has its own law, about a new plan if the law no longer leads to the goal.
+    """A run of `OffsetFree(..., replan_every=...)`: each trial has its own law, about a new plan if that is needed.
 
     At each check of the rule, the law is simulated with the model, from the estimated state and with the unknown
     constants at their estimated values. If that run collides or misses the goal, or `always`, the rest of the horizon

@@ -221,9 +221,10 @@ class ClosedLoop:
     Attributes:
       starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
         which they begin. Both are for `simulate_from`.
-      acting: the disturbances, each `Noise` as a StateNoise.
+      acting: the disturbances, each `Noise` as a StateNoise. law: the controller, by default the plan's policy.
       whole: the plan's trajectory from its own first knot on.
-      followed: the plan of the run: the given one, or else the controller's own; from the knot on.
+      followed: the plan of the run: the given one, or else the controller's own; from the knot on. trajectory: its
+        trajectory.
       state_coordinates, control_coordinates: those of the controller, with limits within the robot's limits.
       step: number of the next control period. measured: (K, n), the measured states at its beginning.
       controller_run: the run of the controller.
@@ -295,7 +296,7 @@ class ClosedLoop:
             self._readings = Readings(sensors, self.effects, self.physics, dt)
 
     def run(self) -> Rollout:
-        """Run all control periods; fewer if all trials have ended."""
+        """Run all control periods; fewer if all trials have ended. Then maybe another loop: see `_undisturbed`."""
         steps = self.trajectory.steps
         with unlogged():
             self.begin()

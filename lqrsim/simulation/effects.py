@@ -87,7 +87,7 @@ class Effects:
         return states
 
     def alter_models(self, physics: AnyPhysics) -> bool:
-        """Alter the models of the trials, and return whether there is anything to alter; `prepare` must follow."""
+        """Alter the models of the trials; return whether anything was altered, for `prepare`, which must follow."""
         for name, effect in self._effects:
             for parameter, factors in (effect.factors or {}).items():
                 columns = len(physics.plant.actuators) if parameter == "thrust" else 1
