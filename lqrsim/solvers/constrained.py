@@ -91,13 +91,13 @@ class ConstrainedRun:
     def _attempts(self) -> Iterator[RunResult | None]:
         """The results of the attempts, each of which is made when it is asked for; None if it has none."""
         run, budget, start, hard = self._run, self._budget, self._start, not self._elastic
-        from_start, known = self._untried, tuple(multipliers.values for multipliers in self._guess.multipliers)
+        from_start, multipliers = self._untried, tuple(record.values for record in self._guess.multipliers)
         if self._guess.interior is not None:  # of the search for a free duration: it is only finished
             yield self._remember(self._point.finish(self._guess.interior))
         if budget.over:
             return
-        if any(values.any() for values in known):  # the plan of another solution, with its multipliers
-            yield self._interior(copied(start), WEAK, multipliers=known)
+        if any(values.any() for values in multipliers):  # the plan of another solution, with its multipliers
+            yield self._interior(copied(start), WEAK, multipliers=multipliers)
         if self._stay and self._guided:
             with budget.limited(REFINED):
                 result = damped_from_rollout(run)

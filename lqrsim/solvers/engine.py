@@ -156,8 +156,8 @@ class SolveRun:
     Attributes:
       initial_guess: the start. work: the memory. budget: the iterations and the time. entry: the compiled function.
       ending: the state of smoothing or iLQR; the outcome is RUNNING until it has ended.
-      second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
-        the smoothing before it; see `SmootherSettings`.
+      second_order: whether Newton's method, or with constraints the interior point, ends the solve. final, rough: the
+        tolerances of the answer, and of the smoothing before it; see `SmootherSettings`.
     """
 
     def __init__(

@@ -94,7 +94,10 @@ Finish = Callable[[SolveRun, Known], RunResult]
 
 
 def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
-    """Solve one problem; the solution can look at its plan between the knots."""
+    """Solve one problem; the solution can look at its plan between the knots.
+
+    The loops that a problem needs are nested here, the innermost first: each solves problems with the one before.
+    """
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
     solve_part: Callable[..., Solution] = partial(solve_fixed, stop=stop)
@@ -321,7 +324,7 @@ class Search:
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         with self._problem.dynamics.solving(self._solving):
-            self.run()
+            self.finish_promising()
             self.try_finite()
             if self.needs_others and self.is_barred:
                 self.try_past_constraints()
@@ -333,8 +336,8 @@ class Search:
                 self.try_sinusoidal_controls()
         return self.best
 
-    def run(self) -> None:
-        """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
+    def finish_promising(self) -> None:
+        """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
         chosen, *others = choose([run for _, run in self._named], self._threads)
         chosen = self._smooth_or_follow_a_line(chosen)
         self._offer(chosen, self._finish(chosen))
