@@ -78,7 +78,7 @@ def run_campaign(
         stack.enter_context(_resumable(folder, campaign.scenario))
         _write_or_check_manifest(campaign, folder, deterministic)
         results = Results(folder, scenario=campaign.scenario)
-        results.campaign = campaign
+        results.campaign = campaign  # `results.trials` then runs its trials, with the solutions of the folder
         unfinished = _unfinished(results)
         if unfinished:
             if others := changed(results.manifest["versions"]):

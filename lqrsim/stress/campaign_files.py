@@ -77,7 +77,7 @@ else:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-Table = dict[str, npt.NDArray[np.generic]]
+Columns = dict[str, npt.NDArray[np.generic]]  # of the table of a shard, by name
 _KEY = b"lqrsim shard"
 _TEXTS = "outcome", "obstacle", "reason"
 _TYPES = dict.fromkeys((*COLUMNS, "reason"), pa.float64()) | {"trial": pa.int64()} | dict.fromkeys(_TEXTS, pa.string())
@@ -89,7 +89,7 @@ class Damaged(Exception):
     """The exception for a file that differs from what was written."""
 
 
-def pack(table: Table, shard: Shard, campaign: str) -> bytes:
+def pack(table: Columns, shard: Shard, campaign: str) -> bytes:
     """Encode a table as a file; `campaign` is the digest of its campaign."""
     about = _about(shard, campaign)
     meta = json.dumps(about | {"sha256": _digest(table, about)}).encode()
@@ -99,7 +99,7 @@ def pack(table: Table, shard: Shard, campaign: str) -> bytes:
     return file.getvalue()
 
 
-def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
+def unpack(contents: bytes, shard: Shard, campaign: str) -> Columns:
     """Decode a table. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
     about = _about(shard, campaign)
     try:
@@ -116,7 +116,7 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
             raise ValueError("columns of different lengths")
         meta = json.loads((file.schema_arrow.metadata or {})[_KEY])
         numbers = file.read([name for name in _TYPES if name not in _TEXTS], use_threads=False)
-        table: Table = {name: numbers[name].to_numpy() for name in _TYPES if name not in _TEXTS}
+        table: Columns = {name: numbers[name].to_numpy() for name in _TYPES if name not in _TEXTS}
         for name in _TEXTS:
             table[name] = _texts(file, name, max(group[[*_TYPES].index(name)].size for group in groups))
         table = {name: table[name] for name in _TYPES}
@@ -136,7 +136,7 @@ def write(contents: bytes, path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def read(path: Path, shard: Shard, campaign: str) -> Table:
+def read(path: Path, shard: Shard, campaign: str) -> Columns:
     """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
     if not os.path.isfile(path):
         raise Damaged("it is no regular file")
@@ -165,7 +165,7 @@ def _texts(file: pq.ParquetFile, name: str, size: int) -> npt.NDArray[np.str_]:
     return np.array(column, dtype=np.str_)
 
 
-def _digest(table: Table, about: Mapping[str, Any]) -> str:
+def _digest(table: Columns, about: Mapping[str, Any]) -> str:
     parts: list[str | bytes] = [json.dumps(about)]
     for name, column in table.items():
         text = column.dtype.kind == "U"

@@ -24,7 +24,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.analysis import COLUMNS, Outcomes, outcomes
-from lqrsim.stress.campaign_files import SOLUTION_FILE, Damaged, Table, digest_of_solution, read, read_manifest
+from lqrsim.stress.campaign_files import SOLUTION_FILE, Columns, Damaged, digest_of_solution, read, read_manifest
 from lqrsim.stress.data_table import DataTable, Entry, fraction_format
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS, make_controller
 from lqrsim.stress.statistics import CONFIDENCE
@@ -68,11 +68,11 @@ class Trials:
         for cell in filters[:1]:  # its filter is also compiled
             simulate(self.plant, self.solutions[cell.policy], controller=self._controller(cell), **options)
 
-    def table(self, shard: Shard, batch: int) -> Table:
+    def table(self, shard: Shard, batch: int) -> Columns:
         """The rows of a shard, simulated in batches. If a batch fails, its trials are run again one by one."""
         cell = self.campaign.cells[shard.cell]
         last = shard.first + shard.count
-        parts: list[Table] = []
+        parts: list[Columns] = []
         for first in range(shard.first, last, batch):
             count = min(batch, last - first)
             rows = self._rows(cell, first, count)
@@ -80,7 +80,7 @@ class Trials:
             parts += [self._rows(cell, trial, 1) for trial in range(first, first + count)] if alone else [rows]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def _rows(self, cell: Cell, first: int, count: int) -> Table:
+    def _rows(self, cell: Cell, first: int, count: int) -> Columns:
         try:
             rollout = self.run(cell, first, count, frames=False, contacts=False)
             table = outcomes(rollout, self.scenario.problem).columns()
@@ -104,9 +104,9 @@ class Trials:
         return self._controllers[key]
 
 
-def failed_rows(first: int, count: int, reason: str) -> Table:
+def failed_rows(first: int, count: int, reason: str) -> Columns:
     """The rows of trials that could not be run: errors with this reason."""
-    columns: Table = dict.fromkeys(COLUMNS, np.full(count, np.nan))
+    columns: Columns = dict.fromkeys(COLUMNS, np.full(count, np.nan))
     columns |= {"trial": np.arange(first, first + count), "outcome": np.full(count, "error")}
     return columns | {"obstacle": np.full(count, ""), "reason": np.full(count, reason)}
 
@@ -333,13 +333,13 @@ class Results:
         return self.folder / "shards" / shard.file
 
     @checked
-    def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[Table]:
+    def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[Columns]:
         """The tables of a cell, shard by shard: name -> column. If `partial`, shards that are missing are skipped."""
         for shard in self.shards(cell):
             if self.path(shard).is_file() or not partial:
                 yield self.table(shard)
 
-    def table(self, shard: Shard) -> Table:
+    def table(self, shard: Shard) -> Columns:
         """The rows of a shard."""
         path = self.path(shard)
         if not path.is_file():
