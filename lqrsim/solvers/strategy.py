@@ -307,19 +307,19 @@ class Search:
                 self.try_detours()
             self.leave_saddles()
         if self._default and self.may_go_on and self._unmoved():
-            self.move()
+            self.push_and_approach()
         if self.risked_too_much:
             with self._problem.dynamics.solving(self._solving):
                 self.retry_without_risk()
         if self.may_soften:
-            self.soften()
+            self.soften_contacts()
         if self.has_left_given:
-            self.keep()
+            self.keep_given()
         if self.may_go_on and not self.best[1].success:
-            self.alternate()
+            self.alternate_softness()
         if self.is_beside_cheaper:
             with self._problem.dynamics.solving(self._solving):
-                self.leave_modes()
+                self.leave_contact_modes()
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
@@ -560,7 +560,7 @@ class Search:
                 return True
         return False
 
-    def move(self) -> None:
+    def push_and_approach(self) -> None:
         """Begin with motions that change states that miss their goal and that no control changes, as of a box.
 
         These are pushes by one control at a time, and approaches to a body that nothing touches.
@@ -641,7 +641,7 @@ class Search:
             or reach.goal_left(self._problem, best, given)
         )
 
-    def keep(self) -> None:
+    def keep_given(self) -> None:
         """Descend from the plan that the caller gave; return it, if none is better."""
         (run, best), given = self.best, self._given
         assert given is not None
@@ -678,7 +678,7 @@ class Search:
         # Of plans whose risk is too high, this one is near an optimum.
         self._offer(run, result, better=result.rank <= self.best[1].rank)
 
-    def soften(self) -> None:
+    def soften_contacts(self) -> None:
         """Plan for contacts and limits of decreasing softness, and then for the true ones.
 
         Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
@@ -707,7 +707,7 @@ class Search:
                 results[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
         self._stiffen(results, harder, [name], self._budget.left)
 
-    def alternate(self) -> None:
+    def alternate_softness(self) -> None:
         """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
 
         Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
@@ -739,7 +739,7 @@ class Search:
             return False
         return max(contacts.across, contacts.sampled) > run.final
 
-    def leave_modes(self) -> None:
+    def leave_contact_modes(self) -> None:
         """Descend from the best plan whatever its contact modes are."""
         run = self._add(guess_from(self.best[1], "the best plan"), "the best plan, out of its contact modes")
         with run.budget.limited(SOFT):
