@@ -138,7 +138,7 @@ def test_a_tube_ends_where_it_would_hide_the_picture(drive_solution: ls.Solution
     # One that is too wide from the first knot on leaves the plan alone.
     nothing = Ellipsoids.predicted(places, np.tile(1e6 * np.eye(2), (151, 1, 1)))
     assert nothing.outlines().shape == (0, 48, 2)
-    assert len(nothing.spread(10)) == 0
+    assert len(nothing.overlapping(np.arange(0), 10)) == 0
     axes = Figure().add_subplot()
     draw_tube(axes, nothing, nothing.label, face="b", edge="k")
     assert not [path for one in axes.collections for path in one.get_paths()]
@@ -153,7 +153,7 @@ def test_shadows_in_a_plane_are_marginals() -> None:
     ball = np.random.default_rng(0).normal(size=(200_000, 3))
     surface = (ball / np.linalg.norm(ball, axis=1, keepdims=True) * half_axes[0]) @ rotations[0].T
     onto = np.linalg.qr(np.array([[1.0, 2.0], [0.5, -1.0], [0.3, 0.7]]))[0].T
-    outline = solid.seen_in(onto).outlines()[0]
+    outline = solid.projected(onto).outlines()[0]
     for angle in np.linspace(0, np.pi, 7):
         look = np.array([np.cos(angle), np.sin(angle)])
         # 48 points see their farthest end within (pi / 48)^2 / 2 of it, 200,000 within a thousandth.

@@ -23,7 +23,7 @@ class Ellipsoids:
 
     centres: Array
     covariances: Array
-    end: float | None = None  # half axis in m at which the tube is cut off; None if it is whole
+    cut_at: float | None = None  # half axis in m at which the tube is cut off; None if it is whole
 
     @classmethod
     def predicted(cls, centres: Array, covariances: Array) -> "Ellipsoids":
@@ -45,7 +45,7 @@ class Ellipsoids:
     @property
     def label(self) -> str:
         """The label of a predicted tube in a legend."""
-        return PREDICTED if self.end is None else f"{PREDICTED}; drawn up to half axes of {self.end:.2g} m"
+        return PREDICTED if self.cut_at is None else f"{PREDICTED}; drawn up to half axes of {self.cut_at:.2g} m"
 
     def axes(self) -> tuple[Array, Array]:
         """Half axes (k, d), and rotations (k, d, d) whose columns are their directions."""
@@ -54,9 +54,9 @@ class Ellipsoids:
         rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
         return SIGMAS * np.sqrt(np.maximum(variances, 0.0)), rotations
 
-    def seen_in(self, onto: Array) -> "Ellipsoids":
+    def projected(self, onto: Array) -> "Ellipsoids":
         """Their projections onto a plane, whose axes are the rows of `onto` (2, d)."""
-        return Ellipsoids(self.centres @ onto.T, onto @ self.covariances @ onto.T, self.end)
+        return Ellipsoids(self.centres @ onto.T, onto @ self.covariances @ onto.T, self.cut_at)
 
     def outlines(self) -> Array:
         """Outlines (k, 48, 2) of ellipses."""
@@ -65,15 +65,15 @@ class Ellipsoids:
         circle = np.stack([np.cos(around), np.sin(around)], axis=-1)
         return self.centres[:, None, :] + np.einsum("kij,kj,pj->kpi", rotations, half_axes, circle)
 
-    def spread(self, most: int) -> npt.NDArray[np.int64]:
-        """Indices of ellipsoids that overlap to a tube of even depth: the first, the last and some in between."""
+    def overlapping(self, knots: npt.NDArray[np.int64], most: int) -> npt.NDArray[np.int64]:
+        """Knots whose ellipsoids overlap to a tube of even depth: the first, the last and some in between."""
         half_axes = self.axes()[0].mean(axis=1)
-        chosen = [0] if len(self.centres) else []
-        for knot in range(1, len(self.centres)):
+        chosen = list(knots[:1])
+        for knot in knots[1:]:
             before = chosen[-1]
             moved = np.linalg.norm(self.centres[knot] - self.centres[before])
             grown = abs(half_axes[knot] - half_axes[before])
-            if moved + grown >= APART * half_axes[knot] or knot == len(self.centres) - 1:
+            if moved + grown >= APART * half_axes[knot] or knot == knots[-1]:
                 chosen.append(knot)
         places = np.linspace(0, len(chosen) - 1, min(most, len(chosen))).astype(np.int64)
         return np.array(chosen, dtype=np.int64)[places]

@@ -123,9 +123,9 @@ class Views:
                 across, up = centre[along]
                 axes.add_patch(Circle((across, up), radius, facecolor=colour, edgecolor="none", zorder=2))
             for ellipsoids, label, face, edge in self.tubes:
-                draw_tube(axes, ellipsoids.seen_in(onto), label, face=face, edge=edge)
+                draw_tube(axes, ellipsoids.projected(onto), label, face=face, edge=edge)
             if self.certified is not None:
-                outlines = list(self.certified.seen_in(onto).outlines())
+                outlines = list(self.certified.projected(onto).outlines())
                 looks = {"facecolors": "none", "edgecolors": CERTIFIED, "linewidths": 1.6, "zorder": 2.8}
                 axes.add_collection(PolyCollection(outlines, label="certified", **looks))
             for path in self.paths:

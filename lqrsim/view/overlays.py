@@ -160,13 +160,13 @@ class Overlays:
         self.recorded, self.scale = recorded, scale
         self.membership: tuple[str, ...] | None = None  # in the funnel, for each of T+1 steps as text
         self._lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
-        self._funnel = None if "funnel" not in show else self._checked(funnel)
-        self.drawables = [*self._draw(show, solution, segments), *self._moving()]  # in the order of the legend
+        # In the order of the legend.
+        self.drawables = [*self._draw(show, solution, funnel, segments), *self._moving()]
 
     def readings(self, time: float, speed: float = 1.0) -> list[str]:
         """Time, error, clearance and force at a time, and whether the run is in the funnel or has ended."""
         recorded = self.recorded
-        clearance, error = (recorded.interpolate(values, time) for values in (recorded.clearance, recorded.error))
+        clearance, error = (np.interp(time, recorded.times, values) for values in (recorded.clearance, recorded.error))
         texts = [f"time {time:.1f} s" + (f" at {speed:g}x" if speed != 1 else "")]
         if recorded.rollout.tracking_unit == OF_RANGE:
             texts.append(f"tracking error {100 * error:.1f} % of range")
@@ -180,7 +180,9 @@ class Overlays:
             texts.append(self.membership[recorded.step(time)])
         return texts + ([ending.replace("_", " ")] if (ending := recorded.ending(time)) else [])
 
-    def _draw(self, show: Sequence[Overlay], solution: Solution | None, segments: int) -> Iterator[Drawable]:
+    def _draw(
+        self, show: Sequence[Overlay], solution: Solution | None, funnel: Funnel | None, segments: int
+    ) -> Iterator[Drawable]:
         """The overlays but texts, in the order of the legend."""
         recorded, run, planar, lift = self.recorded, self.recorded.rollout, self.recorded.planar, self._lift
         knots = np.unique(np.linspace(0, run.plan.steps, min(run.plan.steps, segments) + 1).astype(int))
@@ -188,7 +190,8 @@ class Overlays:
         tube = None
         if "tube" in show and run.tube is not None and run.tube.max() >= 1e-12:
             ellipsoids = Ellipsoids.predicted(run.plan.states[:, position], run.tube)
-            tube = self._joined("tube", colour_of("tube"), ellipsoids.label, ellipsoids, height=0.6)
+            every = np.arange(len(ellipsoids.centres))
+            tube = self._overlapping("tube", colour_of("tube"), ellipsoids.label, ellipsoids, every, height=0.6)
         width = 0.0035 * recorded.model.stat.extent * (1.0 if tube is None else SLIM)
 
         def profile(relative: float) -> tuple[float, float]:  # on a floor, lines are flat
@@ -201,17 +204,18 @@ class Overlays:
             label, longest = f"force, longest {self.scale.force:.2g} N", ARROW * gap
             thick, for_newton = max(0.1 * gap, 1.5 * width), longest / self.scale.force
             yield Arrow("forces", opaque("forces"), label, recorded.force, gap, thick, for_newton)
-        points = recorded.measured_places() + 3 * lift
-        if "measured" in show and len(points) and not np.array_equal(recorded.measured, recorded.states):
+        if "measured" in show and position and not np.array_equal(recorded.measured, recorded.states):
+            points = run.in_world(recorded.measured[:, position], height=recorded.floor) + 3 * lift
             sizes, seconds = (width, *profile(1.0)), DOTS * run.plan.dt
             yield Dots("measured", opaque("measured"), "measured", points, recorded.times, sizes, seconds)
         if tube is not None:
             yield tube
         if "cost_tube" in show:
-            ellipsoids = self._of_cost(solution)
-            yield self._joined("cost_tube", colour_of("cost_tube"), OF_COST, ellipsoids, height=0.3)
-        if self._funnel is not None:
-            yield from self._draw_funnel(self._funnel)
+            ellipsoids, colour = self._of_cost(solution), colour_of("cost_tube")
+            every = np.arange(len(ellipsoids.centres))
+            yield self._overlapping("cost_tube", colour, OF_COST, ellipsoids, every, height=0.3)
+        if "funnel" in show:
+            yield from self._draw_funnel(funnel)
         if "trace" in show:
             errors, full = np.interp(times, recorded.times, recorded.error), self.scale.error
             end = f"{1e3 * full:g} mm" if full < 1 else f"{full:g} m"
@@ -247,16 +251,13 @@ class Overlays:
             raise InputError("solution: got a plan other than the run's, want the Solution that was run")
         return Ellipsoids.of_cost(solution, run.state_coordinates.position)
 
-    def _checked(self, funnel: Funnel | None) -> Funnel:
-        if funnel is None:
-            raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
-        if not np.array_equal(funnel.plan.states, self.recorded.rollout.plan.states):
-            raise InputError("funnel: got a funnel about another plan, want a funnel about the plan of the run")
-        return funnel
-
-    def _draw_funnel(self, funnel: Funnel) -> Iterator[DrawnTube]:
+    def _draw_funnel(self, funnel: Funnel | None) -> Iterator[DrawnTube]:
         """The projection of a funnel onto the position, from its first knot to its last, wherever it has a level."""
         run, planar = self.recorded.rollout, self.recorded.planar
+        if funnel is None:
+            raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
+        if not np.array_equal(funnel.plan.states, run.plan.states):
+            raise InputError("funnel: got a funnel about another plan, want a funnel about the plan of the run")
         covariances = funnel.position_covariance / SIGMAS**2  # gives the half axes at the level
         ellipsoids = Ellipsoids(run.plan.states[:, list(run.state_coordinates.position)], covariances)
         levels, knots = np.array([funnel.level(t) for t in run.times]), np.arange(len(run.times))
@@ -272,36 +273,28 @@ class Overlays:
             certified = certified[np.linspace(0, len(certified) - 1, min(MOST_ELLIPSOIDS, len(certified))).astype(int)]
             label = f"funnel: {100 * funnel.rate:g} % succeed, confidence {100 * funnel.confidence:g} %"
             rgba = (*colour_of("funnel"), CERTIFIED_OPACITY[planar])
-            yield DrawnTube("funnel", rgba, label, *self._in_world(ellipsoids, certified, 0.2))
+            yield self._tube("funnel", rgba, label, ellipsoids, certified, height=0.2)
         if len(between):
-            opacity, label = INTERPOLATED_OPACITY, "funnel, interpolated"
-            yield self._joined("interpolated", INTERPOLATED, label, ellipsoids, between, height=0.1, opacity=opacity)
+            look = {"height": 0.1, "opacity": INTERPOLATED_OPACITY}
+            yield self._overlapping("interpolated", INTERPOLATED, "funnel, interpolated", ellipsoids, between, **look)
 
-    def _joined(
-        self,
-        name: str,
-        colour: Colour,
-        label: str,
-        ellipsoids: Ellipsoids,
-        among: npt.NDArray[np.int64] | None = None,
-        *,
-        height: float,
-        opacity: Mapping[bool, float] = TUBE_OPACITY,
-    ) -> DrawnTube:
-        """Some of the ellipsoids, of those `among` the knots. If they overlap, their joint opacity is about this."""
-        among = np.arange(len(ellipsoids.centres)) if among is None else among
-        part = Ellipsoids(ellipsoids.centres[among], ellipsoids.covariances[among])
-        chosen = part.spread(MOST_ELLIPSOIDS)
-        apart = np.linalg.norm(np.diff(part.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)
-        overlap = 2 * float(part.axes()[0][chosen].mean()) / apart if apart > 0 else 1.0
+    def _overlapping(
+        self, name: str, colour: Colour, label: str, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], *,
+        height: float, opacity: Mapping[bool, float] = TUBE_OPACITY,
+    ) -> DrawnTube:  # fmt: skip
+        """The ellipsoids at some of the knots. Where they overlap, their joint opacity is about this."""
+        knots = ellipsoids.overlapping(knots, MOST_ELLIPSOIDS)
+        apart = np.linalg.norm(np.diff(ellipsoids.centres[knots], axis=0), axis=1).sum() / max(len(knots) - 1, 1)
+        overlap = 2 * float(ellipsoids.axes()[0][knots].mean()) / apart if apart > 0 else 1.0
         # Ellipsoids that hardly overlap must not be too opaque: they would show as stripes on the lines within.
         alpha = 1 - (1 - opacity[self.recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
-        return DrawnTube(name, (*colour, float(alpha)), label, *self._in_world(ellipsoids, among[chosen], height))
+        return self._tube(name, (*colour, float(alpha)), label, ellipsoids, knots, height=height)
 
-    def _in_world(
-        self, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], height: float
-    ) -> tuple[npt.NDArray[np.int64], Array, Array, Array]:
-        """Knots, centres, half axes and rotations of the ellipsoids, at this height above a floor in units of LIFT."""
+    def _tube(
+        self, name: str, rgba: tuple[float, float, float, float], label: str, ellipsoids: Ellipsoids,
+        knots: npt.NDArray[np.int64], *, height: float,
+    ) -> DrawnTube:  # fmt: skip
+        """The ellipsoids at these knots in the world, at this height above a floor in units of LIFT."""
         space = self.recorded.rollout.state_coordinates
         size, count = len(space.position), len(knots)
         lengths, turns = (part[knots] for part in ellipsoids.axes())
@@ -311,7 +304,7 @@ class Overlays:
         if size == 2:  # the third axis of a flat ellipsoid
             rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
         centres = space.in_world(ellipsoids.centres[knots], height=self.recorded.floor) + height * self._lift
-        return knots, centres, half_axes, rotations
+        return DrawnTube(name, rgba, label, knots, centres, half_axes, rotations)
 
 
 def colour_of(overlay: Overlay) -> Colour:

@@ -91,11 +91,6 @@ class RecordedTrial:
         """Planned places at these times, (..., 3)."""
         return self._between(self.rollout.planned_places, self.rollout.times, at)
 
-    def measured_places(self) -> Array:
-        """The positions (k, 3) as measured; none for a robot without a position."""
-        places = self.measured[:, list(self.rollout.state_coordinates.position)]
-        return self._between(places, self.times, self.times) if places.size else np.zeros((0, 3))
-
     @property
     def ghost_radius(self) -> float:
         """The radius in metres of the ball at the planned place: that of the robot, or of an arm's last ball."""
@@ -116,10 +111,6 @@ class RecordedTrial:
     def step(self, time: float) -> int:
         """The number of the control period that a time is in; at the end of the plan, the number of periods."""
         return min(int(time / self.rollout.plan.dt + 1e-9), self.rollout.plan.steps)
-
-    def interpolate(self, values: Array, time: float) -> float:
-        """The value of `error` or `clearance` at a time."""
-        return float(np.interp(time, self.times, values))
 
     def ending(self, time: float) -> str:
         """The event that ended the trial before this time, as text; empty if there was none."""

@@ -202,7 +202,6 @@ def use_rollout(rollout: ls.Rollout) -> None:
     recorded = RecordedTrial(rollout, 0)
     for look in (recorded.driven, recorded.planned, recorded.force_at, recorded.ending):
         look(recorded.end / 2)
-    recorded.interpolate(recorded.error, recorded.end)
 
 
 def originals() -> dict[str, ls.Solution | ls.Rollout]:
