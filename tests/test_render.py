@@ -525,7 +525,7 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
         ({"overlays": ("plan", "glost")}, r"overlays\[1\]: got 'glost', want one of: .*did you mean ghost"),
         ({"quality": "good"}, "quality: got 'good', want one of: draft, standard, publication"),
         ({"titles": ("one", "two")}, "titles: got 2, want one for each of 1 runs"),
-        ({"trial": ()}, "runs: got 0 to show, want 1 to 6"),
+        ({"trial": ()}, "trial: got none, want 1 to 6"),
         ({"speed": 0}, "speed: got 0, want"),
         ({"trial": 1}, "trial: got 1, want one of 0 to 0"),
         ({"fps": 0}, "fps: got 0, want"),

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import checked
-from lqrsim.errors import Array, InputError, check_items, check_path, excerpt
+from lqrsim.errors import Array, InputError, check_path, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
@@ -39,7 +39,7 @@ from lqrsim.view.overlays import (
     error_colours,
     legend_entries,
 )
-from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms, in_bytes, quaternion_of
+from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms, in_bytes, quaternion_of, rows_of
 
 ASPECTS = 1.6, 0.6  # of a screen and of a telephone; the page begins with the overview for the nearer one
 LEVELS = np.iinfo(np.uint16).max
@@ -97,12 +97,7 @@ def _rows(rollout: Rollout, trial: int | Sequence[int] | None) -> list[Any]:
         if not rows:
             raise InputError("rollout: got no trial with a finite state, want one that can be drawn")
         return rows
-    if not isinstance(trial, Sequence) or isinstance(trial, str):
-        return [trial]
-    rows = check_items("trial", trial, object, f"1 to {rollout.trials} of them", at_most=rollout.trials)
-    if not rows:
-        raise InputError(f"trial: got none, want 1 to {rollout.trials} of them")
-    return list(rows)
+    return rows_of(trial, rollout.trials)
 
 
 class _Arrays:
@@ -151,7 +146,7 @@ def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
         "extent": float(recorded.model.stat.extent),
         "middle": np.mean(recorded.planned(run.times), axis=0).tolist(),
         "views": [_view(recorded, aspect) for aspect in ASPECTS],
-        "errors": in_bytes(error_colours(np.linspace(0, 1, SHADES))),
+        "errors": in_bytes(error_colours(np.linspace(0, 1, SHADES))[:, :3]),
         "tubes": [],
         "bodies": [],
     }
@@ -179,9 +174,9 @@ def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
 def _of_line(arrays: _Arrays, line: Line) -> dict[str, Any]:
     described: dict[str, Any] = {"points": arrays.rounded(line.points), "width": 2 * line.profile[0]}
     if line.times is not None and line.colours is not None:
-        colours = arrays.exact(in_bytes(line.colours), "uint8")
+        colours = arrays.exact(in_bytes(line.colours[:, :3]), "uint8")
         return described | {"times": arrays.exact(line.times, "float32"), "colours": colours}
-    return described | {"colour": in_bytes([line.rgba])[0]}
+    return described | {"colour": in_bytes(line.rgba[:3])}
 
 
 def _of_geom(arrays: _Arrays, geom: DrawnGeom) -> dict[str, Any]:
@@ -230,7 +225,7 @@ def _of_trial(arrays: _Arrays, overlays: Overlays, geoms: Sequence[DrawnGeom]) -
                 trial["measured"] = {
                     "times": arrays.exact(part.times, "float32"),
                     "points": arrays.rounded(part.points),
-                    "colour": in_bytes([part.rgba])[0],
+                    "colour": in_bytes(part.rgba[:3]),
                     "width": 2 * part.half_sizes[0],
                     "seconds": part.seconds,
                 }

@@ -20,7 +20,7 @@ from lqrsim.view.cameras import CameraView, camera_view
 from lqrsim.view.captions import Caption, Legend, Pixels
 from lqrsim.view.options import OVERLAYS, Box, Quality, side_by_side, split_into_panes
 from lqrsim.view.overlays import Arrow, Overlays, Shown, common_scale
-from lqrsim.view.recorded_trial import RecordedTrial
+from lqrsim.view.recorded_trial import RecordedTrial, rows_of
 from lqrsim.view.video_metadata import Pane
 
 FADED_OPACITY = 0.10  # opacity of a geom that hides the robot
@@ -220,11 +220,10 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
     ]
     titles = _one_each("titles", options.titles or None, recordings)
     gl.bind()
-    legend, captions = None, [None] * len(recordings)
-    if "caption" in options.overlays:
-        legend = Legend(overlays, (width, height))
+    legend = Legend(overlays, (width, height)) if "caption" in options.overlays else None
     boxes = side_by_side(len(recordings), (width, height - (0 if legend is None else legend.height)))
-    if "caption" in options.overlays:
+    captions = [None] * len(recordings)
+    if legend is not None:
         captions = [Caption(*run, options.speed) for run in zip(overlays, boxes, titles, strict=True)]
     strip = max(0 if caption is None else caption.height for caption in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
@@ -318,17 +317,12 @@ def _runs_and_trials(
 ) -> tuple[list[Rollout], list[tuple[int, int]]]:
     """The rollouts, each once, and the run and trial of each part of the picture."""
     if isinstance(runs, Rollout):
-        rows: tuple[Any, ...] = (trial,)
-        if isinstance(trial, Sequence) and not isinstance(trial, str):
-            rows = check_items("trial", trial, object, f"1 to {MOST_RUNS} of them", at_most=MOST_RUNS)
-        distinct, shown = [runs], [(0, row) for row in rows]
-    else:
-        wanted = f"a Rollout, or 1 to {MOST_RUNS} of them"
-        distinct = list(check_items("runs", runs, Rollout, wanted, at_most=MOST_RUNS))
-        shown = list(enumerate(_one_each("trial", trial, distinct)))
-    if not 1 <= len(shown) <= MOST_RUNS:
-        raise InputError(f"runs: got {len(shown)} to show, want 1 to {MOST_RUNS}")
-    return distinct, shown
+        return [runs], [(0, row) for row in rows_of(trial, MOST_RUNS)]
+    wanted = f"a Rollout, or 1 to {MOST_RUNS} of them"
+    distinct = list(check_items("runs", runs, Rollout, wanted, at_most=MOST_RUNS))
+    if not distinct:
+        raise InputError(f"runs: got 0 to show, want 1 to {MOST_RUNS}")
+    return distinct, list(enumerate(_one_each("trial", trial, distinct)))
 
 
 def _one_each(field: str, values: Any, of: Sequence[object]) -> list[Any]:

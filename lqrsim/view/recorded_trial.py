@@ -2,14 +2,16 @@
 
 import copy
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Index, checked
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_items
 from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
 from lqrsim.scenes.mjcf_text import model_from_xml
@@ -275,6 +277,16 @@ def quaternion_of(rotation: Array) -> Array:
     return quaternion
 
 
-def in_bytes(colours: npt.ArrayLike) -> list[list[int]]:
-    """Red, green and blue (k, 3) in bytes, of colours (k, 3 or 4) from numbers between 0 and 1."""
-    return np.round(255 * np.asarray(colours, dtype=np.float64)[:, :3]).astype(int).tolist()
+def in_bytes(colours: npt.ArrayLike) -> list[Any]:
+    """Colours (..., c) from numbers between 0 and 1, in bytes."""
+    return np.round(255 * np.clip(colours, 0, 1)).astype(int).tolist()
+
+
+def rows_of(trial: int | Sequence[int], most: int) -> list[Any]:
+    """The rows that `trial` names: one, or 1 to `most`. Raises InputError for another number of them."""
+    if not isinstance(trial, Sequence) or isinstance(trial, str):
+        return [trial]
+    rows = check_items("trial", trial, object, f"1 to {most} of them", at_most=most)
+    if not rows:
+        raise InputError(f"trial: got none, want 1 to {most} of them")
+    return list(rows)

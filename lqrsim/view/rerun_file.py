@@ -18,7 +18,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.options import Overlay
 from lqrsim.view.overlays import Arrow, Dots, Drawable, DrawnTube, Line, MovingBody, Overlays, colour_of, common_scale
-from lqrsim.view.recorded_trial import RecordedTrial, Triangles, drawn_geoms, quaternion_of
+from lqrsim.view.recorded_trial import RecordedTrial, Triangles, drawn_geoms, in_bytes, quaternion_of
 
 TIMELINE = "time"
 GHOST_OPACITY = 0.6  # of a ball without shading
@@ -80,7 +80,7 @@ class _Recording:
                 self._log(entity, self.rerun.Transform3D(translation=places[0][i], quaternion=turns[0][i]))
 
     def _shape(self, kind: str, size: Array, colour: npt.ArrayLike, triangles: Triangles | None = None) -> Any:
-        rerun, colours = self.rerun, [_bytes(colour)]
+        rerun, colours = self.rerun, [in_bytes(colour)]
         solid = {"colors": colours, "fill_mode": "solid"}
         if kind == "plane":
             return rerun.Boxes3D(half_sizes=[[*size[:2], FLAT]], centers=[[0, 0, -FLAT]], **solid)
@@ -102,12 +102,12 @@ class _Recording:
         rerun, entity = self.rerun, ["world", *ENTITIES.get(drawable.name, [drawable.name])]
         match drawable:
             case Line():
-                colour, thin = _bytes(drawable.rgba), 0.002 * self.recorded.model.stat.extent
+                colour, thin = in_bytes(drawable.rgba), 0.002 * self.recorded.model.stat.extent
                 self._log(entity, rerun.LineStrips3D([drawable.points], colors=[colour], radii=[thin]))
             case Dots():
                 self._points(entity, drawable.times, drawable.points, drawable.rgba, drawable.half_sizes[0])
             case MovingBody(name="ghost"):
-                colour = (*colour_of("ghost"), GHOST_OPACITY)
+                colour = (*drawable.rgba[:3], GHOST_OPACITY)
                 self._points(entity, drawable.times, drawable.places, colour, drawable.size[0])
             case MovingBody():
                 self._log(entity, self._shape(drawable.kind, drawable.size, drawable.rgba))
@@ -117,14 +117,14 @@ class _Recording:
                 self._send(entity, times, pose)
             case DrawnTube():
                 ellipsoids = self._ellipsoids(drawable.centres, drawable.half_axes, drawable.rotations)
-                self._log(entity, rerun.Ellipsoids3D(**ellipsoids, colors=[_bytes(drawable.rgba[:3])]))
+                self._log(entity, rerun.Ellipsoids3D(**ellipsoids, colors=[in_bytes(drawable.rgba[:3])]))
             case Arrow():
                 times = self.recorded.times[self.recorded.times < self.recorded.end]
                 forces = np.array([self.recorded.force_at(float(time)) for time in times])
                 arrows = rerun.Arrows3D.columns(
                     vectors=forces * drawable.metres_per_newton,
                     origins=self.recorded.driven(times),
-                    colors=[_bytes(drawable.rgba)] * len(times),
+                    colors=[in_bytes(drawable.rgba)] * len(times),
                 )
                 self._send(entity, times, arrows)
 
@@ -136,7 +136,7 @@ class _Recording:
             plan = self.recorded.planned(run.times)
             half_axes, rotations = Ellipsoids(plan, axes.T @ run.tube @ axes).axes()
             ellipsoids = self._ellipsoids(plan, np.maximum(half_axes, FLAT), rotations)
-            columns = self.rerun.Ellipsoids3D.columns(**ellipsoids, colors=[_bytes(colour_of("tube"))] * len(plan))
+            columns = self.rerun.Ellipsoids3D.columns(**ellipsoids, colors=[in_bytes(colour_of("tube"))] * len(plan))
             self._send(["world", "tube"], run.times, columns)
 
     def draw_numbers(self) -> None:
@@ -162,7 +162,9 @@ class _Recording:
 
     def _points(self, entity: list[str], times: Array, points: Array, colour: npt.ArrayLike, radius: float) -> None:
         count = len(points)
-        columns = self.rerun.Points3D.columns(positions=points, colors=[_bytes(colour)] * count, radii=[radius] * count)
+        columns = self.rerun.Points3D.columns(
+            positions=points, colors=[in_bytes(colour)] * count, radii=[radius] * count
+        )
         self._send(entity, times, columns)
 
     @staticmethod
@@ -176,10 +178,6 @@ class _Recording:
     def _send(self, entity: list[str], times: Array, columns: Any) -> None:
         path, index = self.rerun.new_entity_path(entity), self.rerun.TimeColumn(TIMELINE, duration=times.tolist())
         self.rerun.send_columns(path, [index], columns, recording=self.stream)
-
-
-def _bytes(colour: npt.ArrayLike) -> list[int]:
-    return np.round(255 * np.clip(colour, 0, 1)).astype(int).tolist()
 
 
 def _scalar_last(rotation: Array) -> Array:
