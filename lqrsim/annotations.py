@@ -32,6 +32,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import (
     LARGEST_COUNT,
+    LARGEST_SEED,
     InputError,
     brief,
     check_count,
@@ -51,7 +52,6 @@ Sizes = dict[str, int]
 T = TypeVar("T")
 
 LINE = 1000  # characters of a name or another line
-LARGEST_SEED = 2**128 - 1
 
 
 class Bounds(NamedTuple):
@@ -351,9 +351,14 @@ def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) 
         expected = name if isinstance(name, int) else size if name == "_" else sizes.setdefault(name, size)
         fits = fits and size == expected and size >= 0
     if not fits:
-        known = [_length_of(letter, before) for letter in letters.split()]
-        meaning = "" if known == letters.split() else f" = ({', '.join(known)})"
-        raise InputError(f"{field}: got shape {shape}, want ({', '.join(letters.split())}){meaning}")
+        named = letters.split()
+        # The length that a letter stands for, such as 151 for T+1; the letter itself if its size is unknown.
+        known = [
+            str(before[name] + more) if isinstance(name, str) and name in before else letter
+            for letter, (name, more) in zip(named, _lengths(letters), strict=True)
+        ]
+        meaning = "" if known == named else f" = ({', '.join(known)})"
+        raise InputError(f"{field}: got shape {shape}, want ({', '.join(named)}){meaning}")
 
 
 @cache
@@ -361,12 +366,6 @@ def _lengths(letters: str) -> tuple[tuple[str | int, int], ...]:
     """The letter of each length, or the length itself, and what is added to it."""
     parts = (letter.partition("+") for letter in letters.split())
     return tuple((int(name) if name.isdecimal() else name, int(more or 0)) for name, _, more in parts)
-
-
-def _length_of(letter: str, sizes: Sizes) -> str:
-    """The length that a letter stands for, such as 151 for T+1; the letter itself if its size is unknown."""
-    name, _, more = letter.partition("+")
-    return str(sizes[name] + int(more or 0)) if name in sizes else letter
 
 
 def _check_length(field: str, length: int, letter: str, sizes: Sizes) -> None:

@@ -35,6 +35,7 @@ _ADDRESS = re.compile(r" at 0x[0-9A-Fa-f]+")
 _OBJECT = re.compile(r"<(?:[\w.]|<locals>)*?(\w+) object>")
 _LARGE = 10**7  # entries above which the memory for an array is checked first
 LONGEST = 1010  # largest number of characters of a message
+LARGEST_SEED = 2**128 - 1
 LARGEST_COUNT = 10**9  # limit of counts without their own limit: a longer loop takes more than a day
 
 
@@ -115,11 +116,11 @@ def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ..
 
 def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
     """`value` as a float64 array of any shape, NaN included; copied only if necessary. Raises InputError."""
-    done = type(value) is np.ndarray and value.dtype == np.float64
-    if done and value.size > _LARGE:  # pyright: ignore[reportAttributeAccessIssue]
-        # A broadcast array takes little memory, but arrays made from it take all.
-        check_memory(field, value.size, 32, "arrays made from it")  # pyright: ignore[reportAttributeAccessIssue]
-    return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
+    if type(value) is not np.ndarray or value.dtype != np.float64:
+        return numbers_of(field, value, want)
+    if value.size > _LARGE:  # a broadcast array takes little memory, but arrays made from it take all
+        check_memory(field, value.size, 32, "arrays made from it")
+    return value
 
 
 def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> Array:
@@ -202,7 +203,7 @@ def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = 
 
 def check_seed(field: str, value: object) -> int:
     """`value` as an int >= 0 of at most 128 bits. Raises InputError otherwise."""
-    return check_count(field, value, at_least=0, at_most=2**128 - 1)
+    return check_count(field, value, at_least=0, at_most=LARGEST_SEED)
 
 
 def check_memory(field: str, count: int, each: int, what: str = "whose arrays") -> None:

@@ -129,7 +129,7 @@ def render(
     funnel: Funnel | Sequence[Funnel | None] | None = None,
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
-    fps: float | None = None,
+    fps: Annotated[float, Bounds(at_least=0.1, at_most=240)] | None = None,
     speed: Annotated[float, Bounds(at_least=1e-3, at_most=1000)] = 1.0,
     time: float | None = None,
     every: float | None = None,
@@ -166,8 +166,7 @@ def render(
     still, animated = kind == ".png", kind == ".gif"
     if not still and (time is not None or every is not None):
         raise InputError(f"time, every: got {excerpt(path.name)}, want FILE.png: they belong to stills")
-    fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
-    rate = Fraction(fps).limit_denominator(1001)
+    rate = Fraction((15 if animated else 30) if fps is None else fps).limit_denominator(1001)
     if animated and size is None:
         width, height = (side // 2 for side in QUALITIES[quality].size)
         size = max(width, SMALLEST_GIF[0]), max(height, SMALLEST_GIF[1])
