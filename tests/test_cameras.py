@@ -38,7 +38,7 @@ def rollout(request: pytest.FixtureRequest) -> ls.Rollout:
 def test_projection_is_where_mujoco_draws(kind: str, size: tuple[int, int], rollout: ls.Rollout) -> None:
     gl.bind()
     aspect = size[0] / size[1]
-    camera = TILTED if kind == "tilted" else getattr(cameras, kind)(rollout, aspect)
+    camera = TILTED if kind == "tilted" else cameras.calibrated(kind, rollout, aspect)
     # A cross of balls over the picture, at different depths, which an orthographic picture does not show.
     across, depth = np.array([[0, 0], [0.4, 0.1], [-0.45, 0.3], [0.2, -0.45], [-0.3, -0.4]]), [10, 7, 12, 9, 15]
     right, up = camera.axes
@@ -78,7 +78,7 @@ def test_measure_is_the_inverse_of_project() -> None:
 def test_fixed_cameras_see_the_whole_run(aspect: float, rollout: ls.Rollout) -> None:
     size = (round(1000 * aspect), 1000)
     position = list(rollout.state_coordinates.position)
-    for camera in (cameras.top(rollout, aspect), cameras.side(rollout, aspect)):
+    for camera in (cameras.calibrated("top", rollout, aspect), cameras.calibrated("side", rollout, aspect)):
         for states in (rollout.plan.states, *rollout.states):
             places = np.zeros((len(states), 3))
             places[:, : len(position)] = states[:, position]
@@ -100,7 +100,7 @@ def test_fixed_cameras_see_all_balls_of_a_robot(aspect: float, seed: int, rollou
     driven[0, 40:] = np.nan
     balls = BallRecord(planned=planned, driven=driven, radii=radii, anchors=np.full((3, 4), np.nan))
     long, size = dataclasses.replace(rollout, balls=balls), (round(1000 * aspect), 1000)
-    for camera in (cameras.top(long, aspect), cameras.side(long, aspect)):
+    for camera in (cameras.calibrated("top", long, aspect), cameras.calibrated("side", long, aspect)):
         for centres in (planned, *driven):
             pixels, margin = camera.project(centres, size), radii[:, None] / camera.height * 1000
             shown = np.isfinite(centres).all(axis=2)
@@ -111,14 +111,14 @@ def test_fixed_cameras_see_all_balls_of_a_robot(aspect: float, seed: int, rollou
 def test_a_diverged_trial_does_not_hide_the_others(rollout: ls.Rollout) -> None:
     states = rollout.states.copy()
     states[0, 40:] = np.nan
-    assert np.isfinite(cameras.top(dataclasses.replace(rollout, states=states)).position).all()
+    assert np.isfinite(cameras.calibrated("top", dataclasses.replace(rollout, states=states)).position).all()
 
 
 def metadata(rollout: ls.Rollout) -> VideoMetadata:
     mark = mark_radius(RecordedTrial(rollout, 0))
     panes = (
-        Pane(0, 0, 320, 240, camera=cameras.top(rollout)),
-        Pane(320, 0, 320, 240, trial=1, camera=cameras.side(rollout)),
+        Pane(0, 0, 320, 240, camera=cameras.calibrated("top", rollout)),
+        Pane(320, 0, 320, 240, trial=1, camera=cameras.calibrated("side", rollout)),
         Pane(0, 240, 640, 240),
     )
     return VideoMetadata((digest(rollout),), (mark,), Fraction(30000, 1001), 0.5, 3, panes)
@@ -181,7 +181,7 @@ def test_digest_tells_runs_apart(rollout: ls.Rollout) -> None:
 def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: ls.Rollout) -> None:
     """In its colour to the last bit, in light and shade, before the sky and behind beams."""
     gl.bind()
-    camera, size, mark = getattr(cameras, kind)(rollout), (640, 480), mark_radius(RecordedTrial(rollout, 0))
+    camera, size, mark = cameras.calibrated(kind, rollout), (640, 480), mark_radius(RecordedTrial(rollout, 0))
     model = mujoco.MjModel.from_xml_string(rollout.model)
     model.vis.quality.offsamples = 0
     data = mujoco.MjData(model)

@@ -257,7 +257,7 @@ def test_the_figures_show_the_cut(flown, tmp_path: Path) -> None:
 def test_pixels_tell_where_a_planar_quadrotor_is(flown, tmp_path: Path) -> None:
     _, solution, rollout = flown
     assert cameras.measuring(rollout.plane) == ("side",)
-    assert abs(cameras.side(rollout).forward[1]) == 1
+    assert abs(cameras.calibrated("side", rollout).forward[1]) == 1
     found = ls.verify_run(rollout, solution=solution)
     assert found.passed, found
     video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10, solution=solution)

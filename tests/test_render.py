@@ -112,7 +112,7 @@ def test_obstacles_that_move_are_drawn_where_they_are(
     plant = ls.scenarios.differential_drive().plant()
     run = ls.simulate(plant, drive_solution, moving=moving, contacts=False)
     run = ls.load(ls.save(run, tmp_path / "run.npz"), ls.Rollout)
-    camera = cameras.top(run)
+    camera = cameras.calibrated("top", run)
     options: dict = {"camera": "top", "overlays": (), "size": (640, 480), "quality": "draft"}
     for time in (0.0, 5.0):
         both = [

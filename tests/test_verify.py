@@ -346,7 +346,7 @@ def verified_as_rod(
     """
     model = checks.drawable_model(run, 0)
     geom, pixel = checks._tracked_geom(model, model.body(run.body).id), 0.0
-    for view in (cameras.top(run), cameras.side(run)):
+    for view in (cameras.calibrated("top", run), cameras.calibrated("side", run)):
         pixel = max(pixel, view.height / checks.SIZE[1])
     turn = np.array([1.0, 0, 1, 0]) if seed is None else np.random.default_rng(seed).normal(size=4)
     model.geom_type[geom], model.geom_quat[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, turn / np.linalg.norm(turn)
@@ -503,6 +503,6 @@ def test_the_marks_middle_is_found_between_pixels(centre: tuple[float, float]) -
 
 
 def test_cameras_of_a_robot_in_the_plane_see_it_from_above(case: Case) -> None:
-    views = [cameras.side(case.run)]
+    views = [cameras.calibrated("side", case.run)]
     with pytest.raises(ls.InputError, match="views: got side, want"):
         checks.triangulate(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)

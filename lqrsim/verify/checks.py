@@ -24,7 +24,7 @@ from lqrsim.verify.verdict import Criterion, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.geoms import RIM
-from lqrsim.view.recorded_trial import model_of, place_in, robot_body
+from lqrsim.view.recorded_trial import model_of, place_of, robot_body, tracked_balls
 from lqrsim.view.video_metadata import Pane
 
 
@@ -61,7 +61,8 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
     """Positions (N, d) of the robot's body from the frames, which are denser than the states."""
     good = np.isfinite(rollout.frames[trial]).all(axis=1)
     body = robot_body(model, rollout.body)
-    places = [place_in(data, rollout, body).copy() for data in posed(model, rollout.frames[trial, good])]
+    balls = tracked_balls(rollout)
+    places = [place_of(data, body, balls).copy() for data in posed(model, rollout.frames[trial, good])]
     return positions_at(rollout.frame_times[good], rollout.of_world(places), times)
 
 
@@ -122,13 +123,12 @@ def verify_run(
     """
     model = drawable_model(rollout, trial)
     body, place = robot_body(model, rollout.body), None
-    if rollout.balls is not None and not rollout.state_coordinates.position:
-        body, place = rollout.balls.tracked
+    if (balls := tracked_balls(rollout)) is not None:
+        body, place = balls.tracked
     geom = _tracked_geom(model, body, place)
     times, rows = frames_at_states(rollout, trial)
     box = _corners(model, geom, rollout.frames[trial, rows])
-    makers = {"top": cameras.top, "side": cameras.side}
-    views = [makers[name](rollout, around=box) for name in cameras.measuring(rollout.plane)]
+    views = [cameras.calibrated(name, rollout, around=box) for name in cameras.measuring(rollout.plane)]
     measured: list[Array] = []
     offsets: list[Array] = []
     thickness, curved = _thickness(model, geom, rollout.frames[trial, rows], views)
@@ -252,7 +252,7 @@ def _silhouettes(
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
                 masks.append(renderer.render()[..., 0] > 0)
-            yield masks, data.geom_xpos[geom] - place_in(data, rollout, body)
+            yield masks, data.geom_xpos[geom] - place_of(data, body, tracked_balls(rollout))
 
 
 FEWEST_PIXELS = 20  # of the tracked object; with fewer, the centre is too uncertain

@@ -16,11 +16,12 @@ from lqrsim.annotations import Finite, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
-from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial
+from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial, tracked_balls
 
 Vector = tuple[Finite, Finite, Finite]
 
-NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so a wide range loses no precision
+# Depths in m that are drawn. The depth buffer is linear in an orthographic view, so a wide range loses no precision.
+CLIPPING = 0.01, 1000.0
 
 
 @checked
@@ -49,7 +50,7 @@ class Camera:
         for camera in scene.camera:
             camera.pos, camera.forward, camera.up = self.position, self.forward, self.up
             camera.orthographic = 1
-            camera.frustum_near, camera.frustum_far, camera.frustum_center = NEAR, FAR, 0
+            camera.frustum_near, camera.frustum_far, camera.frustum_center = *CLIPPING, 0
             camera.frustum_bottom, camera.frustum_top = -0.5 * self.height, 0.5 * self.height
             camera.frustum_width = 0.5 * self.height * aspect
 
@@ -64,35 +65,30 @@ class Camera:
         return self.axes @ self.position + off * (self.height / size[1])
 
 
-def top(rollout: Rollout, aspect: float = 4 / 3, *, around: Array | None = None) -> Camera:
-    """A camera above that shows the plan and all trials with a margin, and points (k, 3) `around` them."""
+def calibrated(name: str, rollout: Rollout, aspect: float = 4 / 3, *, around: Array | None = None) -> Camera:
+    """The camera `top` or `side`, which shows the plan and all trials with a margin, and points (k, 3) `around` them.
+
+    `side` is level, and has the longer horizontal side across the picture.
+    """
     low, high = _bounds(rollout, around)
-    right = _right(high - low, aspect)
-    return _camera("top", low, high, right, np.cross([0.0, 0.0, 1.0], right), aspect)
-
-
-def side(rollout: Rollout, aspect: float = 4 / 3, *, around: Array | None = None) -> Camera:
-    """A level camera at the side that shows the same, with the longer horizontal side across the picture."""
-    low, high = _bounds(rollout, around)
-    plane = rollout.plane
-    level = plane.replace("z", "")
-    # A vertical plane is seen at a right angle.
-    right = np.eye(3)["xyz".index(level)] if len(level) == 1 else _right(high - low, 1.0)
-    return _camera("side", low, high, right, np.array([0.0, 0.0, 1.0]), aspect)
-
-
-def measuring(plane: str) -> tuple[str, ...]:
-    """Those of the cameras `top` and `side` that together measure positions along these axes of the world."""
-    return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
-
-
-def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect: float) -> Camera:
-    span, forward = high - low, np.cross(up, right)
+    span, vertical = high - low, np.array([0.0, 0.0, 1.0])
+    level = rollout.plane.replace("z", "")
+    if name == "top":
+        right = _right(span, aspect)
+        up = np.cross(vertical, right)
+    else:  # a vertical plane is seen at a right angle
+        right, up = np.eye(3)["xyz".index(level)] if len(level) == 1 else _right(span, 1.0), vertical
+    forward = np.cross(up, right)
     height = max(float(abs(up) @ span), float(abs(right) @ span) / aspect)
     # Far enough back that all surroundings are in front of it.
     position = 0.5 * (low + high) - (10 + 5 * float(span.max())) * forward
     vectors = (tuple(vector.tolist()) for vector in (position, forward, up))
     return Camera(name, *vectors, height=height)
+
+
+def measuring(plane: str) -> tuple[str, ...]:
+    """Those of the cameras `top` and `side` that together measure positions along these axes of the world."""
+    return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
 
 
 def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array]:
@@ -101,18 +97,16 @@ def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array
     A robot of several balls counts with all of them. The points `around` (k, 3) need no margin.
     """
     places = np.vstack([rollout.planned_places, *(rollout.places(trial) for trial in range(rollout.trials))])
-    if rollout.balls is not None and not rollout.state_coordinates.position:
-        places = np.vstack([rollout.balls.planned.reshape(-1, 3), rollout.balls.driven.reshape(-1, 3)])
+    if (balls := tracked_balls(rollout)) is not None:
+        places = np.vstack([balls.planned.reshape(-1, 3), balls.driven.reshape(-1, 3)])
     low, high = (rollout.in_world(extreme(places, axis=0)) for extreme in (np.nanmin, np.nanmax))
-    beyond = 0.05 * float((high - low).max())
-    margin = rollout.radius + beyond
+    padding = 0.05 * float((high - low).max())
+    margin = rollout.radius + padding
     corners = np.vstack([low - margin, high + margin, *([] if around is None else [around])])
     if rollout.balls is not None:  # they may reach farther than the radius
-        centres, radii = (
-            np.vstack([rollout.balls.planned[None], rollout.balls.driven]),
-            beyond + rollout.balls.radii[:, None],
-        )
-        corners = np.vstack([corners, *(part.reshape(-1, 3) for part in (centres - radii, centres + radii))])
+        centres = np.vstack([rollout.balls.planned[None], rollout.balls.driven])
+        radii = padding + rollout.balls.radii[:, None]
+        corners = np.vstack([corners, (centres - radii).reshape(-1, 3), (centres + radii).reshape(-1, 3)])
     return np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
 
 
@@ -153,7 +147,7 @@ def camera_view(
     if name in CALIBRATED:
         runs = {id(trial.rollout): trial.rollout for trial in alike}
         corners = np.vstack([corner for run in runs.values() for corner in _bounds(run)])
-        camera = (top if name == "top" else side)(recorded.rollout, aspect, around=corners)
+        camera = calibrated(name, recorded.rollout, aspect, around=corners)
         return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
     if name == "chase":
         return _chase(recorded)

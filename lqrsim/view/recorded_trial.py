@@ -104,7 +104,7 @@ class RecordedTrial:
 
     def place_in(self, data: mujoco.MjData) -> Array:
         """Place (3,) of the robot in the posed model."""
-        return place_in(data, self.rollout, self.robot)
+        return place_of(data, self.robot, tracked_balls(self.rollout))
 
     def force_at(self, time: float) -> Array:
         """The recent disturbing force (3,) in N."""
@@ -135,8 +135,8 @@ def model_of(rollout: Rollout, trial: Index) -> mujoco.MjModel:
     if not rollout.plane:
         wanted = "the 2 or 3 states that are the position, or a run of a robot with balls that has frames"
         raise InputError(f"state_coordinates.position: got none, want {wanted}")
-    if rollout.balls is not None and not rollout.state_coordinates.position:
-        _ = rollout.balls.tracked  # raises an exception if no site is named
+    if (balls := tracked_balls(rollout)) is not None:
+        _ = balls.tracked  # raises an exception if no site is named
     model = copy.copy(_compiled(rollout.model))
     hide_hulls(model)
     robot_body(model, rollout.body)
@@ -250,13 +250,13 @@ def drawn_size(model: mujoco.MjModel, rollout: Rollout, robot: int) -> float:
     return reach if 0 < ARMS * reach < rollout.radius else rollout.radius
 
 
-def place_in(data: mujoco.MjData, rollout: Rollout, robot: int) -> Array:
-    """Place (3,) of the robot: the origin of its body; without a position, its last ball."""
-    return place_of(data, robot, None if rollout.state_coordinates.position else rollout.balls)
+def tracked_balls(rollout: Rollout) -> BallRecord | None:
+    """The balls of a robot without a position, the last of which stands for it; None for other robots."""
+    return None if rollout.state_coordinates.position else rollout.balls
 
 
 def place_of(data: mujoco.MjData, robot: int, balls: BallRecord | None) -> Array:
-    """The origin (3,) of a body, or the position of the last ball, by its site."""
+    """Place (3,) of a robot: the origin of its body, or its last ball, by its site."""
     if balls is None:
         return data.xpos[robot]
     body, place = balls.tracked
