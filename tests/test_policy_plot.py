@@ -15,7 +15,7 @@ from sampling import rarely
 import lqrsim as ls
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.figure_parts import NEAR, draw_projected, draw_tube
+from lqrsim.view.figure_parts import CLOSE, draw_projected, draw_tube
 from lqrsim.view.plots import draw_policy, strength
 from lqrsim.view.style import MARGIN
 
@@ -254,7 +254,7 @@ def test_without_a_radius_no_place_is_grey_and_the_plan_is_within_the_axes(
     for radius, figure in figures.items():
         draw_policy(figure, drive_solution, seen, radius)
         axes = figure.axes[0]
-        assert (NEAR in axes.get_legend_handles_labels()[1]) == (world and radius > 0)
+        assert (CLOSE in axes.get_legend_handles_labels()[1]) == (world and radius > 0)
         (low, high), plan = np.array([axes.get_xlim(), axes.get_ylim()]).T, drive_solution.trajectory.states[:, :2]
         assert (low < plan.min(axis=0)).all()
         assert (plan.max(axis=0) < high).all()
@@ -274,7 +274,7 @@ def test_obstacles_cast_the_shadow_of_their_shape() -> None:
 
     def shadow(across: int, up: int) -> np.ndarray:
         axes = Figure().add_subplot()
-        draw_projected(axes, ls.World([box]), low, high, across, up)
+        draw_projected(axes, ls.World([box]), low, high, [across, up])
         (patch,) = axes.patches
         return np.asarray(patch.get_path().vertices)
 

@@ -32,19 +32,19 @@ EMPTY = 0.05  # margin around what is drawn at least, relative to its extent
 LEAST = 1e-6  # smallest chance that is drawn
 SLENDER = 4.0  # the longer side of a view relative to the shorter one, at most: an alley of 60 m would be a line
 STRETCHED = 1.3  # by which the shorter side is stretched at least, if it is
-FLAT = 0.2  # way along an axis that counts for the margin at least, relative to the longest
-NOTHING = 0.5  # m around a plan that stays at a place, if the robot has no radius
+LEAST_WAY = 0.2  # way along an axis that counts for the margin at least, relative to the longest
+MARGIN_AT_REST = 0.5  # m around a plan that stays at a place, if the robot has no radius
 CELLS = 200  # across a view, of the grid on which obstacles' outlines are found
 RINGS = np.array([-1.1, -1.0, -0.8, 0.0, 0.8, 1.0, 1.1])  # grid lines through a small obstacle, in its half sizes
-NEAR = "closer than the robot's radius"
+CLOSE = "closer than the robot's radius"
 MOVED_COLOUR = "#a6761d"  # colour of what a run moved
 LEAST_MOTION = 0.01  # way of an object that counts as moved, relative to the extent of the robot's
 SHAPES = "sphere", "capsule", "cylinder", "box"  # other geoms are drawn as their bounding boxes
 CERTIFIED = RUNS[0]
-SEEN = 80  # across a view, of the grid on which sensors are shown
-FINE = 1e-5  # m, of differences of readings
+SENSED_CELLS = 80  # across a view, of the grid on which sensors are shown
+READING_STEP = 1e-5  # m, of differences of readings
 DEEPEST = "#f5d36b"  # of the places that are seen best
-LONG = 0.45  # height over width, below which a view is as wide as the figure
+LONG_VIEW = 0.45  # height over width, below which a view is as wide as the figure
 
 
 class DrawnPath(NamedTuple):
@@ -91,15 +91,15 @@ class Views:
         if self.limits is not None:
             return self.limits
         ways = np.nanmax(self.places, axis=0) - np.nanmin(self.places, axis=0)
-        margin = np.maximum(1.5 * self.radius, EMPTY * np.maximum(ways, FLAT * ways.max()))
-        margin = margin if self.radius or ways.any() else NOTHING
+        margin = np.maximum(1.5 * self.radius, EMPTY * np.maximum(ways, LEAST_WAY * ways.max()))
+        margin = margin if self.radius or ways.any() else MARGIN_AT_REST
         return bounds(self.places, self.world.seen_by(self.space.plane, self.space.offset), margin)
 
     def panels(self, style: Style) -> list[Panel]:
         """The panels of the views: wide ones if they are long."""
         low, high = self.corners
         shapes = [slenderness((high - low)[list(plane)]) for plane in self.planes]
-        wide, look = max(shapes) < LONG, LAYOUTS[style]
+        wide, look = max(shapes) < LONG_VIEW, LAYOUTS[style]
         width = look.width / (1 if wide else look.columns) - AROUND[1] * look.text / 72
         return [Panel(width * min(shape, 1.0), wide) for shape in shapes]
 
@@ -111,7 +111,7 @@ class Views:
         for axes, plane in zip(views, self.planes, strict=True):
             along, onto = list(plane), np.eye(len(low))[list(plane)]
             if in_space:
-                draw_projected(axes, self.world, low, high, *plane)
+                draw_projected(axes, self.world, low, high, along)
             else:
                 flat = self.world.seen_by(self.space.plane, self.space.offset)
                 draw_in_plane(axes, flat, low, high, self.radius, plane=self.space.plane)
@@ -175,7 +175,7 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
     axes.contour(x, y, distance, levels=[0], colors=[EDGE], linewidths=0.8)
     axes.fill([], [], facecolor=SOLID, edgecolor=EDGE, label="obstacle")  # for the legend
     if radius > 0:
-        axes.fill([], [], facecolor=MARGIN, label=NEAR)
+        axes.fill([], [], facecolor=MARGIN, label=CLOSE)
 
 
 def _half_sizes(obstacle: Obstacle) -> Array:
@@ -202,20 +202,20 @@ def _begin_view(axes: Axes, low: Array, high: Array, names: str) -> None:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect=stretch, xlabel=said[0], ylabel=said[1])
 
 
-def draw_projected(axes: Axes, world: World, low: Array, high: Array, across: int, up: int) -> None:
+def draw_projected(axes: Axes, world: World, low: Array, high: Array, plane: list[int]) -> None:
     """Draw translucent projections of obstacles between two corners (3,) onto the plane of two axes."""
     solid = [obstacle for obstacle in world.obstacles if obstacle.kind != "plane"]
     for number, obstacle in enumerate(solid):
         label = None if number else "obstacle"
         axes.fill(
-            *_outline(obstacle, low, high, [across, up]).T,
+            *_outline(obstacle, low, high, plane).T,
             facecolor=(SOLID, 0.35),
             edgecolor=EDGE,
             linewidth=0.6,
             label=label,
             zorder=1.6,  # over tubes, which show through
         )
-    _begin_view(axes, low[[across, up]], high[[across, up]], "xyz"[across] + "xyz"[up])
+    _begin_view(axes, low[plane], high[plane], "".join("xyz"[axis] for axis in plane))
 
 
 def _outline(obstacle: Obstacle, low: Array, high: Array, plane: list[int]) -> Array:
@@ -318,20 +318,20 @@ def draw_sensed(axes: Axes, belief: Belief, states: Array, low: Array, high: Arr
     """Draw how well the readings of one period tell the position, as standard deviations in m, between two corners.
 
     Args:
-      states: (k, n), of which the nearest has what is no place in the view: its height, heading and speed.
+      states: (k, n); a place in the view has the height, heading and speed of the nearest.
       along: the axes of the view.
     """
-    place = list(belief.robot.state_coordinates.position)
-    shown = [place[axis] for axis in along]
-    x, y = (np.linspace(low[axis], high[axis], SEEN) for axis in along)
+    shown = [belief.robot.state_coordinates.position[axis] for axis in along]
+    x, y = (np.linspace(low[axis], high[axis], SENSED_CELLS) for axis in along)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    near = states[np.linalg.norm(points[:, None] - states[:, shown], axis=2).argmin(axis=1)]
-    near[:, shown] = points
-    seen = accuracy(belief, near).reshape(SEEN, SEEN)
-    levels = np.geomspace(seen.min(), max(np.quantile(seen, 0.9), 1.01 * seen.min()), 7)
+    nearest = states[np.linalg.norm(points[:, None] - states[:, shown], axis=2).argmin(axis=1)]
+    nearest[:, shown] = points
+    deviations = accuracy(belief, nearest).reshape(SENSED_CELLS, SENSED_CELLS)
+    least = deviations.min()
+    levels = np.geomspace(least, max(np.quantile(deviations, 0.9), 1.01 * least), 7)
     shades = LinearSegmentedColormap.from_list("seen", [DEEPEST, "#ffffff"])
-    axes.contourf(x, y, np.log(seen), levels=np.log(levels), cmap=shades, zorder=0.5)
-    lines = axes.contour(x, y, seen, levels=levels[1:], colors="#b08f2a", linewidths=0.4, zorder=0.6)
+    axes.contourf(x, y, np.log(deviations), levels=np.log(levels), cmap=shades, zorder=0.5)
+    lines = axes.contour(x, y, deviations, levels=levels[1:], colors="#b08f2a", linewidths=0.4, zorder=0.6)
     axes.clabel(lines, fmt=lambda value: f"{value:.2g} m", fontsize=5)
     axes.fill([], [], facecolor=DEEPEST, label="standard deviation of the position by readings alone")
 
@@ -341,8 +341,8 @@ def accuracy(belief: Belief, states: Array) -> Array:
     place = belief.robot.state_coordinates.position
     deviations, information = belief.read(states)[1], np.zeros(len(states))
     for axis in place:
-        step = FINE * np.eye(states.shape[1])[axis]
-        slopes = (belief.read(states + step)[0] - belief.read(states - step)[0]) / (2 * FINE)
+        step = READING_STEP * np.eye(states.shape[1])[axis]
+        slopes = (belief.read(states + step)[0] - belief.read(states - step)[0]) / (2 * READING_STEP)
         information += np.square(slopes / deviations).sum(axis=1)
     return np.sqrt(len(place) / np.maximum(information, 1e-24))
 

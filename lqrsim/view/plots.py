@@ -129,13 +129,17 @@ def _entries(*drawn: Axes) -> dict[str, Artist]:
     return {label: artist for axes in drawn for artist, label in zip(*axes.get_legend_handles_labels(), strict=True)}
 
 
+def _driven(rollouts: Mapping[str, Rollout], trial: int, zorder: float = 2.0) -> list[DrawnPath]:
+    return [
+        DrawnPath(run.places(trial), name, color, "-", zorder=zorder)
+        for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
+    ]
+
+
 def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> Views:
     """The views of a robot with a position."""
     first, space = next(iter(rollouts.values())), solution.policy.state_coordinates
-    driven = [
-        DrawnPath(run.places(trial), name, color, "-")
-        for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
-    ]
+    driven = _driven(rollouts, trial)
     plan = DrawnPath(solution.trajectory.states[:, list(space.position)], "planned")
     moved = moved_objects(first, trial)
     of_world = ["xyz".index(letter) for letter in (space.plane if len(space.position) == 2 else "xyz")]
@@ -162,10 +166,6 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
     across, up = sorted(np.argsort(span, kind="stable")[1:].tolist())
     moments = np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))
     colours = [_paler(RUNS[0], 0.75 * (1 - i / (MOMENTS - 1))) for i in range(len(moments))]
-    paths = [
-        DrawnPath(run.places(trial), name, color, "-", zorder=3)
-        for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
-    ]
     return Views(
         title="balls, paler the earlier, and the path of the last",
         space=first.state_coordinates,
@@ -174,7 +174,7 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
         places=np.zeros((0, 3)),
         limits=figure_parts.bounds(alive.reshape(-1, 3), world, float(radii.max()) + 0.1 * float(span.max())),
         planes=[(across, up)],
-        paths=[*paths, DrawnPath(first.planned_places, "planned", zorder=3)],
+        paths=[*_driven(rollouts, trial, zorder=3), DrawnPath(first.planned_places, "planned", zorder=3)],
         balls=[
             (centre, float(radius), colour)
             for knot, colour in zip(moments, colours, strict=True)
@@ -261,7 +261,7 @@ def _convergence(axes: Axes, solution: Solution) -> None:
 TUBE = {"face": "#8ad7d5", "edge": "#008f91"}
 COST_TUBE = {"face": "#d5c8ec", "edge": "#7a4dc7"}
 LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)))
-FLAT = 0.05  # a curve whose range is a smaller part of the largest one's in its unit has another strip
+LEAST_RANGE = 0.05  # a curve whose range is a smaller part of the largest one's in its unit has another strip
 
 
 @checked
@@ -350,7 +350,7 @@ def _drawn_together(solution: Solution) -> list[list[int]]:
     for unit in dict.fromkeys(space.units):
         strip = list[int]()
         for i in sorted((i for i, of in enumerate(space.units) if of == unit), key=lambda i: -sizes[i]):
-            if strip and 0 < sizes[i] < FLAT * sizes[strip[0]]:
+            if strip and 0 < sizes[i] < LEAST_RANGE * sizes[strip[0]]:
                 strips.append(sorted(strip))
                 strip = []
             strip.append(i)

@@ -62,7 +62,7 @@ LAYOUTS: dict[Style, Layout] = {
     "column": Layout(3.4, 7.0, 1),
 }
 ROUNDING = 1e-6  # an axis whose range is a smaller part of its values shows that they are equal
-ASIDE = 0.025  # of the middle of such an axis: what is shown on both sides of it
+HALF_RANGE = 0.025  # of the largest value on such an axis: what is shown on both sides of the middle
 AROUND = 7.0, 7.0  # lines of text in height and in width that a panel's title, numbers and labels take
 PAD = 0.07  # inches around panels
 GAP = 2.0  # pixels between the numbers of ticks at least
@@ -169,9 +169,9 @@ def _set_ticks(axes: Axes) -> None:
             axis.set_minor_formatter(ticker.NullFormatter())
         elif isinstance(axis.get_major_formatter(), ticker.ScalarFormatter):
             low, high = sorted(axis.get_view_interval())
-            beyond = max(abs(low), abs(high))
-            if axes.get_aspect() == "auto" and high - low < ROUNDING * beyond:
-                scale(0.5 * (low + high) - ASIDE * beyond, 0.5 * (low + high) + ASIDE * beyond)
+            largest, middle = max(abs(low), abs(high)), 0.5 * (low + high)
+            if axes.get_aspect() == "auto" and high - low < ROUNDING * largest:
+                scale(middle - HALF_RANGE * largest, middle + HALF_RANGE * largest)
 
 
 def _keep_apart(axes: Axes) -> None:
