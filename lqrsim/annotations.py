@@ -135,24 +135,24 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
 
     @cache  # at the first call, for annotations may name what is defined further down
     def wanted() -> tuple[list[tuple[str, int, Declared]], bool]:
-        said = sorted((item for item in declare().items() if _is_known(item[1])), key=_order)
-        places = [(name, positions.get(name, sys.maxsize), declaration) for name, declaration in said]
-        return places, any(declaration.letters for _, declaration in said)
+        specs = sorted((item for item in declare().items() if _is_known(item[1])), key=_order)
+        places = [(name, positions.get(name, sys.maxsize), spec) for name, spec in specs]
+        return places, any(spec.letters for _, spec in specs)
 
     @functools.wraps(function)
-    def call(*given: Any, **named: Any) -> Any:
+    def call(*arguments: Any, **named: Any) -> Any:
         who = ""
         if makes:
-            kind = type(given[0])
+            kind = type(arguments[0])
             who = getattr(kind, "_prefix", f"{kind.__name__}: ")
-        placed, (places, sized) = list(given), wanted()
+        placed, (places, sized) = list(arguments), wanted()
         sizes = Sizes() if sized else None
         check = _owned if makes else _checked
-        for name, place, said in places:
+        for name, place, spec in places:
             if name in named:
-                named[name] = check(who + name, named[name], said, sizes)
+                named[name] = check(who + name, named[name], spec, sizes)
             elif place < len(placed):
-                placed[place] = check(who + name, placed[place], said, sizes)
+                placed[place] = check(who + name, placed[place], spec, sizes)
         return function(*placed, **named)
 
     return call
@@ -161,11 +161,11 @@ def _checking(function: Any, declare: Callable[[], dict[str, Declared]]) -> Any:
 def _of_parameters(function: Any) -> dict[str, Declared]:
     """The declarations of parameters. A plain number, text or dictionary says too little: the function decides."""
     hints = get_type_hints(function, include_extras=True)
-    said = {name: declared(hint) for name, hint in hints.items() if name != "return"}
+    specs = {name: declared(hint) for name, hint in hints.items() if name != "return"}
     return {
-        name: declaration
-        for name, declaration in said.items()
-        if not (declaration.plain and (get_origin(declaration.kinds[0]) or declaration.kinds[0]) in _PLAIN)
+        name: spec
+        for name, spec in specs.items()
+        if not (spec.plain and (get_origin(spec.kinds[0]) or spec.kinds[0]) in _PLAIN)
     }
 
 
@@ -173,7 +173,7 @@ def _of_parameters(function: Any) -> dict[str, Declared]:
 def declarations(kind: type) -> dict[str, Declared]:
     """The declaration of each field of a record, except fields that are no part of its value (`compare=False`)."""
     of_value = {field.name for field in fields(kind) if field.compare}
-    return {name: said for name, said in _of_fields(kind).items() if name in of_value}
+    return {name: spec for name, spec in _of_fields(kind).items() if name in of_value}
 
 
 @cache
@@ -189,20 +189,20 @@ def _of_fields(kind: type) -> dict[str, Declared]:
 @cache
 def declared(annotation: Any) -> Declared:
     """The content of an annotation."""
-    said: list[Any] = []
+    metadata: list[Any] = []
     optional = False
     kinds: tuple[Any, ...] = (annotation,)
     while len(kinds) == 1 and get_origin(kinds[0]) in (Annotated, Union, UnionType):
         inside = get_args(kinds[0])
         if get_origin(kinds[0]) is Annotated:
-            said += inside[1:]
+            metadata += inside[1:]
             kinds = inside[:1]
         else:
             kinds = tuple(kind for kind in inside if kind is not NoneType)
             optional = optional or len(kinds) < len(inside)
 
     def first(kind: type) -> Any:
-        return next((item for item in said if isinstance(item, kind)), None)
+        return next((item for item in metadata if isinstance(item, kind)), None)
 
     dtype = None
     if get_origin(kinds[0]) in (np.ndarray, npt.NDArray):  # the latter from NumPy 2.5 on, with Python 3.12
@@ -214,18 +214,18 @@ def declared(annotation: Any) -> Declared:
     return Declared(kinds, dtype, letters, first(Bounds), first(int), wanted, allowed, optional)
 
 
-def _is_known(said: Declared) -> bool:
+def _is_known(spec: Declared) -> bool:
     """Whether the annotation says what to check; what it does not say, a function checks itself."""
-    kind, origin = said.kinds[0], get_origin(said.kinds[0])
-    if said.dtype is not None:
-        return bool(said.letters)
-    if len(said.kinds) > 1:
+    kind, origin = spec.kinds[0], get_origin(spec.kinds[0])
+    if spec.dtype is not None:
+        return bool(spec.letters)
+    if len(spec.kinds) > 1:
         # One of several classes of the package; of others only where the message says more than their names.
-        return all(_is_class(choice) and (said.want or choice.__module__.startswith("lqrsim")) for choice in said.kinds)
+        return all(_is_class(choice) and (spec.want or choice.__module__.startswith("lqrsim")) for choice in spec.kinds)
     if origin in _COLLECTIONS:
-        return origin is tuple or bool(said.want)
+        return origin is tuple or bool(spec.want)
     if origin is Callable:
-        return bool(said.want)
+        return bool(spec.want)
     return origin in (Mapping, Literal) or (_is_class(kind) and kind is not object)
 
 
@@ -239,18 +239,18 @@ def _is_class(kind: Any) -> bool:
 
 def _order(item: tuple[str, Declared]) -> int:
     """Sort key: records first, which define sizes, then arrays, then optional records and tuples of a length."""
-    said = item[1]
-    last = said.letters if get_origin(said.kinds[0]) is tuple else said.optional and is_dataclass(said.kinds[0])
-    return 2 if last else int(said.dtype is not None)
+    spec = item[1]
+    last = spec.letters if get_origin(spec.kinds[0]) is tuple else spec.optional and is_dataclass(spec.kinds[0])
+    return 2 if last else int(spec.dtype is not None)
 
 
-def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any:
+def _checked(field: str, value: Any, spec: Declared, sizes: Sizes | None) -> Any:
     """The value as declared, with sizes that agree if any are declared. Raises InputError for other values."""
-    kind, bounds, want = said.kinds[0], said.bounds, said.want
-    if value is None and said.optional:
+    kind, bounds, want = spec.kinds[0], spec.bounds, spec.want
+    if value is None and spec.optional:
         return None
-    if said.dtype is not None and sizes is not None:
-        return _array(field, value, said, sizes)
+    if spec.dtype is not None and sizes is not None:
+        return _array(field, value, spec, sizes)
     if kind is float:
         return _number(field, value) if bounds is None else check_number(field, value, **bounds._asdict())
     if kind is int:
@@ -258,19 +258,19 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any
         return check_count(field, value, at_least=int(least or 0), at_most=int(most or LARGEST_COUNT))
     if kind is bool:
         return check_flag(field, value)
-    if said.names:
-        return check_name(field, value, said.names)
+    if spec.names:
+        return check_name(field, value, spec.names)
     if kind is str:
         if want:
-            return check_text(field, value, want, at_most=said.longest or 200)
-        return check_string(field, value, said.longest)
+            return check_text(field, value, want, at_most=spec.longest or 200)
+        return check_string(field, value, spec.longest)
     origin, inside = get_origin(kind), get_args(kind)
     if origin is Callable:
         count = None if inside[0] is Ellipsis else len(inside[0])
         check_function(field, value, want or f"a function of {count} arguments", arguments=count, optional=False)
         return value
     if origin in _COLLECTIONS:
-        return _items(field, value, said, sizes)
+        return _items(field, value, spec, sizes)
     if origin is Mapping:
         value = check_kind(field, value, Mapping, want or "a dictionary by name")
         inner = declared(inside[1])
@@ -278,63 +278,62 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any
         if not _is_known(inner):
             return dict(value)
         return {name: _checked(f"{field}.{name}", value[name], inner, sizes) for name in names}
-    value = check_kind(field, value, said.kinds, want or _names(said))
+    value = check_kind(field, value, spec.kinds, want or _names(spec))
     if sizes is not None:
-        if said.letters:
-            _check_length(field, len(value), said.letters, sizes)
+        if spec.letters:
+            _check_length(field, len(value), spec.letters, sizes)
         elif is_dataclass(value):
-            _share_sizes(field, value, sizes)
+            _unify_sizes(field, value, sizes)
     return value
 
 
-def _owned(field: str, value: Any, said: Declared, sizes: Sizes | None) -> Any:
+def _owned(field: str, value: Any, spec: Declared, sizes: Sizes | None) -> Any:
     """As `_checked`; an array is a copy, for the caller may write into the given one later."""
-    valid = _checked(field, value, said, sizes)
+    valid = _checked(field, value, spec, sizes)
     return valid.copy() if valid is value and isinstance(valid, np.ndarray) else valid
 
 
-def _names(said: Declared) -> str:
+def _names(spec: Declared) -> str:
     """The end of a message about classes: `_want` of each, with how to get an object, or its name."""
-    names = {kind: f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}" for kind in said.kinds}
+    names = {kind: f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}" for kind in spec.kinds}
     wants = [getattr(kind, "_want", name) for kind, name in names.items()]
     want = (", or " if wants != [*names.values()] else " or ").join(wants)
-    if issubclass(kind := said.kinds[0], enum.Enum):
+    if issubclass(kind := spec.kinds[0], enum.Enum):
         return f"{want}, one of {', '.join(kind.__members__)}"
-    return f"{want}, or None" if said.optional else want
+    return f"{want}, or None" if spec.optional else want
 
 
-def _items(field: str, value: Any, said: Declared, sizes: Sizes | None) -> tuple[Any, ...]:
+def _items(field: str, value: Any, spec: Declared, sizes: Sizes | None) -> tuple[Any, ...]:
     """A collection as a tuple, of which each item is as declared."""
-    inner = get_args(said.kinds[0])
-    if said.want and inner[0] is int:
-        return tuple(map(int, check_items(field, value, (int, np.integer), said.want)))
-    if said.want and _is_class(inner[0]) and inner[0] not in _PLAIN:
-        return check_items(field, value, inner[0], said.want, at_most=said.longest or 1_000_000)
-    items = check_items(field, value, object, said.want or "a tuple")
-    if said.letters and sizes is not None:
-        _check_length(field, len(items), said.letters, sizes)
+    inner = get_args(spec.kinds[0])
+    if spec.want and inner[0] is int:
+        return tuple(map(int, check_items(field, value, (int, np.integer), spec.want)))
+    if spec.want and _is_class(inner[0]) and inner[0] not in _PLAIN:
+        return check_items(field, value, inner[0], spec.want, at_most=spec.longest or 1_000_000)
+    items = check_items(field, value, object, spec.want or "a tuple")
+    if spec.letters and sizes is not None:
+        _check_length(field, len(items), spec.letters, sizes)
     kinds = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
     if len(kinds) != len(items):
         raise InputError(f"{field}: got {len(items)} entries, want {len(kinds)}")
     pairs = enumerate(zip(items, map(declared, kinds), strict=True))
     return tuple(
-        _checked(f"{field}[{i}]", item, declaration, sizes) if _is_known(declaration) else item
-        for i, (item, declaration) in pairs
+        _checked(f"{field}[{i}]", item, of_item, sizes) if _is_known(of_item) else item for i, (item, of_item) in pairs
     )
 
 
-def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
+def _unify_sizes(field: str, record: Any, sizes: Sizes) -> None:
     """Raises InputError unless a record's sizes agree with the known sizes; its other sizes become known."""
-    for name, said in declarations(type(record)).items():
+    for name, spec in declarations(type(record)).items():
         value, inner = getattr(record, name), f"{field}.{name}"
-        if value is None or said.letters.startswith("..."):
+        if value is None or spec.letters.startswith("..."):
             continue
-        if isinstance(value, np.ndarray) and said.letters:
-            check_sizes(inner, value.shape, said.letters, sizes)
-        elif said.letters:
-            _check_length(inner, len(value), said.letters, sizes)
+        if isinstance(value, np.ndarray) and spec.letters:
+            check_sizes(inner, value.shape, spec.letters, sizes)
+        elif spec.letters:
+            _check_length(inner, len(value), spec.letters, sizes)
         elif is_dataclass(value):
-            _share_sizes(inner, value, sizes)
+            _unify_sizes(inner, value, sizes)
 
 
 def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) -> None:
@@ -374,21 +373,21 @@ def _check_length(field: str, length: int, letter: str, sizes: Sizes) -> None:
         raise InputError(f"{field}: got {length} entries, want {want}")
 
 
-def _array(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
+def _array(field: str, value: Any, spec: Declared, sizes: Sizes) -> Any:
     """An array of the declared numbers, shape and bounds."""
-    array = real(field, value, f"numbers of shape ({', '.join(said.letters.split())})")
-    check_sizes(field, array.shape, said.letters, sizes)
-    if said.dtype is np.int64:
+    array = real(field, value, f"numbers of shape ({', '.join(spec.letters.split())})")
+    check_sizes(field, array.shape, spec.letters, sizes)
+    if spec.dtype is np.int64:
         numbers = numbers_of(field, array)
         if not ((numbers >= 0) & (numbers == np.floor(numbers)) & (numbers < 2**53)).all():
             raise InputError(f"{field}: got {excerpt(numbers.tolist())}, want whole numbers >= 0")
         return numbers.astype(np.int64)
-    if said.bounds is not None:
-        above, least, most, below = (np.nan if bound is None else bound for bound in said.bounds)
+    if spec.bounds is not None:
+        above, least, most, below = (np.nan if bound is None else bound for bound in spec.bounds)
         bad = ~np.isfinite(array) | (array <= above) | (array < least) | (array > most) | (array >= below)
         if bad.any():
             place = tuple(np.argwhere(bad)[0].tolist())
-            check_number(f"{field}{list(place)}", array[place].item(), **said.bounds._asdict())
+            check_number(f"{field}{list(place)}", array[place].item(), **spec.bounds._asdict())
     return array
 
 
