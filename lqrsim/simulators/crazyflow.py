@@ -77,45 +77,42 @@ class Crazyflow(Simulator):
             )
 
     def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> "_Drones":
-        return _Drones(self, states, factors, timestep)
+        frequency, trials = round(1 / timestep), len(states)
+        if abs(frequency * timestep - 1) > 1e-9:
+            raise InputError(f"crazyflow: got a timestep of {timestep:g} s, want 1 s divided by a whole number")
+        multiplied = np.ones((trials, 6))
+        for parameter, columns in (("mass", slice(0, 1)), ("inertia", slice(1, 2))):
+            multiplied[:, columns] = factors.get(parameter, 1.0)
+        multiplied[:, 2 + frame_of(self.drone).order] = factors.get("thrust", 1.0)
+        hover_speed = float(speed_of(self.drone, np.array(self.weight / 4)))
+        simulations = _Drones(np.full((trials, 17), hover_speed), multiplied, frequency)
+        self.place(simulations, states)
+        return simulations
 
     def step(self, simulations: "_Drones", controls: Array, wrench: Array, wind: Array, steps: int) -> None:
-        simulations.step(controls, wrench, steps)
+        speeds, states = np.empty_like(controls), simulations.states
+        speeds[:, frame_of(self.drone).order] = speed_of(self.drone, controls)
+        advance = stepper(self.drone, self.integrator, simulations.frequency, steps)
+        for trial, inputs in enumerate(np.concatenate([states, speeds, wrench, simulations.factors], axis=1)):
+            if np.isfinite(inputs).all():
+                states[trial] = advance(inputs)
 
     def states(self, simulations: "_Drones") -> Array:
         states = simulations.states
         return frame_of(self.drone).ours(states[:, :3], states[:, 7:10], states[:, 3:7], states[:, 10:13])
 
     def place(self, simulations: "_Drones", states: Array) -> None:
-        simulations.place(states)
+        x, v, q, w = frame_of(self.drone).theirs(states)
+        simulations.states[:, :13] = np.concatenate([x, q, v, w], axis=1)
 
 
+@dataclass(frozen=True, eq=False)
 class _Drones:
-    """States (K, 17) in crazyflow's form: position, quaternion, velocity, rates, rotor speeds in 1/min."""
+    """K trials in crazyflow's form."""
 
-    def __init__(self, of: Crazyflow, states: Array, factors: Mapping[str, Array], timestep: float) -> None:
-        frequency = round(1 / timestep)
-        if abs(frequency * timestep - 1) > 1e-9:
-            raise InputError(f"crazyflow: got a timestep of {timestep:g} s, want 1 s divided by a whole number")
-        self._of, self._frequency = of, frequency
-        self.states = np.full((len(states), 17), float(speed_of(of.drone, np.array(of.weight / 4))))
-        self._factors = np.ones((len(states), 6))
-        for parameter, columns in (("mass", slice(0, 1)), ("inertia", slice(1, 2))):
-            self._factors[:, columns] = factors.get(parameter, 1.0)
-        self._factors[:, 2 + frame_of(of.drone).order] = factors.get("thrust", 1.0)
-        self.place(states)
-
-    def place(self, states: Array) -> None:
-        x, v, q, w = frame_of(self._of.drone).theirs(states)
-        self.states[:, :13] = np.concatenate([x, q, v, w], axis=1)
-
-    def step(self, controls: Array, wrench: Array, steps: int) -> None:
-        speeds = np.empty_like(controls)
-        speeds[:, frame_of(self._of.drone).order] = speed_of(self._of.drone, controls)
-        advance = stepper(self._of.drone, self._of.integrator, self._frequency, steps)
-        for trial, inputs in enumerate(np.concatenate([self.states, speeds, wrench, self._factors], axis=1)):
-            if np.isfinite(inputs).all():
-                self.states[trial] = advance(inputs)
+    states: Array  # (K, 17): position, quaternion, velocity, rates, rotor speeds in 1/min
+    factors: Array  # (K, 6): of the mass, the inertia, and the thrust of its rotors
+    frequency: int  # of its steps, in 1/s
 
 
 @cache

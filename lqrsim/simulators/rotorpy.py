@@ -116,31 +116,9 @@ class RotorPy(Simulator):
         check_kind("RotorPy: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
 
     def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> "_Vehicles":
-        return _Vehicles(self, self._frame, states, factors, timestep)
-
-    def step(self, simulations: "_Vehicles", controls: Array, wrench: Array, wind: Array, steps: int) -> None:
-        simulations.step(controls, wrench, wind, steps)
-
-    def states(self, simulations: "_Vehicles") -> Array:
-        states = simulations.states
-        return self._frame.ours(*(np.array([state[key] for state in states]) for key in ("x", "v", "q", "w")))
-
-    def place(self, simulations: "_Vehicles", states: Array) -> None:
-        simulations.place(states)
-
-
-class _Vehicles:
-    """A `Multirotor` and its state, in RotorPy's form, for each trial."""
-
-    def __init__(
-        self, simulator: RotorPy, frame: Frame, states: Array, factors: Mapping[str, Array], timestep: float
-    ) -> None:
-        kind, self._frame, self._timestep = pushed_multirotor(), frame, timestep
-        speeds = np.full(4, simulator.hover_speed)
-        self.vehicles, self.states = list[Any](), [{"rotor_speeds": speeds.copy()} for _ in states]
-        self._gain = np.sqrt(factors.get("thrust", np.ones((len(states), 4))) / simulator._numbers["k_eta"])
+        kind, vehicles = pushed_multirotor(), list[Any]()
         for trial in range(len(states)):
-            vehicle = kind(copy.deepcopy(dict(simulator._numbers)))
+            vehicle = kind(copy.deepcopy(dict(self._numbers)))
             vehicle.mass = vehicle.mass * float(factors["mass"][trial, 0]) if "mass" in factors else vehicle.mass
             vehicle.weight = np.array([0.0, 0.0, -vehicle.mass * vehicle.g])
             if "inertia" in factors:
@@ -148,18 +126,18 @@ class _Vehicles:
                 vehicle.inv_inertia = np.linalg.inv(vehicle.inertia)
             if "thrust" in factors:
                 vehicle.rotor_speed_max *= np.sqrt(max(factors["thrust"][trial].max(), 1.0))
-            self.vehicles.append(vehicle)
-        self.place(states)
+            vehicles.append(vehicle)
+        gain = np.sqrt(factors.get("thrust", np.ones((len(states), 4))) / self._numbers["k_eta"])
+        simulations = _Vehicles(
+            vehicles, [{"rotor_speeds": np.full(4, self.hover_speed)} for _ in states], gain, timestep
+        )
+        self.place(simulations, states)
+        return simulations
 
-    def place(self, states: Array) -> None:
-        for state, x, v, q, w in zip(self.states, *self._frame.theirs(states), strict=True):
-            state |= {"x": x.copy(), "v": v.copy(), "q": q, "w": w}
-
-    def step(self, controls: Array, wrench: Array, wind: Array, steps: int) -> None:
+    def step(self, simulations: "_Vehicles", controls: Array, wrench: Array, wind: Array, steps: int) -> None:
         speeds = np.empty_like(controls)
-        speeds[:, self._frame.order] = np.sqrt(controls) * self._gain
-        for trial, vehicle in enumerate(self.vehicles):
-            state = self.states[trial]
+        speeds[:, self._frame.order] = np.sqrt(controls) * simulations.gain
+        for trial, (vehicle, state) in enumerate(zip(simulations.vehicles, simulations.states, strict=True)):
             if not all(np.isfinite(part).all() for part in state.values()):
                 continue
             state["wind"], vehicle.pushed = wind[trial], wrench[trial]
@@ -167,10 +145,28 @@ class _Vehicles:
             try:
                 with np.errstate(over="ignore", invalid="ignore"):
                     for _ in range(steps):
-                        state = vehicle.step(state, command, self._timestep)
+                        state = vehicle.step(state, command, simulations.timestep)
             except (ValueError, FloatingPointError):  # numbers that overflowed
                 state = state | {"x": np.full(3, np.nan)}
-            self.states[trial] = state
+            simulations.states[trial] = state
+
+    def states(self, simulations: "_Vehicles") -> Array:
+        states = simulations.states
+        return self._frame.ours(*(np.array([state[key] for state in states]) for key in ("x", "v", "q", "w")))
+
+    def place(self, simulations: "_Vehicles", states: Array) -> None:
+        for state, x, v, q, w in zip(simulations.states, *self._frame.theirs(states), strict=True):
+            state |= {"x": x.copy(), "v": v.copy(), "q": q, "w": w}
+
+
+@dataclass(frozen=True, eq=False)
+class _Vehicles:
+    """For each of K trials a `Multirotor`, and its state in RotorPy's form."""
+
+    vehicles: list[Any]
+    states: list[dict[str, Any]]
+    gain: Array  # (K, 4), speed in rad/s of our rotors at a force of 1 N, which grows with the root of the force
+    timestep: float
 
 
 def pushed_multirotor() -> Any:
