@@ -19,7 +19,7 @@ from lqrsim.view.overlays import Overlays, error_colours, legend_entries
 Pixels = npt.NDArray[np.uint8]
 
 INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
-HEADER_SHARE = 0.4  # largest fraction of a picture's height for the header
+HEADER_FRACTION = 0.4  # largest fraction of a picture's height for the header
 LETTER_HEIGHTS = 44, 54  # numbers of lines of text in the height of a picture, and in the width of a narrow one
 
 
@@ -49,7 +49,7 @@ class Caption:
             words = what[:count] + ([f"{left} more disturbances" if count else f"{left} disturbances"] if left else [])
             lines = [title, *wrap("; ".join(words), self.letter_height, self.width - round(1.4 * self.letter_height))]
             tile = text_tile(tuple(lines), self.letter_height, width=self.width)
-            if tile.shape[0] <= HEADER_SHARE * box.height:
+            if tile.shape[0] <= HEADER_FRACTION * box.height:
                 break
         return tile
 
@@ -149,8 +149,7 @@ def wrap(words: str, height: int, width: int) -> list[str]:
 
 def blend(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
     """Blend a tile into the image, in place, at these distances in pixels from the left and the top or bottom."""
-    room = image.shape[0] - tile.shape[0]
-    start = max(top if top is not None else room - (bottom or 0), 0)
+    start = max(top if top is not None else image.shape[0] - tile.shape[0] - (bottom or 0), 0)
     area = image[start : start + tile.shape[0], left : left + tile.shape[1]]
     tile = tile[: area.shape[0], : area.shape[1]]
     alpha = tile[..., 3:].astype(np.uint16)

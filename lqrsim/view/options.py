@@ -49,7 +49,7 @@ ALL_OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
 OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if OVERLAY_KINDS[name].default)
 CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)
-INSETS_SHARE = 0.4  # fraction of a run's part for its insets
+INSETS_FRACTION = 0.4  # fraction of a run's part for its insets
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def split_into_panes(box: Box, insets: int) -> list[Box]:
     """The first pane and the insets, in a column on its right, or in a row below it if the box is higher than wide."""
     wide = box.width >= box.height
     length, across = (box.width, box.height) if wide else (box.height, box.width)
-    edge = 2 * round(length * (1 - INSETS_SHARE) / 2) if insets else length
+    edge = 2 * round(length * (1 - INSETS_FRACTION) / 2) if insets else length
     cuts = [2 * round(across * number / max(insets, 1) / 2) for number in range(insets + 1)]
     if wide:
         first = Box(box.left, box.top, edge, box.height)

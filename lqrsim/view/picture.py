@@ -133,9 +133,9 @@ class SceneRenderer:
         for number in range(count if faded.any() else 0):
             geom = self.scene.geoms[number]
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and faded[geom.objid] > 0:
-                share, alpha = faded[geom.objid], float(geom.rgba[3])
+                fade, alpha = faded[geom.objid], float(geom.rgba[3])
                 before.append((number, alpha, geom.transparent))
-                geom.rgba[3], geom.transparent = (1 - share) * alpha + share * min(alpha, FADED_OPACITY), 1
+                geom.rgba[3], geom.transparent = (1 - fade) * alpha + fade * min(alpha, FADED_OPACITY), 1
         yield
         for number, alpha, transparent in before:
             geom = self.scene.geoms[number]

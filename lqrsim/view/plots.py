@@ -453,8 +453,8 @@ def _levels(axes: Axes, funnel: Funnel) -> None:
     axes.plot(times, funnel.levels, "-", color=EDGE, linewidth=1.0)
     axes.plot(times, funnel.levels, "o", color=CERTIFIED, markersize=6)
     for time, level, trials, successes in zip(times, funnel.levels, funnel.trials, funnel.successes, strict=True):
-        said = f"{successes}/{trials}" if trials else "none"
-        axes.annotate(said, (time, level), xytext=(0, 8), textcoords="offset points", ha="center", fontsize=8)
+        counts = f"{successes}/{trials}" if trials else "none"
+        axes.annotate(counts, (time, level), xytext=(0, 8), textcoords="offset points", ha="center", fontsize=8)
     axes.set_xlim(-0.06 * funnel.plan.horizon, 1.02 * funnel.plan.horizon)
     axes.set_ylim(0, 1.2 * max(float(funnel.levels.max()), 1e-9))
     axes.set_xlabel("time (s)")

@@ -189,14 +189,14 @@ def _keep_apart(axes: Axes) -> None:
         if isinstance(formatter, ticker.ScalarFormatter) and (left_out := formatter.get_offset()):
             axis.offsetText.set_visible(False)
             plus = left_out.startswith(("+", "-", "\N{MINUS SIGN}"))
-            said = left_out if plus else f"times {left_out}"
-            axis.set_label_text(" \n"[along].join([axis.get_label_text(), said]))
+            scale = left_out if plus else f"times {left_out}"
+            axis.set_label_text(" \n"[along].join([axis.get_label_text(), scale]))
     if axes.figure.get_layout_engine() is None:  # nothing would make room for more lines
         return
     for text in axes.get_children():
         if isinstance(text, Text) and (title := text.get_text()) and title == axes.get_title(loc="left"):
-            share = axes.bbox.width / text.get_window_extent().width
-            text.set_text("\n".join(textwrap.wrap(title, max(int(len(title) * share), 8))) if share < 1 else title)
+            fits = axes.bbox.width / text.get_window_extent().width  # the fraction of the title that does
+            text.set_text("\n".join(textwrap.wrap(title, max(int(len(title) * fits), 8))) if fits < 1 else title)
 
 
 def _overlap(axis: Axis, along: int) -> bool:

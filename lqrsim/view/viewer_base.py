@@ -82,8 +82,8 @@ class Viewer(abc.ABC):
         if self._balls is not None:
             _ = self._balls.tracked  # raises an exception if no site is named
         self.follow(plan, self._balls)
-        self._apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS  # of points of the trace
-        self._time, self._ahead, self._restart = 0.0, 0.0, False
+        self._trace_spacing = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
+        self._time, self._overrun, self._restart = 0.0, 0.0, False
         self._until = np.inf if seconds is None else clock.monotonic() + seconds
         self._trace: list[Array] = []
         self._floor = 0.0
@@ -109,7 +109,7 @@ class Viewer(abc.ABC):
             self._trace.clear()
             self._floor = floor_below(self.model, self.data, self.robot)
         on_floor = self._on_floor(self.of_world(place))
-        if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > self._apart:
+        if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > self._trace_spacing:
             self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
         self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.planned_position()):.0f} mm from the plan"
         if self.remark:
@@ -166,8 +166,8 @@ class Viewer(abc.ABC):
     def drag(self, wrenches: Array) -> None:
         """Drag the robot with the sum of forces and torques (nbody, 6), up to the strongest drag."""
         wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), STRONGEST_DRAG * 9.81 * self._mass
-        for part, most in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
-            wrench[part] *= most / max(float(np.linalg.norm(wrench[part])), most)
+        for entries, largest in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
+            wrench[entries] *= largest / max(float(np.linalg.norm(wrench[entries])), largest)
         self.wrench = wrench
 
     def request_restart(self) -> None:
@@ -202,11 +202,11 @@ class Viewer(abc.ABC):
         mujoco.mjv_defaultFreeCamera(self.model, camera)
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
         if number >= 0:
-            away = np.array(self.model.stat.center) - self.model.cam_pos[number]
+            sight = np.array(self.model.stat.center) - self.model.cam_pos[number]
             lenses = np.radians([self.model.cam_fovy[number], self.model.vis.global_.fovy])
-            camera.distance = np.linalg.norm(away) * np.divide(*np.tan(lenses / 2))
-            camera.azimuth = np.degrees(np.arctan2(away[1], away[0]))
-            camera.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
+            camera.distance = np.linalg.norm(sight) * np.divide(*np.tan(lenses / 2))
+            camera.azimuth = np.degrees(np.arctan2(sight[1], sight[0]))
+            camera.elevation = np.degrees(np.arctan2(sight[2], np.hypot(sight[0], sight[1])))
 
     def _on_floor(self, place: Array | list[float]) -> Array:
         if self._balls is not None:
@@ -215,7 +215,7 @@ class Viewer(abc.ABC):
 
     def _wait(self, left: float) -> None:
         """Wait until `left` seconds of the time shown have passed."""
-        left = max(left - self._ahead, -MOST_DELAY)
+        left = max(left - self._overrun, -MOST_DELAY)
         before = clock.perf_counter()
         while True:
             if clock.monotonic() > self._until or not self.refresh():
@@ -229,7 +229,7 @@ class Viewer(abc.ABC):
             if left <= 0 and not self.paused:
                 break
             clock.sleep(float(np.clip(left / self.speed, 0.001, 0.01)))
-        self._ahead = -left
+        self._overrun = -left
 
 
 def _seen_from(azimuth: float, right_away_up: tuple[float, float, float]) -> Array:
