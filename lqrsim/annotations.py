@@ -1,4 +1,4 @@
-"""What records and functions take, said by annotations alone: `checked` holds constructors and calls to them.
+"""Checks of arguments by their annotations: `checked` adds them to a function, or to the constructor of a record.
 
     @checked
     @dataclass(frozen=True)
@@ -13,9 +13,9 @@
 A letter is a size, the same throughout a record and the records in it. `...` means any number of dimensions, `_` any
 size. The letter of a tuple, or of `Coordinates`, is its length.
 
-A class, `bool`, a `Literal` and a function need no more than themselves, and a function is tried with as many arguments
-as it is annotated with. `Want` is the end of a message where the type does not say it. What else an annotation may be,
-such as `ArrayLike`, is left to the function.
+Classes, `bool`, `Literal` and `Callable` are checked as they stand; a callable has to take as many arguments as its
+annotation has. `Want` is the end of a message where the name of the type is not enough. Other annotations, such as
+`ArrayLike`, are not checked.
 """
 
 import enum
@@ -70,7 +70,7 @@ class Want(NamedTuple):
 
 
 class OneOf:
-    """The texts that an argument may be, where they are the names of something and no `Literal` has them."""
+    """The texts that an argument may be, if no `Literal` lists them."""
 
     def __init__(self, names: Collection[str]) -> None:
         self.names = names
@@ -82,7 +82,7 @@ Positive = Annotated[float, Bounds(above=0.0)]
 NonNegative = Annotated[float, Bounds(at_least=0.0)]
 SHARE = Bounds(at_least=0.0, at_most=1.0)
 Share = Annotated[float, SHARE]
-Chance = Annotated[float, Bounds(above=0.0, below=1.0)]  # of what is neither impossible nor certain
+Chance = Annotated[float, Bounds(above=0.0, below=1.0)]  # neither impossible nor certain
 Count = Annotated[int, Bounds(at_least=1, at_most=LARGEST_COUNT)]
 Index = Annotated[int, Bounds(at_least=0, at_most=LARGEST_COUNT)]
 Seed = Annotated[int, Bounds(at_least=0, at_most=LARGEST_SEED)]

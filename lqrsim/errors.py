@@ -48,10 +48,10 @@ class InputError(ValueError):
 
 
 def opengl_error(error: BaseException) -> InputError | None:
-    """What to raise instead of an exception with which MuJoCo could not be imported because of MUJOCO_GL; else None.
+    """The InputError for an import of MuJoCo that failed because of MUJOCO_GL; None for other exceptions.
 
-    MuJoCo chooses its OpenGL while it is imported; if the chosen one is missing, it raises anything. Python then keeps
-    the modules in it that were imported, and not MuJoCo itself.
+    MuJoCo chooses its OpenGL while it is imported; without the chosen one it may raise any exception. Its submodules
+    that were imported then stay in `sys.modules`, and `mujoco` itself does not.
     """
     failed = "mujoco" not in sys.modules and any(name.startswith("mujoco.") for name in sys.modules)
     if not failed or "MUJOCO_GL" not in os.environ or isinstance(error, InputError):
@@ -115,7 +115,7 @@ def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ..
 
 
 def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
-    """`value` as a float64 array of any shape, NaN included; copied only if necessary. Raises InputError."""
+    """As `numbers_of`, but a float64 array is returned as it is."""
     if type(value) is not np.ndarray or value.dtype != np.float64:
         return numbers_of(field, value, want)
     if value.size > _LARGE:  # a broadcast array takes little memory, but arrays made from it take all

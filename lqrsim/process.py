@@ -132,7 +132,10 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
-    """A block in which an exception gets results so far as its `found`: what `make` returns, given an inner block's."""
+    """A block that adds results so far to an exception, as its attribute `found`.
+
+    `make` returns them, given the `found` of an inner block, or None.
+    """
     try:
         yield
     except BaseException as error:

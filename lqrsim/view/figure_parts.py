@@ -28,17 +28,17 @@ from lqrsim.view.style import AROUND, LAYOUTS, MARGIN, PLAN, RUNS, SOLID, Panel,
 EDGE = "#5b6470"
 OUTLINES = 24  # number of ellipses whose outlines are drawn
 BEADS = 0.2  # mean half axis, relative to the distance between neighbours, below which outlines look like beads
-EMPTY = 0.05  # margin around what is drawn at least, relative to its extent
+LEAST_MARGIN = 0.05  # around what is drawn, relative to its extent
 LEAST = 1e-6  # smallest chance that is drawn
 SLENDER = 4.0  # the longer side of a view relative to the shorter one, at most: an alley of 60 m would be a line
-STRETCHED = 1.3  # by which the shorter side is stretched at least, if it is
-LEAST_WAY = 0.2  # way along an axis that counts for the margin at least, relative to the longest
+STRETCHED = 1.3  # least factor by which the shorter side is stretched
+LEAST_WAY = 0.2  # least extent along an axis for its margin, relative to the largest extent
 MARGIN_AT_REST = 0.5  # m around a plan that stays at a place, if the robot has no radius
 CELLS = 200  # across a view, of the grid on which obstacles' outlines are found
 RINGS = np.array([-1.1, -1.0, -0.8, 0.0, 0.8, 1.0, 1.1])  # grid lines through a small obstacle, in its half sizes
 CLOSE = "closer than the robot's radius"
 MOVED_COLOUR = "#a6761d"  # colour of what a run moved
-LEAST_MOTION = 0.01  # way of an object that counts as moved, relative to the extent of the robot's
+LEAST_MOTION = 0.01  # distance that an object has to move to be drawn, relative to the extent of the run
 SHAPES = "sphere", "capsule", "cylinder", "box"  # other geoms are drawn as their bounding boxes
 CERTIFIED = RUNS[0]
 SENSED_CELLS = 80  # across a view, of the grid on which sensors are shown
@@ -91,7 +91,7 @@ class Views:
         if self.limits is not None:
             return self.limits
         ways = np.nanmax(self.places, axis=0) - np.nanmin(self.places, axis=0)
-        margin = np.maximum(1.5 * self.radius, EMPTY * np.maximum(ways, LEAST_WAY * ways.max()))
+        margin = np.maximum(1.5 * self.radius, LEAST_MARGIN * np.maximum(ways, LEAST_WAY * ways.max()))
         margin = margin if self.radius or ways.any() else MARGIN_AT_REST
         return bounds(self.places, self.world.seen_by(self.space.plane, self.space.offset), margin)
 

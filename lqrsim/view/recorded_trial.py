@@ -49,7 +49,7 @@ class RecordedTrial:
         if not (finite.any() and alive.any()):
             raise InputError(f"rollout: got trial {trial} without a finite state, want one that can be drawn")
         self.frame_times, self.frames = rollout.frame_times[finite], rollout.frames[trial][finite]
-        # Of the k finite states, as what follows.
+        # Rows of the k finite states.
         self.times, self.states = rollout.times[alive], rollout.states[trial, alive]
         self.measured = rollout.measured[trial, alive]
         self.error, self.clearance = rollout.tracking_error[trial, alive], rollout.clearance[trial, alive]
@@ -152,20 +152,16 @@ def model_of(rollout: Rollout, trial: Index) -> mujoco.MjModel:
     return model
 
 
+SKY = '<texture name="" type="skybox" builtin="gradient" rgb1=".93 .96 1" rgb2=".7 .78 .86" width="64" height="384"/>'
+
+
 @functools.lru_cache(maxsize=1)  # the trials of a run have one model, and its meshes take half a second
 def _compiled(xml: str) -> mujoco.MjModel:
-    return model_from_xml(with_sky(xml), "rollout.model")
-
-
-def with_sky(xml: str) -> str:
-    """The MJCF, with a light sky if it has none: MuJoCo would draw a black one."""
-    if "skybox" in xml or "</mujoco>" not in xml:
-        return xml
-    sky = (
-        '<texture name="" type="skybox" builtin="gradient" rgb1=".93 .96 1" rgb2=".7 .78 .86" width="64" height="384"/>'
-    )
-    end = xml.rindex("</mujoco>")
-    return f"{xml[:end]}<asset>{sky}</asset>{xml[end:]}"
+    """Compile an MJCF, with a light sky if it has none: MuJoCo would draw a black one."""
+    if "skybox" not in xml and "</mujoco>" in xml:
+        end = xml.rindex("</mujoco>")
+        xml = f"{xml[:end]}<asset>{SKY}</asset>{xml[end:]}"
+    return model_from_xml(xml, "rollout.model")
 
 
 def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:

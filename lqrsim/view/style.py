@@ -65,7 +65,7 @@ ROUNDING = 1e-6  # an axis whose range is a smaller part of its values shows tha
 HALF_RANGE = 0.025  # of the largest value on such an axis: what is shown on both sides of the middle
 AROUND = 7.0, 7.0  # lines of text in height and in width that a panel's title, numbers and labels take
 PAD = 0.07  # inches around panels
-GAP = 2.0  # pixels between the numbers of ticks at least
+GAP = 2.0  # least number of pixels between the numbers of ticks
 
 
 @contextlib.contextmanager
