@@ -267,7 +267,7 @@ def _checked(field: str, value: Any, spec: Declared, sizes: Sizes | None) -> Any
     origin, inside = get_origin(kind), get_args(kind)
     if origin is Callable:
         count = None if inside[0] is Ellipsis else len(inside[0])
-        check_function(field, value, want or f"a function of {count} arguments", arguments=count, optional=False)
+        check_function(field, value, want or f"a function of {count} arguments", arguments=count)
         return value
     if origin in _COLLECTIONS:
         return _items(field, value, spec, sizes)

@@ -222,15 +222,11 @@ def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: s
     return value
 
 
-def check_function(
-    field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True
-) -> None:
-    """Raises InputError unless `value` can be called with this number of arguments, or is None and optional.
+def check_function(field: str, value: object, want: str, *, arguments: int | None = None) -> None:
+    """Raises InputError unless `value` can be called with this number of arguments.
 
     Exceptions that it raises when it is called are not turned into InputErrors.
     """
-    if optional and value is None:
-        return
     if not callable(value):
         raise InputError(f"{field}: got {excerpt(value)}, want {want}")
     if arguments is None:
