@@ -180,9 +180,6 @@ class Browser(Viewer):
                 raise
         self._handle.set_model(self.model, data=self.data)
 
-    def __enter__(self) -> "Browser":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._handle.close()
 

@@ -29,14 +29,15 @@ DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups t
 
 
 class SceneRenderer:
-    """Draws views of a trial, in panes of its part of a picture; to be used with `with`, as it holds an OpenGL context.
+    """Draws views of a trial, in panes of its part of a picture, with an OpenGL context that the stack closes.
 
     MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
     """
 
     def __init__(
-        self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], box: Box, caption: Caption | None
-    ) -> None:
+        self, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], box: Box, caption: Caption | None,
+        stack: contextlib.ExitStack,
+    ) -> None:  # fmt: skip
         self.overlays, self.views, self.box, self.caption = overlays, views, box, caption
         self.recorded, self.model = overlays.recorded, overlays.recorded.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
@@ -51,22 +52,13 @@ class SceneRenderer:
         self.faded = np.zeros((len(views), self.model.ngeom))
         # A larger buffer costs as much as a larger picture, and a smaller one is refused.
         self.model.vis.global_.offwidth, self.model.vis.global_.offheight = box.width, box.height
-
-    def __enter__(self) -> "SceneRenderer":
-        height, width = self.pixels.shape[:2]
-        with contextlib.ExitStack() as stack:
-            self.window = gl_context.GLContext(width, height)
-            stack.callback(self.window.free)
-            self.window.make_current()
-            self.context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-            stack.callback(self.context.free)
-            stack.callback(self.window.make_current)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
-            self._open = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
+        self.window = gl_context.GLContext(box.width, box.height)
+        stack.callback(self.window.free)
+        self.window.make_current()
+        self.context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        stack.callback(self.context.free)
+        stack.callback(self.window.make_current)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
         """The picture (height, width, 3) at `time`, with the robot also at earlier times; the next call overwrites it.
@@ -239,7 +231,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
             areas = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
             named = zip((camera, *insets), areas, strict=True)
             views = [(area, camera_view(name, recorded, area.aspect, beside=recordings)) for name, area in named]
-            parts.append(stack.enter_context(SceneRenderer(drawn, views, box, caption)))
+            parts.append(SceneRenderer(drawn, views, box, caption, stack))
             panes += [
                 Pane(box.left + area.left, box.top + area.top, area.width, area.height, run, row, view.camera)
                 for area, view in views

@@ -15,22 +15,16 @@ from lqrsim.results.archive import excerpt_of, sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import record_from, tree_of
 from lqrsim.view.cameras import Camera
+from lqrsim.view.options import Box
 
 FORMAT, VERSION = "lqrsim footage", 1
 
 
 @checked
 @dataclass(frozen=True)
-class Pane:
-    """A part of the picture that shows one trial, in pixels from the upper left corner.
+class Pane(Box):
+    """A part of the picture that shows a row of one of the metadata's rollouts, with a camera if it is calibrated."""
 
-    It shows a row of one of the rollouts of the metadata, with a camera if that is calibrated.
-    """
-
-    left: int
-    top: int
-    width: int
-    height: int
     run: int = 0
     trial: int = 0
     camera: Camera | None = None

@@ -206,9 +206,6 @@ class Window(Viewer):
             self.aim_camera(self._viewer.cam)
             self._viewer.perturb.select = self.robot
 
-    def __enter__(self) -> "Window":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._viewer.close()
         for thread in self._threads:  # if the process ended before these threads, it would crash

@@ -3,6 +3,7 @@
 import abc
 import copy
 import time as clock
+from typing import Self
 
 import mujoco
 import numpy as np
@@ -87,6 +88,9 @@ class Viewer(abc.ABC):
         self._until = np.inf if seconds is None else clock.monotonic() + seconds
         self._trace: list[Array] = []
         self._floor = 0.0
+
+    def __enter__(self) -> Self:
+        return self
 
     @abc.abstractmethod
     def refresh(self) -> bool:
