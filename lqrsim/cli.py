@@ -95,14 +95,9 @@ def _run(arguments: list[str]) -> int:
     with process.printing(), process.environment(**{"COLUMNS": str(NARROWEST)} if too_narrow else {}):
         command = _parse(arguments)
 
-    if limit := _memory_limit():
-        memory = f"{limit / 1e6:.0f} MB of address space (ulimit -v), want at least {LEAST_MEMORY / 1e6:.0f} MB"
-        process.print_error(f"lqrsim: error: memory: got {memory}")
-        return 2
-
     from lqrsim.versions import outdated
 
-    if line := outdated():  # before the import that fails because of old packages
+    if line := _too_little_memory() or outdated():  # before imports that fail in little memory or with old packages
         process.print_error(f"lqrsim: error: {line}")
         return 2
 
@@ -141,17 +136,19 @@ def _run(arguments: list[str]) -> int:
         logger.removeHandler(notices)
 
 
-def _memory_limit() -> int:
-    """The limit of the address space in bytes if NumPy, SciPy, Numba and MuJoCo cannot be loaded within it; else 0.
+def _too_little_memory() -> str:
+    """A line if NumPy, SciPy, Numba and MuJoCo cannot be loaded within the limit of the address space; else empty.
 
     With less they end the process; or SciPy's OpenBLAS, as it is loaded, asks again for ever and no signal is heeded.
     """
     try:
         import resource
     except ImportError:  # Windows has no such limits
-        return 0
+        return ""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return limit if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY else 0
+    if limit == resource.RLIM_INFINITY or limit >= LEAST_MEMORY:
+        return ""
+    return f"memory: got {limit / 1e6:.0f} MB of address space (ulimit -v), want at least {LEAST_MEMORY / 1e6:.0f} MB"
 
 
 def _parse(arguments: list[str]) -> Any:
