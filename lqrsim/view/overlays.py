@@ -275,8 +275,10 @@ class Overlays:
             rgba = (*colour_of("funnel"), CERTIFIED_OPACITY[planar])
             yield self._tube("funnel", rgba, label, ellipsoids, certified, height=0.2)
         if len(between):
-            look = {"height": 0.1, "opacity": INTERPOLATED_OPACITY}
-            yield self._overlapping("interpolated", INTERPOLATED, "funnel, interpolated", ellipsoids, between, **look)
+            label, opacity = "funnel, interpolated", INTERPOLATED_OPACITY
+            yield self._overlapping(
+                "interpolated", INTERPOLATED, label, ellipsoids, between, height=0.1, opacity=opacity
+            )
 
     def _overlapping(
         self, name: str, colour: Colour, label: str, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], *,
