@@ -243,7 +243,7 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
     screen = Run(quadrotor, quadrotor_solution, 1).screen
     first = screen.goal
     assert screen.hold(0) == screen.robot
-    screen.press(PUSHES["PageUp"], 0.0)
+    screen.push(PUSHES["PageUp"], 0.0)
     assert screen.pop_wrench(1.0)[2] > 0
     np.testing.assert_array_equal(screen.goal, first)
     assert screen.hold(screen.other()) == screen.goal_body  # Enter
@@ -253,7 +253,7 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
         ("PageDown", 5.0, (0, 0, -1)),
     ):
         before = screen.goal
-        screen.press(PUSHES[key], azimuth)
+        screen.push(PUSHES[key], azimuth)
         np.testing.assert_allclose(screen.goal - before, 0.1 * np.array(way), atol=1e-12)
     assert not screen.pop_wrench(1.0).any()
     assert screen.hold(0) == screen.goal_body  # a click on nothing
@@ -373,7 +373,7 @@ needs_browser = pytest.mark.skipif(not browsing.CHROMIUM, reason="there is no br
 def test_keys_and_the_mouse_move_the_goal(tmp_path: Path) -> None:
     """In the browser: after Enter an arrow key moves it, and Ctrl with the right mouse button drags it."""
     before = """import lqrsim.view.viewer_base as viewer_base
-move, press, key = viewer_base.Viewer.move_goal, viewer_base.Viewer.press, []
+move, press, key = viewer_base.Viewer.move_goal, viewer_base.Viewer.push, []
 def moved(self, place):
     before = self.goal
     move(self, place)
@@ -383,7 +383,7 @@ def pressed(self, direction, azimuth):
     key.append(self.holds_goal)
     press(self, direction, azimuth)
     key.clear()
-viewer_base.Viewer.move_goal, viewer_base.Viewer.press = moved, pressed"""
+viewer_base.Viewer.move_goal, viewer_base.Viewer.push = moved, pressed"""
     with viewing(tmp_path, "quadrotor", "--port", str(PORT), "--replan", "30", before=before) as process:
         text = said(process, "Ctrl-C ends it")
         assert "plans again every 0.03333 s, 30 times a second" in text

@@ -106,7 +106,7 @@ class _SimulationSide(plugin.SimPlugin):
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_key_press(self, event: _KeyPress) -> None:
-        self.owner.press(PUSHES[event.key], event.azimuth)
+        self.owner.push(PUSHES[event.key], event.azimuth)
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_perturb(self, event: messages.PerturbSnapshot) -> bool:

@@ -187,7 +187,7 @@ class Window(Viewer):
 
         def pressed(code: int) -> None:
             if code in keys:
-                self.press(keys[code], self._viewer.cam.azimuth)
+                self.push(keys[code], self._viewer.cam.azimuth)
             elif code == 257:  # enter
                 self._viewer.perturb.select = self.other()
             elif code == 32:  # the space bar

@@ -155,17 +155,16 @@ class Viewer(abc.ABC):
         """The body that Enter selects: the robot or the goal, whichever is not held."""
         return self.robot if self.holds_goal or not self.goal_body else self.goal_body
 
-    def press(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
-        """Push the robot, or move the goal if it is held; see `push`."""
-        if not self.holds_goal:
-            self.push(right_away_up, azimuth)
-            return
-        step = GOAL_STEP * _seen_from(azimuth, right_away_up)
-        self.move_goal(self.goal + self.space.of_world(step))
-
     def push(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
-        """Push the robot in a direction relative to a camera that looks along `azimuth`, in degrees."""
-        self._impulse += self._push * _seen_from(azimuth, right_away_up)
+        """Push the robot, or move a goal that is held, as seen from a camera that looks along `azimuth`, in degrees."""
+        (right, away, up), along = right_away_up, np.radians(azimuth)
+        x = right * np.sin(along) + away * np.cos(along)
+        y = away * np.sin(along) - right * np.cos(along)
+        direction = np.array([x, y, up])  # along the world's axes
+        if self.holds_goal:
+            self.move_goal(self.goal + self.space.of_world(GOAL_STEP * direction))
+        else:
+            self._impulse += self._push * direction
 
     def drag(self, wrenches: Array) -> None:
         """Drag the robot with the sum of forces and torques (nbody, 6), up to the strongest drag."""
@@ -234,11 +233,3 @@ class Viewer(abc.ABC):
                 break
             clock.sleep(float(np.clip(left / self.speed, 0.001, 0.01)))
         self._overrun = -left
-
-
-def _seen_from(azimuth: float, right_away_up: tuple[float, float, float]) -> Array:
-    """Convert a direction relative to a camera that looks along `azimuth`, in degrees, to the world's axes, (3,)."""
-    along, (right, away, up) = np.radians(azimuth), right_away_up
-    x = right * np.sin(along) + away * np.cos(along)
-    y = away * np.sin(along) - right * np.cos(along)
-    return np.array([x, y, up])
