@@ -207,7 +207,7 @@ class Browser(Viewer):
 def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
     """A block in which MuJoCo's server starts on loopback only, refuses uploads, and admits only its own pages.
 
-    Three functions of MuJoCo are replaced, for which 4.0 has no option. Without them, 4.0.0 does this, as we tried:
+    Three functions of MuJoCo are replaced, for which 4.0 has no option. Without them, 4.0.0 does this:
 
     - `web_server.bind_public_socket`: the viewer passes `::` to it, and the server answers at 127.0.0.2, at ::1 and at
       the machine's addresses in the network.

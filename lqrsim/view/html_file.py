@@ -118,7 +118,7 @@ class _Arrays:
     def rounded(self, values: Array) -> dict[str, Any]:
         """Append a table (k, c) in 16 bits of the range of each column.
 
-        What is kept are differences of rows, column by column, which compress best.
+        The differences of rows are stored, column by column, which compress best.
         """
         table = values.reshape(len(values), math.prod(values.shape[1:]))
         low, high = table.min(axis=0, initial=np.inf), table.max(axis=0, initial=-np.inf)

@@ -1,4 +1,4 @@
-"""What is drawn over the scene of a trial, and what texts say of it: lines, dots, tubes, bodies and an arrow over time.
+"""Overlays of a trial, as lines, dots, tubes, bodies and an arrow in the scene over time; and its readings as text.
 
 Each is drawn by MuJoCo (`geoms.py`), by a page in a browser (`html_file.py`) and by Rerun (`rerun_file.py`).
 """
@@ -67,7 +67,7 @@ class Line(Drawable):
 
 @dataclass(frozen=True, eq=False)
 class Dots(Drawable):
-    """Boxes of half sizes (3,) at points (k, 3), each for some `seconds` from its time (k,) on."""
+    """Boxes of half sizes (3,) at points (k, 3), each shown for `seconds` from its time (k,) on."""
 
     points: Array
     times: Array
@@ -107,7 +107,7 @@ class MovingBody(Drawable):
 
 @dataclass(frozen=True, eq=False)
 class Arrow(Drawable):
-    """The arrow of a force (T, 3) in each period, `width` thick, which begins `gap` from the robot, to be seen."""
+    """The arrow of a force (T, 3) in each period, `width` thick; it begins `gap` from the robot, which may hide it."""
 
     forces: Array
     gap: float
