@@ -15,7 +15,7 @@ import sys
 import sysconfig
 import types
 import warnings
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -259,8 +259,11 @@ def check_text(field: str, value: object, want: str = "text", *, at_most: int = 
     return value
 
 
-def check_path(field: str, value: object, want: str = "the path of a file") -> Path:
-    """`value` as a valid path of a file, with names in UTF-8 of at most 255 bytes. Raises InputError otherwise."""
+def check_path(field: str, value: object, want: str = "the path of a file", *, suffixes: Collection[str] = ()) -> Path:
+    """`value` as a valid path of a file, with names in UTF-8 of at most 255 bytes. Raises InputError otherwise.
+
+    With `suffixes`, such as (".html",), its name has to end in one of them.
+    """
     name: object = value
     try:
         if not isinstance(value, (str, os.PathLike)):
@@ -272,7 +275,10 @@ def check_path(field: str, value: object, want: str = "the path of a file") -> P
         good = False
     if not good:
         raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names in UTF-8 of at most 255 bytes")
-    return Path(name)  # pyright: ignore[reportArgumentType]
+    path = Path(name)  # pyright: ignore[reportArgumentType]
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(f"{field}: got {excerpt(path.name)}, want a name that ends in {', '.join(suffixes)}")
+    return path
 
 
 def check_items(

@@ -125,7 +125,7 @@ def test_bad_input_gets_one_line(
     tmp_path: Path,
 ) -> None:
     world = differential_drive.scene.world
-    with pytest.raises(ls.InputError, match=r"path: got .*figure\.jpg', want a name that ends in one of: \.png"):
+    with pytest.raises(ls.InputError, match=r"path: got .*figure\.jpg', want a name that ends in \.png"):
         plot_run(drive_solution, drive_runs, tmp_path / "figure.jpg", world=world)
     with pytest.raises(ls.InputError, match="rollouts: got 0, want 1 to 4"):
         plot_run(drive_solution, {}, tmp_path / "figure.png", world=world)

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import checked
-from lqrsim.errors import Array, InputError, check_path, excerpt
+from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
@@ -66,9 +66,7 @@ def render_html(
       trial: row of the rollout, or several rows; by default all trials that have a finite state.
       overlays: as in `render`, except that there is always a caption.
     """
-    path = check_path("path", path)
-    if path.suffix.lower() != ".html":
-        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in .html")
+    path = check_path("path", path, suffixes=(".html",))
     rows, arrays = _rows(rollout, trial), _Arrays()
     scale = common_scale(RecordedTrial(rollout, row) for row in rows)
 

@@ -159,10 +159,8 @@ def render(
     Returns:
       The path. A notebook shows the video or the still if the call is a cell's last expression.
     """
-    path = check_path("path", path)
+    path = check_path("path", path, suffixes=MEDIA_TYPES)
     kind = path.suffix.lower()
-    if kind not in MEDIA_TYPES:
-        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {', '.join(MEDIA_TYPES)}")
     still, animated = kind == ".png", kind == ".gif"
     if not still and (time is not None or every is not None):
         raise InputError(f"time, every: got {excerpt(path.name)}, want FILE.png: they belong to stills")

@@ -19,7 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 
 from lqrsim.annotations import checked
-from lqrsim.errors import InputError, check_path, excerpt
+from lqrsim.errors import check_path
 from lqrsim.results.archive import replacing
 
 PLAN = "#222222"
@@ -78,10 +78,7 @@ def figure(
     A block that fails writes nothing. Numbers of ticks that would overlap, and titles wider than their axes, are mended
     when the block ends: layout engines do not do that. By default `style` gives the width and `arrange` the height.
     """
-    places = [check_path("path", path) for path in paths]
-    for place in places:
-        if place.suffix.lower() not in METADATA:
-            raise InputError(f"path: got {excerpt(place.name)}, want a name that ends in one of: {', '.join(METADATA)}")
+    places = [check_path("path", path, suffixes=METADATA) for path in paths]
     look = LAYOUTS[style]
     text = {"font.size": look.text, "axes.titlesize": look.text * STYLE["axes.titlesize"] / STYLE["font.size"]}
     with contextlib.ExitStack() as stack:
