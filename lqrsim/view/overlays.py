@@ -20,6 +20,7 @@ from lqrsim.view.options import OVERLAY_KINDS, Colour, Overlay
 from lqrsim.view.recorded_trial import RecordedTrial, interpolated
 
 Shown = Annotated[Sequence[Overlay], Want("a tuple of overlays")]
+Rgba = tuple[float, float, float, float]
 
 # Opacities for planar robots and for robots in space.
 TUBE_OPACITY = {True: 0.43, False: 0.2}  # of a whole tube
@@ -42,7 +43,7 @@ class Drawable:
     """Something in the world, in metres and seconds."""
 
     name: str  # of the overlay, of a part of it, or of an obstacle that moves
-    rgba: tuple[float, float, float, float]
+    rgba: Rgba
     label: str  # in the legend; none if empty
 
 
@@ -198,16 +199,16 @@ class Overlays:
             return relative * width, 0.2 * LIFT if planar else relative * width
 
         if "plan" in show:
-            yield Line("plan", opaque("plan"), "planned", recorded.planned(times) + 2 * lift, profile(0.8))
+            yield Line("plan", rgba_of("plan"), "planned", recorded.planned(times) + 2 * lift, profile(0.8))
         if "forces" in show and self.scale.force >= 1e-6:
             gap = min(run.radius, 0.1 * recorded.model.stat.extent)  # the radius of an arm is its reach
             label, longest = f"force, longest {self.scale.force:.2g} N", ARROW * gap
             thick, for_newton = max(0.1 * gap, 1.5 * width), longest / self.scale.force
-            yield Arrow("forces", opaque("forces"), label, recorded.force, gap, thick, for_newton)
+            yield Arrow("forces", rgba_of("forces"), label, recorded.force, gap, thick, for_newton)
         if "measured" in show and position and not np.array_equal(recorded.measured, recorded.states):
             points = run.in_world(recorded.measured[:, position], height=recorded.floor) + 3 * lift
             sizes, seconds = (width, *profile(1.0)), DOTS * run.plan.dt
-            yield Dots("measured", opaque("measured"), "measured", points, recorded.times, sizes, seconds)
+            yield Dots("measured", rgba_of("measured"), "measured", points, recorded.times, sizes, seconds)
         if tube is not None:
             yield tube
         if "cost_tube" in show:
@@ -227,7 +228,7 @@ class Overlays:
             places, kind = recorded.planned(run.times), "cylinder" if planar else "sphere"
             if planar:
                 places[:, 2] = recorded.floor + 3 * LIFT
-            rgba, size = (*colour_of("ghost"), GHOST_OPACITY[planar]), np.array([recorded.ghost_radius, LIFT, 0.0])
+            rgba, size = rgba_of("ghost", GHOST_OPACITY[planar]), np.array([recorded.ghost_radius, LIFT, 0.0])
             yield MovingBody("ghost", rgba, "", kind, size, np.eye(3), run.times, places)
 
     def _moving(self) -> Iterator[MovingBody]:
@@ -272,7 +273,7 @@ class Overlays:
         if len(certified):
             certified = certified[np.linspace(0, len(certified) - 1, min(MOST_ELLIPSOIDS, len(certified))).astype(int)]
             label = f"funnel: {100 * funnel.rate:g} % succeed, confidence {100 * funnel.confidence:g} %"
-            rgba = (*colour_of("funnel"), CERTIFIED_OPACITY[planar])
+            rgba = rgba_of("funnel", CERTIFIED_OPACITY[planar])
             yield self._tube("funnel", rgba, label, ellipsoids, certified, height=0.2)
         if len(between):
             label, opacity = "funnel, interpolated", INTERPOLATED_OPACITY
@@ -293,9 +294,8 @@ class Overlays:
         return self._tube(name, (*colour, float(alpha)), label, ellipsoids, knots, height=height)
 
     def _tube(
-        self, name: str, rgba: tuple[float, float, float, float], label: str, ellipsoids: Ellipsoids,
-        knots: npt.NDArray[np.int64], *, height: float,
-    ) -> DrawnTube:  # fmt: skip
+        self, name: str, rgba: Rgba, label: str, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], *, height: float
+    ) -> DrawnTube:
         """The ellipsoids at these knots in the world, at this height above a floor in units of LIFT."""
         space = self.recorded.rollout.state_coordinates
         size, count = len(space.position), len(knots)
@@ -316,9 +316,9 @@ def colour_of(overlay: Overlay) -> Colour:
     return colour
 
 
-def opaque(overlay: Overlay) -> tuple[float, float, float, float]:
-    """The colour of an overlay that hides what is behind it."""
-    return (*colour_of(overlay), 1.0)
+def rgba_of(overlay: Overlay, opacity: float = 1.0) -> Rgba:
+    """The colour of an overlay that has one, with its opacity."""
+    return (*colour_of(overlay), opacity)
 
 
 def legend_entries(overlays: Iterable[Overlays]) -> dict[str, Colour | None]:

@@ -13,7 +13,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.view import geoms
-from lqrsim.view.overlays import Line, MovingBody, colour_of
+from lqrsim.view.overlays import Line, MovingBody, rgba_of
 from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
 GHOST_OPACITY = 0.25
@@ -189,14 +189,14 @@ class Viewer(abc.ABC):
         """Draw the plan, the trace and the planned place; `new` returns a new geom."""
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
         plan = np.array([self._on_floor(self._places[knot]) for knot in knots])
-        width, colour, flat = 0.002 * float(self.model.stat.extent), colour_of("plan"), self.space.from_above
+        width, flat = 0.002 * float(self.model.stat.extent), self.space.from_above
         radius = self.radius if self._balls is None else float(self._balls.radii[-1])
         kind, size = "cylinder" if flat else "sphere", np.array([radius, LIFT, 0.0])
         place, now = self.planned_position()[None], np.zeros(1)
         for drawable in (
-            Line("plan", (*colour, 1.0), "", plan, (0.6 * width, 0.6 * width)),
+            Line("plan", rgba_of("plan"), "", plan, (0.6 * width, 0.6 * width)),
             Line("trace", TRACE_RGBA, "", np.array(self._trace), (width, width)),
-            MovingBody("ghost", (*colour, GHOST_OPACITY), "", kind, size, np.eye(3), now, place),
+            MovingBody("ghost", rgba_of("ghost", GHOST_OPACITY), "", kind, size, np.eye(3), now, place),
         ):
             geoms.draw(drawable, self._time, new, emission=0.0)
 
