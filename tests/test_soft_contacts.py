@@ -204,7 +204,8 @@ SWIMMER = """<mujoco><option timestep="0.01" density="4000" viscosity="0.1" inte
 
 
 @pytest.mark.long
-def test_softening_does_not_bring_back_a_plan_that_does_nothing() -> None:
+def test_a_swimmer_does_not_rest() -> None:
+    """Where it rests, no small control moves it forward: at first order, a plan that does nothing is optimal."""
     robot = ls.MjcfRobot(scene_from_xml(SWIMMER, "swimmer"))
     low, high = robot.dynamics.control_coordinates.low, robot.dynamics.control_coordinates.high
     ends = [100.0, *[0.0] * 9]
@@ -213,12 +214,12 @@ def test_softening_does_not_bring_back_a_plan_that_does_nothing() -> None:
         stage_cost=ls.ControlCost([0.01, 0.01]), final_cost=ls.QuadraticCost(ends, about=robot.at(x=0.5)),
         control_limits=(low, high),
     )  # fmt: skip
-    solution = ls.smooth(problem, max_iterations=6)
-    rest = solution.candidates[0]
-    assert rest.status is ls.Status.CONVERGED
-    assert any("softness" in one.start for one in solution.candidates)
-    assert rest.cost == pytest.approx(0.5 * 100 * 0.5**2)  # at rest, that of the goal alone
-    assert solution.cost < 0.99 * rest.cost
+    solution = ls.smooth(problem, max_iterations=12)
+    at_rest = 0.5 * 100 * 0.5**2  # that of the goal alone
+    true = [one for one in solution.candidates if not one.start.startswith("contacts of softness")]
+    assert len(true) < len(solution.candidates)  # the first plan has not converged
+    assert solution.cost <= min(one.cost for one in true)
+    assert solution.cost < 0.75 * at_rest
 
 
 def test_the_time_limit_ends_the_solves_for_softer_contacts_too() -> None:
