@@ -409,6 +409,8 @@ def excerpt(value: object) -> str:
             return f"{type(value).__name__} of {len(value)}"  # pyright: ignore[reportArgumentType]
         elif isinstance(value, int) and value.bit_length() > 1000:
             return f"an int of {value.bit_length()} bits"
+        elif isinstance(value, np.number):
+            value = value.item()  # 0.5, not np.float64(0.5)
         elif dataclasses.is_dataclass(value):  # its repr may have megabytes
             return value.__name__ if isinstance(value, type) else f"{type(value).__name__}(...)"
         text = " ".join(without_addresses(repr(value)).split())

@@ -7,6 +7,7 @@ from pathlib import Path
 import between_knots
 import numpy as np
 import pytest
+from failing_solves import rattled
 from sampling import rarely
 from scipy.integrate import solve_ivp
 
@@ -96,6 +97,20 @@ def test_accuracy_takes_as_many_substeps_as_it_needs() -> None:
     # It is the plan of dynamics with so many: from there nothing is left to do.
     again = ls.smooth(replace(SWING, dynamics=PENDULUM.with_substeps(substeps)), start=fine)
     np.testing.assert_allclose(again.trajectory.states, plan.states, atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [16, 20, 40])
+def test_a_plan_of_many_substeps_is_looked_at_with_them(steps: int) -> None:
+    """With one step in a period of many vibrations nothing of the motion is seen, and the plan was called coarse."""
+    found = ls.smooth(rattled(steps=steps))
+    assert found.success
+    looked = found.between_knots()
+    assert looked.step_error <= 1e-6
+    assert "accuracy=" not in str(found)
+    # The vibration's amplitude is 1, and what one step in a period makes of it has nothing to do with that.
+    plan, shaken = found.trajectory, np.sin(1e3 * found.trajectory.states[:, 0])
+    moved = plan.states[0, 1] + np.append(0.0, np.cumsum(plan.controls[:, 0]) * plan.dt) + shaken
+    assert np.abs(plan.states[:, 1] - moved).max() == pytest.approx(looked.end_error, abs=1e-6)
 
 
 def test_errors_are_those_by_scipy() -> None:

@@ -443,6 +443,21 @@ def short(by: float) -> ls.Solution:
     return replace(plan, goal=goal, goal_radius=0.3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_that_comes_back_to_its_start_misses_by_a_tenth_of_how_far_it_went(seed: int) -> None:
+    """Where no radius is known. A body that turns in place ends at its goal but for rounding: that is no miss."""
+    rng, plan = np.random.default_rng(seed), hover()
+    states = plan.trajectory.states
+    bent = np.sin(np.linspace(0.0, np.pi, len(states)))[:, None] * rng.normal(size=3)
+    for away, off, missed in ((0.0, 1e-9, False), (1.0, 0.09, False), (1.0, 0.11, True), (1e-9, 1e-3, True)):
+        moved = states.copy()
+        moved[:, :3] = states[0, :3] + away * bent
+        farthest = np.linalg.norm(moved[:, :3] - states[0, :3], axis=1).max()
+        moved[-1, :3] = states[0, :3] + (off * farthest if away == 1.0 else off) * np.eye(3)[0]
+        back = replace(plan, goal=states[0], goal_radius=None, trajectory=replace(plan.trajectory, states=moved))
+        assert ("MISSES" in str(back)) == missed
+
+
 def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage: Plant) -> None:
     solution = short(1.9)
     rollout = ls.simulate(cage, solution, trials=2)

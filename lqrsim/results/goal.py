@@ -215,7 +215,8 @@ class Target:
     def of_plan(self, radius: float | None) -> list[str]:
         """Lines on the end of the plan: its distance from the goal, and another line if the plan misses the goal.
 
-        Without a radius, a plan misses if it ends farther from the goal than a tenth of the way from its start.
+        Without a radius, a plan misses if it ends farther from the goal than a tenth of the way from its start; of the
+        farthest on the way, if it starts at the goal.
         """
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
@@ -225,7 +226,12 @@ class Target:
         worst = self.worst(self.plan[-1], radius)
         end = self.describe(float(self.distance(self.plan[-1])))
         lines = [f"the plan ends {end}{within}{f': {worst}' if worst else ''}"]
-        if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):
+        if radius is None:
+            away = self.distance(self.plan)
+            allowed = max(TOLERANCE * float(away[0] if away[0] > NEGLIGIBLE else away.max()), NEGLIGIBLE)
+        else:
+            allowed = radius
+        if self.misses(allowed):
             by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
             mend = "raise the weights of the final cost or, if controls are at their limits, the number of steps"
             lines.append(f"the plan MISSES the goal{by}: {mend}")

@@ -206,6 +206,10 @@ def solve_between_knots(
             break
         if rounds >= ROUNDS or stop.due:
             status, remedy = Status.STALLED, "use more steps"
+            if coarse:
+                assert problem.accuracy is not None
+                times = math.ceil((2 * errors.step_error / problem.accuracy) ** (1 / ORDER))
+                remedy = f"use {times} times as many steps, or a larger accuracy than {problem.accuracy:g}"
             if stop.due:
                 status, remedy = Status.TIME_LIMIT, "raise time_limit"
             wrong = errors.record(at_knots)._faults(tolerance, problem.accuracy or np.inf)

@@ -108,7 +108,9 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     if problem.control_rate is not None:
         solve_part = partial(solve_with_rates, solve=solve_part)
     solution = solve_part(problem, settings)
-    vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, problem, solution.trajectory))
+    substeps = solution.options.get("substeps")  # of dynamics whose single steps may be too coarse to look with
+    seen = replace(problem, dynamics=problem.dynamics.with_substeps(substeps)) if isinstance(substeps, int) else problem
+    vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, seen, solution.trajectory))
     return solution
 
 

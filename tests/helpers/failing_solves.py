@@ -113,6 +113,20 @@ def fragile(limit: float) -> ls.Problem:
     return replace(problem(final=100.0), dynamics=ls.Dynamics(rate, level="plain", **FIELDS))
 
 
+def rattled(*, steps: int = 4, accuracy: float = 1e-6) -> ls.Problem:
+    """A position that a forced vibration of 160 Hz shakes, for two seconds; a clock is among the states."""
+    from sympy import cos
+
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [1.0, p.w * cos(p.w * x.clock) + u.v], states={"clock": "s", "x": "m"}, controls={"v": "m/s"},
+        parameters={"w": 1e3},
+    )  # fmt: skip
+    return ls.Problem(
+        dynamics=dynamics, dt=2.0 / steps, steps=steps, initial=ls.FixedState(np.zeros(2)), accuracy=accuracy,
+        stage_cost=ls.ControlCost([1.0]), final_cost=ls.QuadraticCost({"x": 100.0}, about={"x": 1.0}),
+    )  # fmt: skip
+
+
 CASES = {
     "too late": Case(
         "INFEASIBLE", "allow more time than 1.5 s, relax the limits of u, or ask for less of what is missed",
@@ -170,6 +184,10 @@ CASES = {
     "steps that are unstable": Case(
         "NOT_FINITE", "use dt of at most 0.00103 s, with 98 times as many steps", problem(brake, start=(0.0, 30.0)), {},
         [(problem(brake, start=(0.0, 30.0), dt=0.001, steps=1500), {})], ls.ilqr,
+    ),
+    "steps that are too few for the accuracy": Case(
+        "STALLED", "use 3 times as many steps, or a larger accuracy than 1e-06", rattled(), {},
+        [(rattled(steps=12), {}), (rattled(accuracy=1e-4), {})],
     ),
     "too few iterations": Case(
         "MAX_ITERATIONS", "raise max_iterations: the cost still fell in the last one, by ", UPRIGHT,
