@@ -124,7 +124,7 @@ def test_the_room_is_that_of_the_normal_distribution(own: str, hardened: Hardene
     [
         ("", 2.0, "not after 1 plans; allow more rounds, or a higher chance"),
         (",near=1", 2.0, "there is no plan with more room"),
-        ("", 8.0, "of the failing runs leave the last one for good; more range of the controls"),
+        ("", 8.0, "of the failing runs leave the last one for good; give the controls more range"),
     ],
 )
 def test_what_cannot_be_reached_says_why(own: str, words: str, strength: float, says: str) -> None:
@@ -140,11 +140,65 @@ def test_what_cannot_be_reached_says_why(own: str, words: str, strength: float, 
     assert found.rare.probability.value == min(measured)
 
 
+@pytest.mark.parametrize(
+    ("words", "more", "options", "says", "changes"),
+    [
+        (
+            "", {}, {"rounds": 1}, "not after 1 plans; allow more rounds, or a higher chance",
+            [("", {}, {"rounds": 4}), ("", {}, {"rounds": 1, "chance": 0.3})],
+        ),
+        (
+            ",near=1", {}, {"rounds": 2}, "there is no plan with more room; allow a higher chance, or another route",
+            [(",near=1", {}, {"chance": 0.1}), ("", {}, {})],
+        ),
+        (
+            "", {}, {"rounds": 2, "particles": 25}, "an interval; allow more particles or repetitions",
+            [("", {}, {"rounds": 2}), ("", {}, {"rounds": 2, "particles": 25, "repetitions": 16})],
+        ),
+        (
+            "", {"strength": 4.0}, {}, "design the law for what is run (without design_disturbances)",
+            [(",limit=8", {"strength": 4.0, "design_disturbances": None}, {}),
+             ("", {"strength": 4.0}, {"chance": 0.6})],
+        ),
+    ],
+    ids=["few rounds", "no room", "wide interval", "leaves for good"],
+)  # fmt: skip
+def test_what_its_reason_advises_helps(
+    own: str, words: str, more: dict[str, Any], options: dict[str, Any], says: str, changes: list[Any]
+) -> None:
+    def found(words: str, more: dict[str, Any], options: dict[str, Any]) -> HardenedPlan:
+        problem = stated(own + words, **more)
+        if "near" in words:  # a search for a safe first plan would take long
+            problem = replace(problem, solution=ls.smooth(problem.resolved.problem))
+        return ls.stress.harden(problem, **FEW | options)
+
+    failed = found(words, more, options)
+    assert not failed.success
+    assert says in failed.reason
+    for change in changes:
+        better = found(*change)
+        assert better.success, str(better)
+
+
+def test_more_range_of_the_controls_keeps_runs_near_their_plan(own: str) -> None:
+    """So does a law that is designed for the forces of the runs, here four times those it was told."""
+    weak, strong, knowing = (
+        ls.stress.harden(problem, **FEW, rounds=2).rounds[-1].strays
+        for problem in (
+            stated(own, strength=4.0), stated(f"{own},limit=8", strength=4.0),
+            stated(own, strength=4.0, design_disturbances=None),
+        )
+    )  # fmt: skip
+    assert weak > 0.5
+    assert max(strong, knowing) < 0.25
+
+
 def test_it_ends_early_where_all_failing_runs_leave_the_plan(own: str, hardened: HardenedPlan) -> None:
     search = _Search(stated(own), CHANCE, {})
     search.rounds.append(replace(hardened.rounds[0], hit={}, strays=1.0))
     assert search.next() is None
     assert search.shortfall().startswith("all failing runs leave the plan for good")
+    assert search.shortfall().endswith("; " + search.remedy)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -205,7 +205,7 @@ def solve_between_knots(
         if not (coarse or missed):
             break
         if rounds >= ROUNDS or stop.due:
-            status, remedy = Status.STALLED, "use more steps"
+            status, remedy = Status.STALLED, "use twice as many steps"
             if coarse:
                 assert problem.accuracy is not None
                 times = math.ceil((2 * errors.step_error / problem.accuracy) ** (1 / ORDER))

@@ -49,7 +49,6 @@ FAILING_TRIALS = 10  # trials of each repetition that fail at the requested prob
 MOST_COUNTED = 100_000  # trials that are run where splitting found no failure: about as many as two splittings
 REPLAYED_FAILURES = 300  # failing runs that are run again, to see where they fail
 MOST_ROUNDS = 20
-REMEDY = "more range of the controls, less lag, or other tolerances may help"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -245,7 +244,7 @@ class _Search:
         if last.rare is None:  # nothing tells where the plan needs more room
             return None
         if not any(name in last.hit for name in self.names):
-            self.ended = f"all failing runs leave the plan for good, which more room does not prevent; {REMEDY}"
+            self.ended = f"all failing runs leave the plan for good, which more room does not prevent; {self.remedy}"
             return None
         more = self.wanted(last) - self.deviations
         for fraction in (1.0, 0.5, 0.25):  # as much of it as there is room for
@@ -335,15 +334,32 @@ class _Search:
                 f" particles: from {ceil(FAILING_TRIALS / self.chance):,} on failures are counted"
             )
         after, strays = f"not after {len(self.rounds)} plans", last.strays
+        safest = self.safest()
+        found = self.rounds[safest].probability
+        if found.value <= self.chance:
+            return (
+                f"the probability of plan {safest + 1} is measured as {found.low:.2g} to {found.high:.2g}, too wide an"
+                " interval; allow more particles or repetitions, or a higher chance"
+            )
         if strays < 0.5:
             return f"{after}; allow more rounds, or a higher chance"
-        return f"{after}, because {100 * strays:.0f} % of the failing runs leave the last one for good; {REMEDY}"
+        return f"{after}, because {100 * strays:.0f} % of the failing runs leave the last one for good; {self.remedy}"
+
+    @property
+    def remedy(self) -> str:
+        """What helps against runs that leave their plan for good."""
+        told = self.problem.policy in DESIGNED and self.problem.design_disturbances is not None
+        design = ", design the law for what is run (without design_disturbances)" if told else ""
+        return f"give the controls more range{design}, or allow a higher chance"
+
+    def safest(self) -> int:
+        """The number of the safest plan so far; one without failures is as safe as its trials prove."""
+        measured = [(plan.probability.high if plan.rare is None else plan.probability.value) for plan in self.rounds]
+        return int(np.argmin(measured))
 
     def result(self, reason: str) -> HardenedPlan:
         """The last plan if there is no reason against it, else the safest of the plans so far."""
-        # A plan without failures is as safe as its trials prove.
-        measured = [(plan.probability.high if plan.rare is None else plan.probability.value) for plan in self.rounds]
-        chosen = int(np.argmin(measured)) if reason else len(self.rounds) - 1
+        chosen = self.safest() if reason else len(self.rounds) - 1
         return HardenedPlan(
             problem=self.problem, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,
             reason=reason,

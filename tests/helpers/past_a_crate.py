@@ -5,13 +5,14 @@ The force is drawn once for each trial. The exact dynamics are those of a `Simul
 
 OWN = """
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlOffset
 from lqrsim.simulators import Simulator
-from lqrsim.templates.my_robot.my_robot import MJCF, MyRobot
+from lqrsim.templates.my_robot.my_robot import MJCF, MyRobot, rate
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,22 @@ class Euler(Simulator):
         return simulations
 
 
-def told(offset: float = 0.25, pillar: bool = True, near: bool = False) -> ls.Scenario:
-    robot, scene = MyRobot(), ls.load_scene(MJCF)
+@dataclass(frozen=True)
+class Pushed(MyRobot):
+    limit: float = 2.0  # N
+
+    @cached_property
+    def dynamics(self):
+        states = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}
+        return ls.Dynamics(
+            rate, states=states, controls={"push_x": "N", "push_y": "N"}, position=("x", "y"),
+            parameters={"mass": self.mass, "damping": self.damping}, disturbances={"force_x": 0.0, "force_y": 0.0},
+            control_limits=(-self.limit, self.limit),
+        )
+
+
+def told(offset: float = 0.25, pillar: bool = True, near: bool = False, limit: float = 2.0) -> ls.Scenario:
+    robot, scene = MyRobot() if limit == 2.0 else Pushed(limit=limit), ls.load_scene(MJCF)
     world = scene.world if pillar else ls.World([one for one in scene.world.obstacles if one.name != "pillar"])
     problem = ls.Problem(
         dynamics=robot.dynamics, dt=0.1, steps=24, initial=ls.FixedState((-1.0, 0.3, 0.0, 0.0)),
