@@ -1,6 +1,7 @@
 """Robots in a plane: what they see of the world, against MuJoCo, and who is refused because it moves in another."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import mujoco
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from mechanisms import Jointed
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 from sampling import examples
 from scipy.spatial.transform import Rotation
@@ -312,7 +314,10 @@ def test_a_robot_in_another_plane_fits_with_its_plane_and_where_it_is() -> None:
     [
         (PlanarQuadrotor(names=("a", "b")), {}, r"the plane 'xy'; .* a along \+x, b along \+z; want plane='xz'"),
         (PlanarQuadrotor(names=("a", "b"), plane="zx"), {}, "want plane='xz'"),
-        (PlanarQuadrotor(), {"level": "y"}, r"x along \+y, z along \+z; want plane='yz'"),
+        (
+            PlanarQuadrotor(), {"level": "y"},
+            r"x along \+y, z along \+z; want plane='yz', and names that tell it, such as \(y, z\)$",
+        ),
         (PlanarQuadrotor(), {"y": 0.7}, "at y = 0 m, where MuJoCo has body 'drone' at y = 0.7 m; want offset=0.7"),
         (PlanarQuadrotor(offset=0.7), {}, "at y = 0.7 m, where MuJoCo has body 'drone' at y = 0 m; want offset=0"),
     ],
@@ -321,6 +326,26 @@ def test_a_robot_of_another_plane_is_refused_with_the_remedy(robot, scene, messa
     with pytest.raises(ls.InputError, match=message) as refused:
         fitted(robot, **scene)
     assert "\n" not in str(refused.value)
+
+
+@settings(max_examples=examples(20))
+@given(
+    st.sampled_from([("x", "z"), ("y", "z"), ("a", "b")]), st.sampled_from(("x", "y")),
+    st.floats(-3.0, 3.0).map(lambda number: round(number, 3)), st.sampled_from([None, "xz", "zx", "yz", "xy"]),
+)  # fmt: skip
+def test_who_follows_the_remedies_fits(names, level, y, plane) -> None:
+    """At most three are needed: the plane, with its names, and where it is."""
+    robot = PlanarQuadrotor(names=names, plane=plane if plane and names == ("a", "b") else "")
+    for _ in range(4):
+        try:
+            fitted(robot, level=level, y=y)
+            return
+        except ls.InputError as refused:
+            wants = dict(re.findall(r"(plane|offset)=('\w+'|[-\d.e]+)", str(refused).split("; want ")[1]))
+            told = re.search(r"such as \((\w), (\w)\)", str(refused))
+            changes = {name: value.strip("'") if name == "plane" else float(value) for name, value in wants.items()}
+            robot = dataclasses.replace(robot, **changes | ({"names": told.groups()} if told else {}))
+    pytest.fail(f"{robot} does not fit")
 
 
 def test_a_plan_for_another_plane_is_not_run() -> None:
@@ -384,8 +409,56 @@ def test_a_robot_in_space_has_its_axes_in_order() -> None:
         def configuration(self, state):
             return super().configuration(np.asarray(state)[..., [1, 0, *range(2, 12)]])
 
-    with pytest.raises(ls.InputError, match=r"x along \+y, y along \+x, z along \+z; want position=\('y', 'x', 'z'\)"):
+    # With such names the position is in this order, so configuration() has to change.
+    with pytest.raises(ls.InputError, match=r"x along \+y, y along \+x, z along \+z; want each to move it by a metre"):
         ls.Plant(Swapped(), ls.load_scene("cage"))
+    Swapped.configuration = ls.Quadrotor.configuration
+    ls.Plant(Swapped(), ls.load_scene("cage"))
+
+
+def test_a_position_of_other_names_follows_the_remedy_into_order() -> None:
+    """A ball on three slides, whose first is along y."""
+    text = """<mujoco><worldbody><body name="ball">
+      <joint name="a" type="slide" axis="0 1 0"/><joint name="b" type="slide" axis="1 0 0"/>
+      <joint name="c" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody>
+      <actuator><motor name="fa" joint="a"/><motor name="fb" joint="b"/><motor name="fc" joint="c"/></actuator>
+      </mujoco>"""
+
+    class Ball(Jointed):
+        name, body, radius = "ball", "ball", 0.1
+        joints, actuators = ("a", "b", "c"), ("fa", "fb", "fc")
+        order: tuple[str, ...] = ("a", "b", "c")
+
+        @property
+        def dynamics(self):
+            return ls.Dynamics(
+                lambda x, u, p: [x.va, x.vb, x.vc, u.fa, u.fb, u.fc],
+                states={"a": "m", "b": "m", "c": "m", "va": "m/s", "vb": "m/s", "vc": "m/s"},
+                controls={"fa": "N", "fb": "N", "fc": "N"}, position=self.order,
+            )  # fmt: skip
+
+    ball = Ball()
+    with pytest.raises(ls.InputError, match=r"want position=\('b', 'a', 'c'\)"):
+        ls.Plant(ball, scene_from_xml(text, "ball"))
+    Ball.order = ("b", "a", "c")
+    ls.Plant(ball, scene_from_xml(text, "ball"))
+
+
+@pytest.mark.parametrize("at", [0.4, -1.3])
+def test_slides_that_count_from_the_body_s_place_are_told(at: float) -> None:
+    """The body is elsewhere in the MJCF; a configuration() that takes that off fits."""
+    scene = scene_from_xml(mjcf().replace('pos="0 0.0 0"', f'pos="{at} 0 0"'), "planar")
+    with pytest.raises(ls.InputError, match=r"slides count from the body's pos in the MJCF"):
+        ls.Plant(PlanarQuadrotor(), scene)
+
+    class Placed(PlanarQuadrotor):
+        def configuration(self, state):
+            return super().configuration(np.asarray(state) - at * np.eye(6)[0])
+
+        def state(self, qpos, qvel, near=None):
+            return super().state(qpos, qvel) + at * np.eye(6)[0]
+
+    ls.Plant(Placed(), scene)
 
 
 # The robot among other bodies that move

@@ -1,6 +1,7 @@
 """Checks that a robot fits a scene: its names exist, its maps fit MuJoCo's arrays, and its body is at its position."""
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -214,12 +215,24 @@ def _remedy(robot: Robot, names: list[str], jacobian: Array) -> str:
     motion = f"MuJoCo moves body {robot.body!r} by a metre of {moved}"
     if exact and (np.abs(rows).sum(axis=1) == 1).all() and (rows.sum(axis=1) == 1).all():
         axes = "".join(SPACE[int(row.argmax())] for row in rows)
-        if axes in PLANES:
-            return f"{motion}; want plane={axes!r}"
+        space = robot.dynamics.state_coordinates
+        if axes in PLANES:  # names such as x and z tell the plane, too
+            others = "" if _accepts(space, plane=axes) else f", and names that tell it, such as ({', '.join(axes)})"
+            return f"{motion}; want plane={axes!r}{others}"
         if sorted(axes) == sorted(SPACE):
-            order = ", ".join(repr(names[axes.index(letter)]) for letter in SPACE)
-            return f"{motion}; want position=({order})"
+            order = [axes.index(letter) for letter in SPACE]
+            if _accepts(space, position=tuple(space.position[k] for k in order)):
+                return f"{motion}; want position=({', '.join(repr(names[k]) for k in order)})"
     return f"{motion}; want each to move it by a metre along its own axis: check the joints and configuration()"
+
+
+def _accepts(space: Coordinates, **changes: Any) -> bool:
+    """Whether coordinates may be changed so: names such as x, y and z have to agree."""
+    try:
+        replace(space, **changes)
+    except InputError:
+        return False
+    return True
 
 
 def _of(space: Coordinates) -> str:

@@ -127,6 +127,23 @@ def rattled(*, steps: int = 4, accuracy: float = 1e-6) -> ls.Problem:
     )  # fmt: skip
 
 
+def combed(steps: int, teeth: float, height: float) -> ls.Problem:
+    """A point passes over a comb that has many teeth in a period, without touching any."""
+    dynamics = ls.Dynamics(lambda x, u, p: [u[0], u[1]], states={"x": "m", "y": "m"}, controls={"a": "", "b": ""})
+
+    def above(x, u, p):
+        from sympy import cos
+
+        return x.y - p.height * cos(p.teeth * x.x)
+
+    return ls.Problem(
+        dynamics=dynamics, dt=2.0 / steps, steps=steps, initial=ls.FixedState([0.0, 2 * height]), between_knots=True,
+        stage_cost=ls.ControlCost([0.1, 0.1]) + ls.QuadraticCost({"y": 5.0}, about={"y": 0.0}),
+        final_cost=ls.QuadraticCost({"x": 100.0}, about={"x": 1.0}),
+        constraints=[ls.SymbolicConstraint(above, parameters={"height": height, "teeth": teeth})],
+    )  # fmt: skip
+
+
 CASES = {
     "too late": Case(
         "INFEASIBLE", "allow more time than 1.5 s, relax the limits of u, or ask for less of what is missed",
@@ -188,6 +205,10 @@ CASES = {
     "steps that are too few for the accuracy": Case(
         "STALLED", "use 3 times as many steps, or a larger accuracy than 1e-06", rattled(), {},
         [(rattled(steps=12), {}), (rattled(accuracy=1e-4), {})],
+    ),
+    "steps that are too few for what is between them": Case(
+        "STALLED", "use twice as many steps", combed(7, 732.0, 0.41), {"starts": 1},
+        [(combed(14, 732.0, 0.41), {"starts": 1})],
     ),
     "too few iterations": Case(
         "MAX_ITERATIONS", "raise max_iterations: the cost still fell in the last one, by ", UPRIGHT,
