@@ -546,7 +546,9 @@ def test_a_working_folder_that_was_removed_is_one_line(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
-@pytest.mark.parametrize("command", ["new robot", "solve quadrotor", "rare quadrotor", "harden quadrotor", "demo"])
+@pytest.mark.parametrize(
+    "command", ["new robot", "solve quadrotor", "stress quadrotor", "rare quadrotor", "harden quadrotor", "demo"]
+)
 def test_a_name_that_is_not_utf_8_is_refused_before_the_work(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

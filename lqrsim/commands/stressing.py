@@ -55,6 +55,7 @@ class Stress(SetupOptions):
 
         setup = ls.stress.Setup(**stated(self, ls.stress.Setup))
         folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
+        console.check_output("--out", folder)
         if self.resume:
             campaign = ls.stress.Results(folder, scenario=self.scenario).campaign
             campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
