@@ -8,6 +8,8 @@ import json
 import os
 import pickle
 import socket
+import subprocess
+import sys
 import time
 import tracemalloc
 import warnings
@@ -92,6 +94,23 @@ def test_only_regular_files_are_written_to(drive_solution: ls.Solution, tmp_path
     after = [path.lstat() for path, _ in kinds]
     assert [(one.st_ino, one.st_mode) for one in after] == [(one.st_ino, one.st_mode) for one in before]
     assert len(list(tmp_path.iterdir())) == len(kinds)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no pipes in folders")
+@pytest.mark.parametrize("name", ["run.npz", "robot.xml", "robot.urdf", "run.mp4"])
+@pytest.mark.parametrize("linked", [False, True])
+def test_only_regular_files_are_read(name: str, linked: bool, tmp_path: Path) -> None:
+    """Opening a pipe waits for ever if nobody writes to it; a device may have no end."""
+    path = tmp_path / name
+    if linked:
+        path.symlink_to("/dev/zero")
+    else:
+        os.mkfifo(path)
+    words = ["list", str(path)] if path.suffix in (".xml", ".urdf") else ["verify", str(path)]
+    done = subprocess.run([sys.executable, "-m", "lqrsim", *words], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert "want a file that exists" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_so_do_the_solutions_of_ilqr_and_failed_ones(tmp_path: Path, differential_drive: ls.Scenario) -> None:
