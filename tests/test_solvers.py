@@ -483,6 +483,13 @@ def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
     assert "clearance: 0.141 m" in text
 
 
+@pytest.mark.parametrize("optimality", [np.inf, np.nan, 0.0, 2.5e-3])
+def test_the_summary_has_an_optimality_only_if_it_is_known(drive_solution: ls.Solution, optimality: float) -> None:
+    status, plan = Status.COST_CONVERGED, dataclasses.replace(drive_solution.certificate, optimality=optimality)
+    text = str(dataclasses.replace(drive_solution, status=status, certificate=plan))
+    assert f"optimality: {f'{optimality:.1e}' if np.isfinite(optimality) else 'unknown'}" in text
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_the_time_that_is_left_only_falls(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     """Also while the clock is stopped, and when it goes on."""

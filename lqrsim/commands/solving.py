@@ -224,6 +224,14 @@ class Simulate:
                 f" up to {violation['most']:.3g} (trial {violation['trial']} at {violation['time']:.2f} s); outcomes do"
                 " not count this"
             )
+        for site, errors in scenario.problem.site_errors(rollout.states[:, -1]).items():
+            worst = max(((error, k) for k, error in enumerate(errors.tolist()) if error == error), default=None)
+            if worst is not None:
+                unit = "rad" if " turned" in site else "m"
+                console.say(
+                    f"{site} ends up to {worst[0]:.3g} {unit} off (trial {rollout.first_trial + worst[1]}); outcomes do"
+                    " not count this"
+                )
         if violations is None and scenario.problem.constraints:
             console.say(
                 "whether trials violate constraints is not checked: another horizon, or constraints of a belief"

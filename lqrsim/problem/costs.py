@@ -110,6 +110,13 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """The obstacles that it keeps the robot clear of, with the robot's shape; None for others."""
         return None
 
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        """How far parts of the robot are from where it wants them, at states (K, n): name -> (K,), in m or rad.
+
+        Only of what no goal of states can say, as of a gripper's site.
+        """
+        return {}
+
     def with_added_state(self, dynamics: Dynamics) -> Self:
         """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
         each control with a `control_rate`. `dynamics` are those without that state.

@@ -540,6 +540,26 @@ class Problem(OneVersion):
             raise InputError("between_knots: got True with obstacles that move, want False")
 
     @checked
+    def site_errors(self, states: Annotated[Array, "K n"]) -> dict[str, Array]:
+        """How far sites are from where SiteCosts of the final cost and SiteConstraints want them.
+
+        A goal has states alone, so neither the goal line of a Solution nor a run's outcome counts this.
+
+            problem.site_errors(rollout.states[:, -1])  # of the last state of each trial
+
+        Returns:
+          Name of the site -> (K,), its distance from the position in metres; with " turned", its angle from the
+          orientation in rad. NaN for states that are not finite. If a site has several places, " (2)" follows the name
+          of the second, and so on.
+        """
+        errors: dict[str, Array] = {}
+        for part in (*terms_of(self.final_cost), *self.constraints):
+            for name, error in part.off_place(self.dynamics, states).items():
+                numbered = (f"{name} ({number})" for number in itertools.count(2))
+                errors[name if name not in errors else next(key for key in numbered if key not in errors)] = error
+        return errors
+
+    @checked
     def violations(self, rollout: Rollout) -> dict[str, Array]:
         """By how much K runs of a plan violate each constraint, other than clearances, which a `Rollout` has itself.
 

@@ -162,7 +162,8 @@ class Solution(Plan):
         if self.remedy:
             lines.append(f"  remedy:    {self.remedy}")
         gap = f"{self.gap:.1e}" if np.isfinite(self.gap) else "none (no cost-to-come)"
-        lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {self.optimality:.1e}")
+        optimality = f"{self.optimality:.1e}" if np.isfinite(self.optimality) else "unknown"
+        lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {optimality}")
         if self.curvature is not Curvature.NOT_CHECKED:
             lines[-1] += f"   curvature: {self.curvature}"
         if self.violation > 1e-6:  # the default tolerance

@@ -34,7 +34,8 @@ from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
-from lqrsim.scenes.mjcf_kinematics import axes_of
+from lqrsim.scenes.mjcf_kinematics import axes_of, posed
+from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.world import SPACE
 
 
@@ -76,6 +77,27 @@ class _Pose:
         data = np.concatenate([[model.site_bodyid[number]], model.site_pos[number], axes, position, wanted.ravel()])
         return Residual(source, data, tuple(rows), model.nv, functions=(MjcfMemory.of(mjcf_dynamics),))
 
+    @unlogged()
+    def off(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        """The distance (K,) of the site from its position in m, and its turn (K,) from the orientation in rad."""
+        mjcf_dynamics = dynamics.calling
+        assert isinstance(mjcf_dynamics, MjcfDynamics)
+        model, errors = mjcf_dynamics.physics.model, dict[str, Array]()
+        site, finite = model.site(self.site).id, np.isfinite(states).all(axis=1)
+        if self.position is not None:
+            errors[self.site] = np.full(len(states), np.nan)
+        if self.orientation is not None:
+            errors[f"{self.site} turned"] = np.full(len(states), np.nan)
+        positions, quaternion, turn = mjcf_dynamics.mjcf.qpos_of(states[finite, : model.nv]), np.zeros(4), np.zeros(3)
+        for k, data in zip(np.flatnonzero(finite), posed(model, positions), strict=True):
+            if self.position is not None:
+                errors[self.site][k] = np.linalg.norm(data.site_xpos[site] - self.position)
+            if self.orientation is not None:
+                mujoco.mju_mat2Quat(quaternion, data.site_xmat[site])
+                mujoco.mju_subQuat(turn, quaternion, self.orientation / np.linalg.norm(self.orientation))
+                errors[f"{self.site} turned"][k] = np.linalg.norm(turn)
+        return errors
+
 
 class SiteCost(Cost):
     """`1/2 weight |p - position|^2 + 1/2 turn_weight |r|^2` of a site of a robot from an MJCF.
@@ -109,6 +131,9 @@ class SiteCost(Cost):
             for name, values in (("weight", weight), ("turn_weight", turn_weight))
         )
 
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        return self.pose.off(dynamics, states)
+
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return self
 
@@ -141,6 +166,9 @@ class SiteConstraint(Constraint):
     ) -> None:
         self.pose = _Pose("SiteConstraint", site, position, orientation)
         self.at = at
+
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        return self.pose.off(dynamics, states)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return self

@@ -59,7 +59,13 @@ def assemble(
     policy = partial(compiled.policy_of, problem)
     unstable = unstable_step(problem, states, controls, sound=result.success)
     doubts = (_near_singular(problem, result), _fragile(problem, result)) if np.isfinite(states).all() else ()
-    said = result.detail, _usable(result, options), *doubts, unstable.detail if unstable else ""
+    said = (
+        result.detail,
+        _usable(result, options),
+        *doubts,
+        unstable.detail if unstable else "",
+        _sites(problem, states),
+    )
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -114,6 +120,13 @@ def _usable(result: RunResult, options: dict[str, object]) -> str:
         "the plan can be used, for it keeps dynamics, limits and constraints; its cost could still fall by a relative"
         f" {plan.optimality:.1e}{wanted}"
     )
+
+
+def _sites(problem: Problem, states: Array) -> str:
+    """Where the sites of SiteCosts and SiteConstraints end, which a goal of states leaves out; empty without them."""
+    errors = problem.site_errors(states[-1:])
+    parts = [f"{name} {error[0]:.3g} {'rad' if ' turned' in name else 'm'}" for name, error in errors.items()]
+    return f"sites end off by {', '.join(parts)}, which the goal does not count" if parts else ""
 
 
 def _near_singular(problem: Problem, result: RunResult) -> str:

@@ -26,8 +26,9 @@ MOST = 300  # largest number of iterations from one plan
 FAINT = 1e-9  # factor by which penalties are smaller where a plan ends inside: its certificate is that of multipliers
 # What is said where the cost no longer changes, and the gradient does not vanish.
 KINKED = (
-    "the derivatives of the dynamics jump along the plan, as by dry friction or at a joint's limit, where no gradient"
-    f" vanishes; the cost has not changed by {FLAT:g} of itself in {ENDS} iterations, but plans beside it may cost less"
+    "the derivatives of the dynamics jump along the plan, as by dry friction, at a contact, at a joint's limit or in a"
+    f" medium at rest, where no gradient vanishes; the cost has not changed by {FLAT:g} of itself in {ENDS} iterations,"
+    " but plans beside it may cost less"
 )
 UNSETTLED = (
     "no gradient vanishes along the plan, as where a flat side of the robot lies along an obstacle and the derivatives"
