@@ -377,6 +377,16 @@ def test_a_solution_says_how_far_its_sites_are_off(tmp_path: Path, weight: float
     solution = ls.smooth(problem, max_iterations=5)
     off = problem.site_errors(solution.trajectory.states[-1:])["tool"][0]
     assert f"sites end off by tool {off:.3g} m, which the goal does not count" in str(solution)
+    there = problem.dynamics.step(robot.at(), np.zeros(3), 0.02)
+    data = mujoco.MjData(robot.scene.model)
+    data.qpos[:] = robot.configuration(there)[0]
+    mujoco.mj_kinematics(robot.scene.model, data)
+    kept = ls.SiteConstraint("tool", position=data.site("tool").xpos)
+    resting = ls.smooth(
+        replace(problem, steps=1, final_cost=ls.QuadraticCost(np.zeros(6), about=robot.at()), constraints=[kept])
+    )
+    assert resting.success, resting
+    assert "sites end off" not in str(resting)
 
 
 def test_the_command_says_how_far_a_site_ends_off(

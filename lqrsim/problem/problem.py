@@ -22,6 +22,7 @@ from lqrsim.errors import (
     check_number,
     keep,
     renamed,
+    shaped,
 )
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import (
@@ -552,7 +553,7 @@ class Problem(OneVersion):
           orientation in rad. NaN for states that are not finite. If a site has several places, " (2)" follows the name
           of the second, and so on.
         """
-        errors: dict[str, Array] = {}
+        states, errors = shaped("states", states, (None, len(self.dynamics.state_coordinates))), dict[str, Array]()
         for part in (*terms_of(self.final_cost), *self.constraints):
             for name, error in part.off_place(self.dynamics, states).items():
                 numbered = (f"{name} ({number})" for number in itertools.count(2))

@@ -31,6 +31,7 @@ NEAR_TURN = 0.3
 # That of a tilt from half a turn. An error of the attitude is 2 / NEAR_TILT times as large in the turn, as much as
 # 2 pi / NEAR_TURN times in a rotation vector.
 NEAR_TILT = 0.1
+EXACT = 1e-6  # m or rad, by which a SiteConstraint that is kept may be off
 UNBOUNDED = 1e10  # a cost so many times below that of the first iteration, or below -1, falls for ever
 UNFINISHED = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
@@ -123,9 +124,10 @@ def _usable(result: RunResult, options: dict[str, object]) -> str:
 
 
 def _sites(problem: Problem, states: Array) -> str:
-    """Where the sites of SiteCosts and SiteConstraints end, which a goal of states leaves out; empty without them."""
-    errors = problem.site_errors(states[-1:])
-    parts = [f"{name} {error[0]:.3g} {'rad' if ' turned' in name else 'm'}" for name, error in errors.items()]
+    """Where the sites of SiteCosts and SiteConstraints end, which a goal of states leaves out; empty if none is off."""
+    errors = {name: error[0] for name, error in problem.site_errors(states[-1:]).items()}
+    units = {name: "rad" if " turned" in name else "m" for name in errors}
+    parts = [f"{name} {error:.3g} {units[name]}" for name, error in errors.items() if error > EXACT]
     return f"sites end off by {', '.join(parts)}, which the goal does not count" if parts else ""
 
 
