@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import systems
-from sampling import rarely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sampling import examples, rarely
 from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
 from lqrsim.errors import Array
+from lqrsim.results.goal import TOLERANCE
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.packaged import quadrotor_queries
 from lqrsim.solvers import budget
@@ -461,6 +464,29 @@ def test_a_plan_that_is_not_finished_says_how_far_it_is_from_an_optimum(
     missed = ls.smooth(dataclasses.replace(problem, constraints=[kept]), max_iterations=2, starts=1)
     assert missed.violation > 1e-6
     assert "can be used" not in missed.detail
+
+
+@settings(max_examples=examples(20))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_an_unfinished_plan_that_misses_its_goal_is_not_called_of_use(seed: int) -> None:
+    """A pendulum whose controls cost more or less, so that the plan ends nearer to its goal or farther off."""
+    draws = np.random.default_rng(seed)
+    pendulum = ls.Dynamics(
+        lambda x, u, p: [x.turn, u.push - p.pull * x.angle**3],
+        states={"angle": "rad", "turn": "rad/s"}, controls={"push": "1/s^2"}, parameters={"pull": 1.0},
+    )  # fmt: skip
+    problem = ls.Problem(
+        dynamics=pendulum, dt=0.1, steps=20, initial=ls.FixedState([0.0, 0.0]),
+        stage_cost=ls.ControlCost([10 ** draws.uniform(-3, 2)]),
+        final_cost=ls.QuadraticCost([10.0, 1.0], about=[draws.uniform(0.5, 2.0), 0.0]),
+    )  # fmt: skip
+    for most in (2, 3, 4):
+        found = ls.smooth(problem, max_iterations=most, safeguard=False)
+        away = found.target.distance(found.trajectory.states[-1])
+        if "the plan can be used" in found.detail:
+            assert away <= TOLERANCE
+        if "misses the goal" in found.detail:
+            assert away > TOLERANCE
 
 
 def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:

@@ -62,7 +62,7 @@ def assemble(
     doubts = (_near_singular(problem, result), _fragile(problem, result)) if np.isfinite(states).all() else ()
     said = (
         result.detail,
-        _usable(result, options),
+        _usable(problem, result, options),
         *doubts,
         unstable.detail if unstable else "",
         _sites(problem, states),
@@ -101,7 +101,7 @@ def parts_of(problem: Problem) -> dict[str, str]:
     return {name: printable(" ".join(text.split()))[: 10 * LINE] for name, text in problem.parts.items() if text}
 
 
-def _usable(result: RunResult, options: dict[str, object]) -> str:
+def _usable(problem: Problem, result: RunResult, options: dict[str, object]) -> str:
     """What the certificate says of a plan that is finished but not optimal, because time or iterations ended; or empty.
 
     It is empty for a plan that misses a constraint, which the detail names.
@@ -112,15 +112,17 @@ def _usable(result: RunResult, options: dict[str, object]) -> str:
     missed = plan.violation > (allowed if isinstance(allowed, float) else 0.0)
     if missed or plan.start or plan.limits or not (plan.dynamics_residual <= MOTION and plan.policy_residual <= LAW):
         return ""
-    if not np.isfinite(plan.optimality):
-        return "the plan can be used, for it keeps dynamics, limits and constraints; whether it is optimal is unknown"
-    if plan.optimality > UNFINISHED:
+    if np.isfinite(plan.optimality) and plan.optimality > UNFINISHED:
         return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
+    target = Target(problem.dynamics.state_coordinates, problem.weighed_goal, result.states)
+    misses = len(target.of_plan(target.radius_of_plan(goal_radius_of(problem, result.states)))) > 1
+    use = "the plan can be used, for it keeps dynamics, limits and constraints"
+    if misses:
+        use = "the plan keeps dynamics, limits and constraints, but misses the goal"
+    if not np.isfinite(plan.optimality):
+        return f"{use}; whether it is optimal is unknown"
     wanted = f", where {tolerance:g} is wanted" if isinstance(tolerance, float) else ""
-    return (
-        "the plan can be used, for it keeps dynamics, limits and constraints; its cost could still fall by a relative"
-        f" {plan.optimality:.1e}{wanted}"
-    )
+    return f"{use}; its cost could still fall by a relative {plan.optimality:.1e}{wanted}"
 
 
 def _sites(problem: Problem, states: Array) -> str:
