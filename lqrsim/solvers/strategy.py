@@ -77,6 +77,7 @@ SOFT, LOOK, FEWER = 60, 25, 3
 # the relative decrease of cost that is worth another; by how much a softened plan may cost more before it descends.
 ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 
+CHEAPER = 0.01  # by what share a plan that has not converged must cost less than the answer, to be named
 # Saddles that are left in turn; steps away from one along its direction of negative curvature, relative to the typical
 # sizes; and the relative decrease of cost that such a step must lead to.
 SADDLES, SADDLE_STEPS, SADDLE_DECREASE = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
@@ -529,7 +530,10 @@ class Search:
                 self._try(name, trajectory)
 
     def leave_saddles(self) -> None:
-        """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle."""
+        """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle.
+
+        A saddle that is not left has not converged, and comes after a plan from elsewhere that costs less.
+        """
         for _ in range(SADDLES):
             run, best = self.best
             if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
@@ -538,7 +542,20 @@ class Search:
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
                 self._finished[0] = run, replace(best, status=status, detail=detail)
+                self._prefer_cheaper()
                 return
+
+    def _prefer_cheaper(self) -> None:
+        """Put the cheapest plan that keeps the constraints first, if it costs less by more than rounding."""
+        if (cheapest := self._cheaper_elsewhere(SADDLE_DECREASE)) is not None:
+            self._finished.insert(0, self._finished.pop(cheapest))
+
+    def _cheaper_elsewhere(self, less: float) -> int | None:
+        """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
+        allowed, best = self._settings.violation_tolerance(self._problem), self.best[1].cost
+        kept = [result.violation <= allowed and np.isfinite(result.cost) for _, result in self._finished]
+        costs = np.where(kept, [result.cost for _, result in self._finished], np.inf)
+        return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
 
     def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
         """Leave a saddle; return whether a plan was found that costs less."""
@@ -835,12 +852,24 @@ class Search:
         elif not stop.due or (self._still is not None and not self._comes_nearer(result)):
             result = self._with_unmoved_states(result)
         detail = name_risk(chosen, result) if result.status is Status.RISK_TOO_HIGH else result.detail
+        if result.success and (cheapest := self._cheaper_elsewhere(CHEAPER)) is not None:
+            detail = "; ".join(filter(None, (detail, self._unfinished(*self._finished[cheapest]))))
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
         begun = self._named[0][1] if settings.start is not None else chosen
         return assemble(
             problem, replace(result, detail=detail), chosen.budget.log, solver="smooth",
             options=settings.options(begun.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
+
+    def _unfinished(self, run: SolveRun, result: RunResult) -> str:
+        """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
+        number = next((i for i, (_, other) in enumerate(self._named) if other is run), None)
+        if number is None:
+            return ""
+        return (
+            f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}:"
+            f" candidates[{number}].trajectory, a start to go on from"
+        )
 
     def _with_unmoved_states(self, result: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
