@@ -175,6 +175,8 @@ def begin(begun, stages, work, mem):
         rows.force[at] = 0.0
         if rows.live[at] != 0:
             begin_row(at, begun, stages, work, mem)
+    for t in range(steps):
+        clear(stages.policy.gain[t], M, N)
     adjoint(stages, work.costates, work.other.changes.controls)
     measure_iterate(stages, work, mem)
     violated = off(now, stages)
@@ -243,10 +245,10 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
     if isnan(mem.target):  # the first call
         mem.target = tolerance
     while True:
-        inside = within(tolerance, violation, mem)
+        inside = within(stages.learns == 1, tolerance, violation, mem)
         if inside and mem.age > 0 and (ended or central(tolerance, mem)):
             renew(stages, work, mem)
-            inside = within(tolerance, violation, mem)
+            inside = within(stages.learns == 1, tolerance, violation, mem)
         mem.solved = 1.0 if inside or (mem.solved != 0 and stages.learns == 0) else 0.0
         if stages.learns == 1 and inside and (ended or central(tolerance, mem)):
             return done, CONVERGED
@@ -257,7 +259,7 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
                 return done, STALLED
             if cross(tolerance, violation, stages, work, mem):
                 return done, CONVERGED
-            ended = ended or mem.target <= FINEST
+            ended = ended or mem.target <= FINEST or mem.unchanged >= ENDS
             mem.target *= FINER
             mem.since = 0.0
         if ended:
@@ -272,7 +274,8 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
         row.gap, row.complementarity = mem.gap, mem.complementarity
         done += 1
         mem.since += 1
-        ended = creeping(violation, mem) or (stages.learns == 1 and cost_is_flat(violation, mem))
+        count_unchanged(stages.learns == 1, violation, mem)
+        ended = creeping(violation, mem) or (stages.learns == 1 and cost_is_flat(mem))
 
 
 def creeping(violation, mem):
@@ -285,20 +288,32 @@ def creeping(violation, mem):
     return mem.short >= CREEPING
 
 
-def cost_is_flat(violation, mem):
-    """Whether the cost no longer changes at the least barrier, though the plan is not stationary."""
-    kept = mem.violation <= violation and mem.stationarity > STEEP
-    if kept and abs(mem.cost - mem.level) <= FLAT * abs(mem.level):
+def count_unchanged(learns, violation, mem):
+    """Count the iterations in a row in which the cost does not change, though the plan is not stationary.
+
+    Where derivatives may jump, changes count as none that elsewhere would not, and steps may be short.
+    """
+    kept = mem.violation <= violation and (mem.stationarity > STEEP if learns else mem.fraction >= LONG)
+    if kept and abs(mem.cost - mem.level) <= (FLAT if learns else ROUNDING) * abs(mem.level):
         mem.unchanged += 1
     else:
         mem.unchanged, mem.level = 0.0, mem.cost
+
+
+def cost_is_flat(mem):
+    """Whether the cost no longer changes at the least barrier."""
     return mem.unchanged >= ENDS and mem.pairs * mem.parameter <= FLAT * mem.scale
 
 
-def within(tolerance, violation, mem):
-    """Whether the measures are within tolerance. The violation of elastic rows is in their slacks."""
+def within(learns, tolerance, violation, mem):
+    """Whether the measures are within tolerance. The violation of elastic rows is in their slacks.
+
+    Where long steps no longer change the cost, what is left of the slope is rounding, which grows along unstable
+    dynamics.
+    """
     missed = mem.miss < tolerance if mem.elastic != 0 else mem.violation <= violation
-    return mem.stationarity < tolerance and mem.gap < tolerance and mem.complementarity < tolerance and missed
+    stationary = mem.stationarity < tolerance or (not learns and mem.unchanged >= ENDS)
+    return stationary and mem.gap < tolerance and mem.complementarity < tolerance and missed
 
 
 def central(tolerance, mem):

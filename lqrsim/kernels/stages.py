@@ -337,13 +337,20 @@ def lagrangian_slope(t, stages, after, slope):
 
 
 def adjoint(stages, costates, slopes):
-    """Write the costates (T+1, N) and the gradient in the controls (T, M) of the Lagrangian."""
+    """Write the costates (T+1, N) and the gradient in the controls (T, M) of the Lagrangian.
+
+    Controls respond by the gains of the policy. At a stationary plan that changes nothing but rounding, which does not
+    grow then where dynamics are unstable.
+    """
     slope = stack(W)
     for t in range(stages.steps, -1, -1):
         lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
-        copy(slope, N, costates[t])
         if t < stages.steps:
             copy_part(slope, N, slopes[t], 0, M)
+            for i in range(M):
+                for j in range(N):
+                    slope[j] += stages.policy.gain[t, i, j] * slopes[t, i]
+        copy(slope, N, costates[t])
 
 
 def plan_residuals(stages, plan, numbers, gaps):

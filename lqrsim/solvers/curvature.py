@@ -39,23 +39,26 @@ class CurvatureCheck(NamedTuple):
     direction: Motion | None = None
 
 
-def curvature_at(stages: Stages, plan: Motion, multipliers: Array) -> CurvatureCheck:
-    """The curvature of the Lagrangian at a stationary plan, with multipliers (T+1, R) of the constraints' rows.
+def curvature_at(stages: Stages, plan: Motion, gain: Array, multipliers: Array) -> CurvatureCheck:
+    """The curvature of the Lagrangian at a stationary plan.
 
-    Those of limits are worked out here. The models of the stages are overwritten.
+    Args:
+      stages: whose models are overwritten. gain: (T, m, n) of a policy about the plan.
+      multipliers: (T+1, R) of the constraints' rows; those of limits are worked out here.
     """
     with np.errstate(all="ignore"):
-        return _Reduced(stages, plan, multipliers, stages.sizes(plan)).check()
+        return _Reduced(stages, plan, gain, multipliers, stages.sizes(plan)).check()
 
 
 class _Reduced:
     """The models about a plan, and which rows are held."""
 
-    def __init__(self, stages: Stages, plan: Motion, multipliers: Array, sizes: Sizes) -> None:
+    def __init__(self, stages: Stages, plan: Motion, gain: Array, multipliers: Array, sizes: Sizes) -> None:
         self._stages, self._sizes = stages, sizes
         # The costates need no multipliers of limits, which hold controls alone.
         stages.linearize(plan, np.zeros_like(plan.states), multipliers, np.inf)
-        costates, slopes = stages.adjoint()
+        inside = (stages.low < plan.controls) & (plan.controls < stages.high)
+        costates, slopes = stages.adjoint(np.where(inside[:, :, None], gain, 0.0))
         stages.linearize(plan, costates, multipliers, 0.0)
         forces, limit = multipliers.copy(), stages.owners == -1
         for row, (sign, i, _) in zip(np.flatnonzero(limit), stages.limits, strict=True):

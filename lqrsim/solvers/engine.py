@@ -526,9 +526,8 @@ class SolveRun:
             if out["curvature"][0] > FLAT:
                 return CurvatureCheck(Curvature.MINIMUM)
         stages, plan = self.stages, Motion(*map(in_c_order, result.plan))
-        return curvature_at(
-            stages, plan, stages.of_constraints([multipliers.values for multipliers in result.multipliers])
-        )
+        multipliers = stages.of_constraints([multipliers.values for multipliers in result.multipliers])
+        return curvature_at(stages, plan, result.law.gain, multipliers)
 
     def _without_penalties(self) -> ProblemModel:
         """The model without constraints, whose noise is weighed by its own cost-to-go."""

@@ -260,8 +260,12 @@ class Stages:
         """Numbers of the rows (R,) for each of the live rows, (K,)."""
         return np.broadcast_to(numbers, self.live.shape)[self.live]
 
-    def adjoint(self) -> tuple[Array, Array]:
-        """Costates (T+1, n) of the Lagrangian, and its slopes in the controls (T, m), with the current multipliers."""
+    def adjoint(self, gain: Array | None = None) -> tuple[Array, Array]:
+        """Costates (T+1, n) of the Lagrangian, and its slopes in the controls (T, m), with the current multipliers.
+
+        The gains (T, m, n) of a policy about a stationary plan keep rounding from growing where dynamics are unstable.
+        """
+        self.about.policy.gain[...] = 0.0 if gain is None else gain
         costates, slopes = np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m))
         self.call("adjoint", self.about, costates, slopes)
         return costates, slopes
