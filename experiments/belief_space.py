@@ -27,8 +27,7 @@ import mujoco
 import numpy as np
 from matplotlib.patches import Circle
 from paper.common import figure, picture
-from peers.common import Unavailable
-from peers.ipopt import casadi
+from peers.common import Unavailable, casadi
 from runner import FolderSettings, Result, at_most, between, interval, opening, run, table
 
 import lqrsim as ls

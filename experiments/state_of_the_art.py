@@ -9,18 +9,17 @@ the nominal control; "line" is the straight line of states to the goal. All stop
 With --quick IPOPT evaluates its functions in CasADi, which is slower, and compiles nothing.
 """
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from paper.common import as_in_the_paper, bootstrap, figure, fixed, picture
 from paper.contestants import draw_excess, draw_means
-from peers import Answer
 from peers.common import line
 from peers.common import versions as versions_of_peers
-from quality.common import PEERS, all_iterations, clearance, cost, others
+from peers.contestants import ours, timed
+from quality.common import PEERS, clearance, cost, others
 from quality.common import Config as Asked
 from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
 from solver_benchmark.common import take_turns
@@ -45,14 +44,6 @@ class Config(FolderSettings):
     """Whether other people's solvers are asked, too."""
 
 
-@dataclass(frozen=True)
-class Solved:
-    controls: Array
-    iterations: int
-    solved: bool
-    seconds: float
-
-
 def main(config: Config) -> Result:
     count = min(config.queries, 4) if config.quick else config.queries
     scenarios = [ls.scenarios.quadrotor(query=query, seed=config.seed) for query in range(count)]
@@ -65,7 +56,7 @@ def main(config: Config) -> Result:
         ILQR: ours(ls.ilqr_many, stop="cost"),
     }
     solvers, skipped = others(Asked(peers=config.peers), problems[0], PEERS, compile=not config.quick)
-    contestants |= {name: theirs(solver) for name, solver in solvers.items()}
+    contestants = {name: timed(solver) for name, solver in (contestants | solvers).items()}
     for contestant in contestants.values():
         contestant(problems[0])  # compile
     turns = take_turns(contestants, problems, 1, "state of the art")
@@ -75,7 +66,7 @@ def main(config: Config) -> Result:
         answers = [answer for (answer,) in rounds]
         plans = list(zip(problems, (answer.controls for answer in answers), strict=True))
         found[name] = {
-            "solved": np.array([answer.solved for answer in answers]),
+            "solved": np.array([answer.converged for answer in answers]),
             "iterations": np.array([answer.iterations for answer in answers]),
             "milliseconds": np.array([1e3 * answer.seconds for answer in answers]),
             "cost": np.array([cost(*plan) for plan in plans]),
@@ -88,25 +79,6 @@ def main(config: Config) -> Result:
         draw_means(means, found)
         drawn.set_layout_engine("tight", w_pad=2)
     return result
-
-
-def ours(solver: Callable[..., list[ls.Solution]], **options: Any) -> Callable[[ls.Problem], Solved]:
-    def solve(problem: ls.Problem) -> Solved:
-        clock = time.perf_counter()
-        (solution,) = solver([problem], threads=1, **options)
-        seconds = time.perf_counter() - clock
-        return Solved(solution.trajectory.controls, all_iterations(solution), solution.success, seconds)
-
-    return solve
-
-
-def theirs(solver: Callable[[ls.Problem], Answer]) -> Callable[[ls.Problem], Solved]:
-    def solve(problem: ls.Problem) -> Solved:
-        clock = time.perf_counter()
-        answer = solver(problem)
-        return Solved(answer.controls, answer.iterations, answer.converged, time.perf_counter() - clock)
-
-    return solve
 
 
 def straight(problem: ls.Problem) -> ls.Trajectory:

@@ -16,8 +16,8 @@ import numpy as np
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from peers import formulas, ipopt
-from peers.common import Answer, at
+from peers import formulas
+from peers.common import Answer, at, casadi
 from peers.fddp import linked
 from peers.shooting import MAX_ITERATIONS, TOLERANCE, Moment
 
@@ -64,7 +64,7 @@ class BoxFddp:
 
 def _generate(problem: ls.Problem, folder: Path) -> Path:
     """Writes `generated.c` to the folder, with how much scratch memory its functions need."""
-    ca, told = ipopt.casadi(), formulas.formulas(problem)
+    ca, told = casadi(), formulas.formulas(problem)
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", len(formulas.parameters(problem)))
     made = []
@@ -94,5 +94,5 @@ def _generate(problem: ls.Problem, folder: Path) -> Path:
 
 
 def _dense(name: str, arguments: list[Any], results: list[Any]) -> Any:
-    ca = ipopt.casadi()
+    ca = casadi()
     return ca.Function(name, arguments, [ca.densify(one) for one in results])

@@ -1,6 +1,7 @@
 """What the peers share: what they are told of a problem, what they answer, and how their C and C++ is compiled."""
 
 import ctypes
+import importlib
 import os
 import shutil
 import subprocess
@@ -8,7 +9,9 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +36,7 @@ class Unavailable(Exception):
 class Answer:
     """States (T+1, n), controls (T, m), their cost as the solver has it, and how many iterations it took.
 
-    `duration` is in s where that was free; its price is in the cost.
+    `duration` is in s where that was free; its price is in the cost. `seconds` are those of a call that is timed.
     """
 
     states: Array
@@ -42,6 +45,7 @@ class Answer:
     iterations: int
     converged: bool
     duration: float | None = None
+    seconds: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,15 @@ def line(problem: ls.Problem) -> tuple[Array, Array]:
     """States on the line from start to goal and the nominal control, which do not belong together."""
     along, (start, goal) = np.linspace(0, 1, problem.steps + 1)[:, None], ends(problem)
     return start + along * (goal - start), np.tile(problem.nominal_control, (problem.steps, 1))
+
+
+@cache
+def casadi() -> Any:
+    """The module. Raises Unavailable where it is not installed."""
+    try:
+        return importlib.import_module("casadi")
+    except ImportError:
+        raise Unavailable("CasADi is not installed: pip install 'lqrsim[bench]'") from None
 
 
 def versions() -> dict[str, str]:

@@ -74,7 +74,7 @@ class Crocoddyl:
         """Solve from states on the line from start to goal and the nominal control, which do not belong together."""
         return self._solve(problem, *line(problem), rolled_out=False)
 
-    def from_trajectory(self, problem: ls.Problem, states: Array, controls: Array) -> Answer:
+    def solve(self, problem: ls.Problem, states: Array, controls: Array) -> Answer:
         """Solve from states (T+1, n) and controls (T, m), whether or not they belong together."""
         return self._solve(problem, np.array(states, dtype=float), np.array(controls, dtype=float), rolled_out=False)
 

@@ -17,7 +17,7 @@ from lqrsim.codegen.symbolic import Vector
 from lqrsim.errors import Array
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, terms_of
-from peers.ipopt import casadi, distance, quadratic, ratios
+from peers.common import casadi
 
 
 @dataclass(frozen=True)
@@ -134,9 +134,9 @@ class _Rows:
 def _cost(problem: ls.Problem, cost: Cost, x: Any, u: Any, given: _Given) -> Any:
     ca = casadi()
     if isinstance(cost, ls.QuadraticCost):
-        return quadratic(cost.weight, x - given(len(cost.about)))
+        return _quadratic(cost.weight, x - given(len(cost.about)))
     if isinstance(cost, ls.ControlCost):
-        return quadratic(cost.weight, u - given(len(cost.about)))
+        return _quadratic(cost.weight, u - given(len(cost.about)))
     if isinstance(cost, ls.SymbolicCost):
         function = _by_name(problem, cost.function)
         return evaluate(function, tuple(cost.parameters), x, u, given(len(cost.parameters)))[0]
@@ -166,7 +166,7 @@ def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, 
         values = ca.DM(list(dynamics.parameters.values()))
         places = evaluate(_coordinates(balls), tuple(dynamics.parameters), x, u, values, dynamics.constants)
         rows = [
-            distance(obstacle, ca.vertcat(*places[3 * ball : 3 * ball + 3])) - radius - constraint.margin
+            _distance(obstacle, ca.vertcat(*places[3 * ball : 3 * ball + 3])) - radius - constraint.margin
             for ball, radius in enumerate(balls.radii)
             for obstacle in constraint.world.obstacles
         ]
@@ -187,7 +187,7 @@ def _from_obstacles(problem: ls.Problem, world: ls.World, x: Any) -> Any:
     ca, space = casadi(), problem.dynamics.state_coordinates
     place = ca.vertcat(x[list(space.position)], *[0.0] * (3 - len(space.position)))
     seen = world.seen_by(space.plane, space.offset)
-    return ca.vertcat(*[distance(obstacle, place) for obstacle in seen.obstacles])
+    return ca.vertcat(*[_distance(obstacle, place) for obstacle in seen.obstacles])
 
 
 def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
@@ -283,4 +283,62 @@ def _words() -> dict[str, Any]:
     names = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "log", "sqrt", "tanh", "if_else")
     words = {name: getattr(ca, name) for name in (*names, "logic_and", "logic_or")}
     turns = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
-    return words | {name: lambda s, i=i: ratios(s)[i] for i, name in enumerate(turns)} | {"abs": ca.fabs, "pi": np.pi}
+    return words | {name: lambda s, i=i: _ratios(s)[i] for i, name in enumerate(turns)} | {"abs": ca.fabs, "pi": np.pi}
+
+
+def _quadratic(weight: Array, off: Any) -> Any:
+    ca = casadi()
+    return 0.5 * ca.bilin(ca.sparsify(ca.DM(weight)), off, off)
+
+
+def _ratios(s: Any) -> list[Any]:
+    """sin t / t, (1 - cos t) / t^2 and (1 - t/2 cot(t/2)) / t^2 at t^2 = s; below 1/4 by their series."""
+    ca = casadi()
+    t = ca.sqrt(ca.fmax(s, 0.25))  # both cases are always evaluated, so neither may be singular
+    sine, cosine = ca.sin(t) / t, (1 - ca.cos(t)) / (t * t)
+    large = sine, cosine, (1 - sine / (2 * cosine)) / (t * t)
+    series = (
+        [1 / 6, 1 / 20, 1 / 42, 1 / 72, 1 / 110, 1 / 156, 1 / 210],
+        [1 / 12, 1 / 30, 1 / 56, 1 / 90, 1 / 132, 1 / 182],
+    )
+    small = []
+    for factors in series:
+        value = 1.0
+        for factor in reversed(factors):
+            value = 1 - factor * s * value
+        small.append(value)
+    tail = 1 / 47900160 + s * (691 / 1307674368000 + s * (1 / 74724249600 + s * 3617 / 10670622842880000))
+    small = small[0], small[1] / 2, 1 / 12 + s * (1 / 720 + s * (1 / 30240 + s * (1 / 1209600 + s * tail)))
+    return [ca.if_else(s > 0.25, *pair) for pair in zip(large, small, strict=True)]
+
+
+def _distance(obstacle: ls.Obstacle, place: Any) -> Any:
+    """Signed distance in metres; where it has no derivative it has one of zero."""
+    ca = casadi()
+    local = ca.sparsify(ca.DM(obstacle.rotation.T)) @ (place - obstacle.position)
+    side, height = _length(local[:2]), ca.fabs(local[2])
+    radius, half, _ = obstacle.size
+    match obstacle.kind:
+        case "plane":
+            return local[2]
+        case "sphere":
+            return _length(place - obstacle.position) - radius
+        case "capsule":
+            return _length(ca.vertcat(local[:2], ca.fmax(height - half, 0))) - radius
+        case "cylinder" if np.isinf(half):
+            return side - radius
+        case "cylinder":
+            return _outside(ca.vertcat(side - radius, height - half))
+    finite = [axis for axis in range(3) if np.isfinite(obstacle.size[axis])]
+    return _outside(ca.fabs(local[finite]) - obstacle.size[finite])
+
+
+def _outside(beyond: Any) -> Any:
+    """Distance to a convex body from how far a point is beyond each of its mutually perpendicular faces."""
+    ca = casadi()
+    return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
+
+
+def _length(vector: Any) -> Any:
+    ca = casadi()
+    return ca.sqrt(ca.fmax(ca.sumsqr(vector), 1e-24))

@@ -1,17 +1,24 @@
 """IPOPT and Fatrop for any problem of formulas, through CasADi, with all that the problem asks for.
 
-Direct multiple shooting, as in `ipopt.py` and `fatrop.py`: the states and controls of all knots are variables, the
-steps and the given start are equality constraints, limits of controls and bounds of states are bounds of the variables.
-Derivatives are exact, the Hessian of the Lagrangian among them. Both stop at their own tolerance of 1e-8 or after 3,000
-iterations, IPOPT's default, and are otherwise as they come, on one thread. Times are processor times. A solver is made
-for one problem and serves all that differ in parameters only.
+Direct multiple shooting, as a careful user of CasADi writes it: the states and controls of all knots are variables,
+knot by knot, the Runge-Kutta steps and the given start are equality constraints, limits of controls and bounds of
+states are bounds of the variables. The step and the costs are SX functions, mapped over the knots; derivatives are
+CasADi's, exact and sparse, the Hessian of the Lagrangian among them. CasADi either evaluates the expanded problem in
+its virtual machine, or writes it as C, which is compiled with -O3 -march=native (some 15 seconds, kept on disk).
+
+Both stop at their own tolerance of 1e-8 or after 3,000 iterations, IPOPT's default, and are otherwise as they come,
+IPOPT with MUMPS, on one thread. Times are processor times. A solver is made for one problem and serves all that differ
+in parameters only.
 """
 
+import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -19,8 +26,9 @@ import numpy as np
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.process import SIGNALS
-from peers import formulas, ipopt
-from peers.common import Answer
+from peers import formulas
+from peers.common import FLAGS, Answer, casadi, compiled, line
+from peers.truth import rollout
 
 TOLERANCE, MAX_ITERATIONS = 1e-8, 3000
 
@@ -47,7 +55,7 @@ class Shooting:
       problem: of the kind that is to be solved.
       plugin: "ipopt" or "fatrop".
       compile: to C and with g++, for speed.
-      **settings: options of IPOPT or FATROP.
+      **settings: options of IPOPT or FATROP, in place of these.
 
     Raises:
       Unavailable: CasADi is not installed, or g++ where it is needed.
@@ -57,21 +65,32 @@ class Shooting:
     def __init__(
         self, problem: ls.Problem, plugin: Literal["ipopt", "fatrop"], *, compile: bool, **settings: Any
     ) -> None:
-        ca = ipopt.casadi()
-        self._plugin, self._own = plugin, settings
-        told = formulas.formulas(problem)
-        nlp, self._equal = _nlp(problem, told)
+        nlp, self._equal = _nlp(problem, formulas.formulas(problem))
+        self._plugin: str = plugin
         self._nlp = nlp
-        self._limits = {"lbg": 0.0, "ubg": np.where(self._equal, 0.0, np.inf)}
-        self._options: dict[str, Any] = {}
-        if plugin == "fatrop":
-            self._options = {"structure_detection": "auto", "equality": self._equal.tolist()}
-        source = nlp
+        self._limits = {"lbg": 0.0, "ubg": casadi().DM(np.where(self._equal, 0.0, np.inf))}
+        settings = {"print_level": 0, "max_iter": MAX_ITERATIONS, "tol": TOLERANCE, **settings}
+        self._options: dict[str, Any] = {"print_time": False, "show_eval_warnings": False, plugin: settings}
+        if plugin == "ipopt":
+            # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
+            settings |= {"sb": "yes", "honor_original_bounds": "yes"}
+        else:
+            self._options |= {"structure_detection": "auto", "equality": self._equal.tolist()}
         if compile:
-            source = ipopt.library(plugin, nlp, {**self._options, plugin: self._settings(MAX_ITERATIONS)})
-        self._source = source
-        self._solver = self._made(MAX_ITERATIONS)
-        self._values = ca.Function("values", [nlp["x"], nlp["p"]], [nlp["f"], nlp["g"]])
+            self._source = str(_library(plugin, nlp, self._options))
+        else:
+            self._source, self._options["expand"] = nlp, True
+        self._solver = self._made({})
+        self._values = casadi().Function("values", [nlp["x"], nlp["p"]], [nlp["f"], nlp["g"]])
+
+    def from_hover(self, problem: ls.Problem) -> Answer:
+        """Solve from the trajectory of the nominal control, of either robot."""
+        controls = np.tile(problem.nominal_control, (problem.steps, 1))
+        return self.solve(problem, rollout(problem, controls), controls)
+
+    def from_line(self, problem: ls.Problem) -> Answer:
+        """Solve from states on the line from start to goal and the nominal control, which do not belong together."""
+        return self.solve(problem, *line(problem))
 
     def solve(self, problem: ls.Problem, states: Array, controls: Array) -> Answer:
         """Solve from states (T+1, n) and controls (T, m), whether or not they belong together."""
@@ -102,7 +121,7 @@ class Shooting:
     def _shown(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
         shown: list[tuple[float, Array]] = []
         watch = _watch(self._nlp, shown)
-        solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
+        solver = self._made({}, iteration_callback=watch)
         begun = time.process_time()
         self._run(solver, problem, states, controls)
         # Counted back from the last: IPOPT shows its plan once more wherever it begins to restore feasibility.
@@ -112,7 +131,8 @@ class Shooting:
 
     def _stopped(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
         for count in range(1, iterations + 1):
-            solver = self._made(count - 1)  # as Fatrop counts, in its last iteration it only looks at what it has
+            # As Fatrop counts, in its last iteration it only looks at what it has.
+            solver = self._made({"max_iter": count - 1})
             begun = time.process_time()
             plan = self._run(solver, problem, states, controls)["x"].full().ravel()
             yield Moment(count, time.process_time() - begun, *self._worth(problem, plan))
@@ -124,14 +144,10 @@ class Shooting:
         """
         return self._worth(problem, _packed(_stated(problem, states), controls))
 
-    def _settings(self, iterations: int) -> dict[str, Any]:
-        settings = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE, **self._own}
-        # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
-        return settings | ({"sb": "yes", "honor_original_bounds": "yes"} if self._plugin == "ipopt" else {})
-
-    def _made(self, iterations: int, **options: Any) -> Any:
-        own = {**self._options, self._plugin: self._settings(iterations), **options}
-        return ipopt.made(self._plugin, self._source, own)
+    def _made(self, settings: dict[str, Any], **options: Any) -> Any:
+        """CasADi's function that solves the problem, with other settings and options than its own."""
+        own = {**self._options, self._plugin: self._options[self._plugin] | settings, **options}
+        return casadi().nlpsol("solver", self._plugin, self._source, own)
 
     def _run(self, solver: Any, problem: ls.Problem, states: Array, controls: Array) -> Any:
         guess = _packed(_stated(problem, states), controls)
@@ -202,7 +218,7 @@ def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], 
 
     Besides, which of the constraints are equalities.
     """
-    ca, steps = ipopt.casadi(), problem.steps
+    ca, steps = casadi(), problem.steps
     n, m = _stage_states(problem), len(problem.control_coordinates)
     given = len(problem.dynamics.state_coordinates)  # of the start: all but a free duration
     stages, last = ca.MX.sym("w", n + m, steps), ca.MX.sym("last", n)
@@ -226,9 +242,23 @@ def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], 
     return {"x": ca.vertcat(ca.vec(stages), last), "p": p, "f": cost, "g": ca.vertcat(*g)}, np.array(equal)
 
 
+def _library(plugin: str, nlp: dict[str, Any], options: dict[str, Any]) -> Path:
+    """What the plugin needs of the problem, compiled from C; kept on disk."""
+    name = f"{plugin}.c"
+    with tempfile.TemporaryDirectory() as folder:
+        # CasADi writes to the current folder only.
+        here = Path.cwd()
+        os.chdir(folder)
+        try:
+            casadi().nlpsol("solver", plugin, nlp, options).generate_dependencies(name)
+        finally:
+            os.chdir(here)
+        return compiled(f"{plugin}'s problem (some 15 seconds)", [Path(folder) / name], FLAGS)
+
+
 def _watch(nlp: dict[str, Any], shown: list[tuple[float, Array]]) -> Any:
     """What IPOPT calls at the start and after each iteration: it notes when that was, and the variables."""
-    ca, variables, rows = ipopt.casadi(), nlp["x"].numel(), nlp["g"].numel()
+    ca, variables, rows = casadi(), nlp["x"].numel(), nlp["g"].numel()
     sizes = {"f": 1, "x": variables, "lam_x": variables, "g": rows, "lam_g": rows}
 
     class Watch(ca.Callback):

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import peers
+from peers.contestants import Solve, all_iterations, installed
 from reliability.common import fixed
 from runner import Settings, at_most, progress
 from solver_benchmark.speed import reference_folder
@@ -19,7 +20,6 @@ import lqrsim as ls
 from lqrsim.errors import Array
 
 Section = Literal["starts", "time", "clearance", "limits", "worlds", "resolve", "ingredients", "finish"]
-Solve = Callable[[ls.Problem], peers.Answer]
 Found = dict[str, Any]
 
 NONE = (-np.inf, np.inf)  # limits of the controls, for FDDP has none
@@ -95,11 +95,6 @@ def solve(config: Config, problems: Sequence[ls.Problem], name: str, **options: 
         return ls.smooth_many(problems, progress=lambda *_: bar.update(), **options)
 
 
-def all_iterations(solution: ls.Solution) -> int:
-    """Of all starts that were tried."""
-    return sum(one.iterations for one in solution.candidates) or len(solution.iterations)
-
-
 def is_damped(solution: ls.Solution) -> bool:
     return not {row.method for row in solution.iterations} <= {"smooth"}
 
@@ -157,24 +152,20 @@ def others(
     config: Config, problem: ls.Problem, names: Iterable[str], *, compile: bool = True
 ) -> tuple[dict[str, Solve], dict[str, str]]:
     """Other people's solvers by the names of `PEERS` for one world, and why the rest of them is not there."""
-    makers: dict[str, Callable[[], Any]] = {
+    pairs = [tuple(name.split(", ")) for name in names]
+    if not config.peers:
+        return {}, {who: "not asked for" for who, _ in pairs}
+    makers: dict[str, Callable[[], peers.Crocoddyl | peers.Shooting]] = {
         "FDDP": lambda: peers.Crocoddyl(problem),
-        "IPOPT": lambda: peers.Ipopt(problem, compile=compile),
+        "IPOPT": lambda: ipopt(problem, compile=compile),
     }
-    made: dict[str, Any] = {}
-    skipped: dict[str, str] = {}
-    for who in dict.fromkeys(name.split(", ")[0] for name in names):
-        try:
-            if not config.peers:
-                raise peers.Unavailable("not asked for")
-            made[who] = makers[who]()
-        except peers.Unavailable as error:
-            skipped[who] = str(error)
-    found: dict[str, Solve] = {}
-    for who, start in (name.split(", ") for name in names):
-        if who in made:
-            found[f"{who}, {start}"] = made[who].from_hover if start == "hover" else made[who].from_line
-    return found, skipped
+    made, skipped = installed({who: makers[who] for who, _ in pairs})
+    starts = {who: {"hover": one.from_hover, "line": one.from_line} for who, one in made.items()}
+    return {f"{who}, {start}": starts[who][start] for who, start in pairs if who in made}, skipped
+
+
+def ipopt(problem: ls.Problem, *, compile: bool) -> peers.Shooting:
+    return peers.Shooting(problem, "ipopt", compile=compile, max_iter=peers.MAX_ITERATIONS)
 
 
 PEERS = ("FDDP, hover", "FDDP, line", "IPOPT, hover", "IPOPT, line")

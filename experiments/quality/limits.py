@@ -1,6 +1,5 @@
 """Limits of the controls: kept exactly, and what IPOPT makes of the same ones."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from runner import judge, progress
 
 import lqrsim as ls
 from quality import worlds
-from quality.common import Config, Found, converged, cost, endings, of_solutions, queries, skips, solve
+from quality.common import Config, Found, converged, cost, endings, ipopt, of_solutions, queries, skips, solve
 
 ROTORS, WHEELS = (1.05, 1.40), (-0.27, 0.27)  # N, and m/s
 NEAR = 0.01
@@ -70,20 +69,14 @@ def followed(solution: ls.Solution) -> float:
 
 def compare(pairs: list[tuple[ls.Problem, ls.Solution]], name: str, *, same: bool) -> Found:
     """IPOPT's costs from the line, and from each plan; compiled if all are in the `same` world."""
-    starts: dict[str, Callable[[peers.Ipopt, ls.Problem, ls.Solution], peers.Answer]] = {
-        "line": lambda ipopt, problem, _: ipopt.from_line(problem),
-        "plan": lambda ipopt, problem, solution: ipopt.from_trajectory(
-            problem, solution.trajectory.states, solution.trajectory.controls
-        ),
-    }
-    answers: dict[str, list[dict[str, Any]]] = {start: [] for start in starts}
-    shared = peers.Ipopt(pairs[0][0], compile=True) if same else None
+    found: Found = {"from_line": [], "from_plan": []}
+    shared = ipopt(pairs[0][0], compile=True) if same else None
     for problem, solution in progress(pairs, name):
-        ipopt = shared or peers.Ipopt(problem)
-        for start, run in starts.items():
-            answer = run(ipopt, problem, solution)
-            answers[start].append({"cost": cost(problem, answer.controls), "converged": answer.converged})
-    return {f"from_{start}": some for start, some in answers.items()}
+        solver, plan = shared or ipopt(problem, compile=False), solution.trajectory
+        answers = solver.from_line(problem), solver.solve(problem, plan.states, plan.controls)
+        for some, answer in zip(found.values(), answers, strict=True):
+            some.append({"cost": cost(problem, answer.controls), "converged": answer.converged})
+    return found
 
 
 def report(found: dict[str, Any]) -> list[str]:

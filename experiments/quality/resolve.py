@@ -4,11 +4,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from peers.contestants import all_iterations
 from runner import progress
 from solver_benchmark.common import median
 
 import lqrsim as ls
-from quality.common import Config, all_iterations, clear, cost, queries
+from quality.common import Config, clear, cost, queries
 
 SHIFT = 5  # steps that the horizon moves along
 MOVED = 0.1  # m, the goal

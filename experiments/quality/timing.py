@@ -1,15 +1,14 @@
 """How long a query takes, in turns, one thread: one start and several, against FDDP and IPOPT."""
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from peers.contestants import ours, timed
 from runner import judge
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
-from quality.common import NONE, Config, Solve, others, queries, skips
+from quality.common import NONE, Config, others, queries, skips
 
 OURS: dict[str, dict[str, Any]] = {"smooth, one start": {"starts": 1}, "smooth": {}}
 THEIRS = ("FDDP, hover", "IPOPT, line")
@@ -23,8 +22,8 @@ TARGETS = {
 def measure(config: Config) -> dict[str, Any]:
     problems = queries(config.queries, config.seeds[0], NONE)
     solvers, skipped = others(config, problems[0], THEIRS)
-    runs = {name: ours(options) for name, options in OURS.items()}
-    runs |= {name: theirs(solver) for name, solver in solvers.items()}
+    solvers = {name: ours(ls.smooth_many, **options) for name, options in OURS.items()} | solvers
+    runs = {name: timed(solver) for name, solver in solvers.items()}
     for run in runs.values():
         run(problems[0])  # compile
     few, rest = problems[: config.ipopt_queries], problems[config.ipopt_queries :]
@@ -33,26 +32,10 @@ def measure(config: Config) -> dict[str, Any]:
     if rest:
         for name, jobs in take_turns(without, rest, config.rounds, "time, without IPOPT").items():
             turns[name] += jobs
-    seconds = {name: [1e3 * median(rounds) for rounds in jobs] for name, jobs in turns.items()}
+    seconds = {
+        name: [1e3 * median(answer.seconds for answer in rounds) for rounds in jobs] for name, jobs in turns.items()
+    }
     return {"milliseconds": seconds, "skipped": skipped}
-
-
-def ours(options: dict[str, Any]) -> Callable[[ls.Problem], float]:
-    def run(problem: ls.Problem) -> float:
-        clock = time.perf_counter()
-        ls.smooth_many([problem], threads=1, **options)
-        return time.perf_counter() - clock
-
-    return run
-
-
-def theirs(solver: Solve) -> Callable[[ls.Problem], float]:
-    def run(problem: ls.Problem) -> float:
-        clock = time.perf_counter()
-        solver(problem)
-        return time.perf_counter() - clock
-
-    return run
 
 
 def report(found: dict[str, Any]) -> list[str]:
