@@ -14,7 +14,7 @@ RotorPy    its SE(3) controller, along the plan of a quadrotor's solution; `roto
 drake      gains of Drake's linear-quadratic regulators; `drake.py`.
 
 `cost_of`, `rollout` and `clearance_of` recompute what a plan costs, where it leads, and how near it comes to obstacles;
-`cost_along` what a run costs.
+`cost_along` what a run costs. `contestants.py` has what comparisons share: lqrsim's solvers beside these, and times.
 """
 
 from peers import drake
