@@ -169,7 +169,7 @@ def begin(begun, stages, work, mem):
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
     mem.highest, mem.fraction, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
     mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, inf, 0.0, begun.oldest
+    mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, nan, 0.0, begun.oldest
     clear(now.slacks, rows.size * (steps + 1), 2)
     for at in range(rows.size * (steps + 1)):
         rows.force[at] = 0.0

@@ -324,6 +324,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "World.seen_by": ({"self": world, "plane": "xz", "offset": 0.5},),
         "World.moved": ({"self": world, "seconds": 0.5},),
         "World.displacements": ({"self": world, "times": [0.0, 0.5]},),
+        "Problem.site_errors": ({"self": place.problem, "states": place.rollout.states[:, -1]},),
         "Problem.violations": ({"self": place.problem, "rollout": place.rollout},),
         "World.tables": ({"self": world, "times": [0.0, 0.5]},),
         "World.distances": ({"self": world, "point": [0.0, 1.0, 2.0]},),
