@@ -372,6 +372,7 @@ def test_a_chance_constraint_keeps_standard_deviations_away(chance: float) -> No
     assert 0 <= left.min() <= 1.1e-3  # with noise, a solver keeps 1e-3 to spare
 
 
+@pytest.mark.long  # what is compiled for it takes 6 s
 def test_the_filter_in_the_loop_is_as_good_as_it_says() -> None:
     """The errors of its means, in MuJoCo with the stated noise: 3 squares of normal numbers, on average over trials.
 

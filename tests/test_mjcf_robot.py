@@ -512,6 +512,7 @@ def test_a_free_body_passes_pillars(clearance: float | None) -> None:
         assert min(apart) == pytest.approx(clearance, abs=1e-5)
 
 
+@pytest.mark.long  # what is compiled for it takes 6 s
 def test_a_plan_along_which_flat_sides_lie_along_pillars_ends() -> None:
     """The optimum is at kinks of distances, where no gradient vanishes, though no clearance acts.
 

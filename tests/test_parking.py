@@ -68,7 +68,7 @@ def backed(
 
 
 @pytest.mark.parametrize(
-    ("gap", "weight", "steps"), [(6.0, 20.0, 20), *rarely((6.0, 1.0, 20), (5.0, 500.0, 20), (5.0, 5000.0, 25))]
+    ("gap", "weight", "steps"), rarely((6.0, 20.0, 20), (6.0, 1.0, 20), (5.0, 500.0, 20), (5.0, 5000.0, 25))
 )
 def test_a_car_beside_a_gap_backs_its_trailer_into_it(gap: float, weight: float, steps: int) -> None:
     """It has to drive on first. What is missed by plans that only turn is stationary, and they are where all other
