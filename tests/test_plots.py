@@ -1,5 +1,6 @@
 """The figure of a run: what is written on it, and that it is the same each time."""
 
+import gc
 import re
 import subprocess
 import sys
@@ -96,6 +97,26 @@ def test_same_runs_give_the_same_bytes(
     assert files[0] == files[1]
     assert dict(matplotlib.rcParams) == before
     assert {file.suffix for file in tmp_path.iterdir()} == {suffix}
+
+
+@pytest.mark.parametrize("layout", ["screen", *rarely("column", "page")])
+def test_where_objects_lie_in_memory_does_not_change_the_bytes(
+    layout: style.Style,
+    drive_solution: ls.Solution,
+    drive_runs: dict[str, ls.Rollout],
+    differential_drive: ls.Scenario,
+    tmp_path: Path,
+) -> None:
+    """Collections at other times lead to other addresses, by which the solver of the layout orders its variables."""
+    before, files, world = gc.get_threshold(), [], differential_drive.scene.world
+    try:
+        for young in (*range(1, 8), 700):
+            gc.set_threshold(young, 2, 2)
+            path = tmp_path / f"{young}.svg"
+            files.append(plot_run(drive_solution, drive_runs, path, world=world, style=layout).read_bytes())
+    finally:
+        gc.set_threshold(*before)
+    assert len(set(files)) == 1
 
 
 def test_works_without_obstacles(
