@@ -12,7 +12,7 @@ from tracking import hover, weave
 
 import lqrsim
 from lqrsim import rotations
-from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.sources import Source, source_of
 from lqrsim.problem import quadratic_cost
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.effects import Effect
@@ -251,6 +251,8 @@ CALLS: list[tuple[Callable[[], object], str]] = [
         (7, {}, "want __name__"), (quadratic_cost, {"UNKNOWN": 1}, "UNKNOWN: got 1, want a number"),
         (quadratic_cost, {"CONTROL": "no"}, "CONTROL: got 'no', want a number"),
     )],
+    *[(lambda name=name: Source(module=name).digest, "source: module: got .*, want the name of one that can be")
+      for name in ("no_such_module", "lqrsim." * 2000 + "kernels", "lqrsim..kernels")],
     # Solutions in continuous time.
     (lambda: lq_continuous().policy([0.0], -0.1), r"^t: got -0\.1, want seconds from 0 to 2"),
     (lambda: lq_continuous().x_hat([0.0, 2.1]), r"^t: got 2\.1, want seconds from 0 to 2"),

@@ -293,7 +293,7 @@ def _is_kernels(module: str) -> bool:
 def _imported(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
-    except (ImportError, ValueError):
+    except (ImportError, ValueError, RecursionError):  # the last for a name of a thousand parts
         raise InputError(f"source: module: got {excerpt(module)}, want the name of one that can be imported") from None
 
 
