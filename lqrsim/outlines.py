@@ -138,7 +138,10 @@ class Box(namedtuple("Box", ("length", "width", "height"))):
             if isinstance(turn, Real):
                 from math import cos, sin
             else:
-                from sympy import cos, sin
+                from sympy import Expr, cos, sin
+
+                if not isinstance(turn, Expr):
+                    raise TypeError("no angle")  # SymPy would read an iterator to its end
             (x, y), c, s = center, cos(turn) / 2, sin(turn) / 2
             ends = [(a * self.length, b * self.width) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             return [[x + a * c - b * s, y + a * s + b * c] for a, b in ends]

@@ -1,5 +1,6 @@
 """Bad input gets one line that names it; where a file, a run or a robot is needed, with the tests of these."""
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -266,6 +267,8 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: ls.load_scene("aren"), "^scene: got 'aren', want one of: arena, cage .*or the path of an .xml"),
     (lambda: ls.load_scene("somewhere/nowhere.xml"),
      "^scene: got '.*nowhere.xml', want a file that exists, or one of: arena"),
+    *[(lambda height=height, turn=turn: ls.types.Box(1, 2, height).corners([0.0] * (3 if height else 2), turn()),
+       "corners: got .*, want . coordinates and") for height in (None, 1.0) for turn in (itertools.count, object, str)],
     (lambda: ls.Obstacle.of_corners(object(), np.zeros(3)), "^obstacle: name: got an object, want a name"),
     (lambda: ls.World([ls.Obstacle(
         "ramp", "box", np.zeros(3), Rotation.from_euler("x", 30, degrees=True).as_matrix(), np.ones(3)
