@@ -130,7 +130,9 @@ def test_records_of_arrays_equal_themselves_alone() -> None:
     texts = {kind: [annotation(kind, field) for field in dataclasses.fields(kind) if field.compare] for kind in kinds}
     found: set[type] = set()
     while True:
-        names = "|".join([r"numpy\.ndarray", *(re.escape(f"{kind.__module__}.{kind.__name__}") for kind in found)])
+        names = "|".join(
+            [r"numpy\.ndarray|NDArray", *(re.escape(f"{kind.__module__}.{kind.__name__}") for kind in found)]
+        )
         more = {kind for kind in kinds if any(re.search(rf"({names})\b", text) for text in texts[kind])}
         more |= {kind for kind in kinds if any(issubclass(kind, one) for one in found)}
         if more == found:
