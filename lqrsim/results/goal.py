@@ -212,12 +212,19 @@ class Target:
         """Whether the plan ends outside the radius; False if the radius is not known."""
         return radius is not None and not float(self.distance(self.plan[-1])) <= radius
 
-    def of_plan(self, radius: float | None) -> list[str]:
-        """Lines on the end of the plan: its distance from the goal, and another line if the plan misses the goal.
+    def misses_goal(self, radius: float | None) -> bool:
+        """Whether the problem names a goal and the plan ends outside the radius.
 
         Without a radius, a plan misses if it ends farther from the goal than a tenth of the way from its start; of the
         farthest on the way, if it starts at the goal.
         """
+        if radius is None:
+            away = self.distance(self.plan)
+            radius = max(TOLERANCE * float(away[0] if away[0] > NEGLIGIBLE else away.max()), NEGLIGIBLE)
+        return self.goal is not None and self.misses(radius)
+
+    def of_plan(self, radius: float | None) -> list[str]:
+        """Lines on the end of the plan: its distance from the goal, and another line if the plan misses the goal."""
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
         within = ""
@@ -226,12 +233,7 @@ class Target:
         worst = self.worst(self.plan[-1], radius)
         end = self.describe(float(self.distance(self.plan[-1])))
         lines = [f"the plan ends {end}{within}{f': {worst}' if worst else ''}"]
-        if radius is None:
-            away = self.distance(self.plan)
-            allowed = max(TOLERANCE * float(away[0] if away[0] > NEGLIGIBLE else away.max()), NEGLIGIBLE)
-        else:
-            allowed = radius
-        if self.misses(allowed):
+        if self.misses_goal(radius):
             by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
             mend = "raise the weights of the final cost or, if controls are at their limits, the number of steps"
             lines.append(f"the plan MISSES the goal{by}: {mend}")

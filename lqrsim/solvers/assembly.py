@@ -115,9 +115,8 @@ def _usable(problem: Problem, result: RunResult, options: dict[str, object]) -> 
     if np.isfinite(plan.optimality) and plan.optimality > UNFINISHED:
         return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
     target = Target(problem.dynamics.state_coordinates, problem.weighed_goal, result.states)
-    misses = len(target.of_plan(target.radius_of_plan(goal_radius_of(problem, result.states)))) > 1
     use = "the plan can be used, for it keeps dynamics, limits and constraints"
-    if misses:
+    if target.misses_goal(target.radius_of_plan(goal_radius_of(problem, result.states))):
         use = "the plan keeps dynamics, limits and constraints, but misses the goal"
     if not np.isfinite(plan.optimality):
         return f"{use}; whether it is optimal is unknown"
