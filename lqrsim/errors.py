@@ -420,7 +420,7 @@ def excerpt(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def brief(value: object) -> str:
+def brief(value: object, depth: int = 0) -> str:
     """A value within the text of a record: numbers in six digits, long arrays by their shape, functions by name."""
     if isinstance(value, (bool, str)) or value is None:
         return repr(value)
@@ -431,10 +431,12 @@ def brief(value: object) -> str:
         if square and not (value - np.diag(np.diag(value))).any():
             return f"diag({brief(np.diag(value).tolist())})"
         return brief(value.tolist()) if value.ndim <= 1 and value.size <= 12 else f"array {value.shape}"
+    if isinstance(value, (Mapping, list, tuple)) and depth > 5:  # lists within lists without end
+        return f"a {type(value).__name__}"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{name}: {brief(entry)}" for name, entry in value.items()) + "}"
+        return "{" + ", ".join(f"{name}: {brief(entry, depth + 1)}" for name, entry in value.items()) + "}"
     if isinstance(value, (list, tuple)):
-        listed = [brief(item) for item in value]
+        listed = [brief(item, depth + 1) for item in value]
         text = (
             f"{listed[0]}, ... {len(listed)} times" if len(listed) > 3 and len(set(listed)) == 1 else ", ".join(listed)
         )

@@ -43,6 +43,7 @@ from lqrsim.errors import (
 )
 from lqrsim.machine import memory
 from lqrsim.problem.costs import CostTerm
+from lqrsim.results.solution_parts import BetweenKnots
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress import Campaign
 from lqrsim.stress.statistics import rate
@@ -295,6 +296,16 @@ class TestChecks:
         for value in (nested, Raising(), "x\n" * 10**6, 10**10_000, list(range(10**6)), np.zeros((50, 50)), "\x1b[2J"):
             assert len(excerpt(value)) <= 60
             assert excerpt(value).isprintable()
+
+    @pytest.mark.parametrize("kind", [list, tuple, dict])
+    def test_records_print_lists_within_lists_without_end(self, kind: type) -> None:
+        endless: list[Any] = []
+        endless.append(endless)
+        deep: Any = kind()
+        for _ in range(100_000):
+            deep = {"a": deep} if kind is dict else kind([deep])
+        for value in (deep, endless):
+            assert f"a {type(value).__name__}" in repr(BetweenKnots(0.0, 0.0, {"clearance": value}))
 
     def test_memory_is_that_of_the_machine_and_its_limits(self) -> None:
         assert memory() > 2**28
