@@ -33,7 +33,7 @@ SIZE = 1280, 720
 
 @dataclass(frozen=True, kw_only=True)
 class Config(Settings):
-    rounds: int = 7
+    rounds: int = 5
     """How often each has its turn."""
     seed: int = 0
     """Of the disturbances."""

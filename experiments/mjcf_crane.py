@@ -8,7 +8,7 @@ tendon with a largest length; its load is only moved.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from runner import FolderSettings, Result, opening, run, table
@@ -49,6 +49,8 @@ CRANE = """
 class Config(FolderSettings):
     iterations: int = 150
     """At most, of each solve."""
+    loads: tuple[Literal["in the plane", "in space"], ...] = ("in the plane", "in space")
+    """How the load can move."""
 
 
 def main(config: Config) -> Result:
@@ -56,7 +58,7 @@ def main(config: Config) -> Result:
     result["rows"] = [
         solved(winch, load, lifted, most)
         for winch, lifts in ((name, LIFTED if name != next(iter(WINCHES)) else (0.0,)) for name in WINCHES)
-        for load in LOADS
+        for load in config.loads
         for lifted in lifts
     ]
     return result
