@@ -267,11 +267,9 @@ def connected(address: str) -> Iterator[Any]:
             raise InputError(f"scheduler: got {address}, want workers that can run lqrsim ({error})") from None
         if not versions_there:
             raise InputError(f"scheduler: got {address}, which has no workers, want at least one")
-        for worker, theirs in versions_there.items():
-            if theirs != versions():
-                other = ", ".join(
-                    f"{name} {theirs.get(name)}" for name, own in versions().items() if theirs.get(name) != own
-                )
+        here = versions()
+        for worker, there in versions_there.items():
+            if other := ", ".join(f"{name} {there.get(name)}" for name in here if there.get(name) != here[name]):
                 raise InputError(f"scheduler: got worker {worker} with {other}, want the versions of this machine")
         yield client
 

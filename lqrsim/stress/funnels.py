@@ -11,6 +11,7 @@ bound of Clopper and Pearson is at least the rate.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -299,24 +300,21 @@ def funnel(
             simulated=sum(result.simulated for result in every),
         )
 
+    run = 0
+
+    def runs(knot: int, level: float, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+        nonlocal run
+        last = f", level {levels[-1].level:.3g} at the one before" if levels else ""
+        tell(len(levels), len(starts), f"trying level {level:.3g} at knot {knot}{last}; {run:,} trials")
+        run += len(numbers)
+        return runner.reached(blank, knot, level, numbers)
+
     with keeping(lambda _: so_far() if levels else None):
-        run = 0
-        for done, knot in enumerate(starts):
-            last = f", level {levels[-1].level:.3g} at the one before" if levels else ""
+        for knot in starts:
             guess = _radius_level(plant, space.position, chosen, shapes[knot])
-            highest = min(
-                _half_turn_level(solution, chosen, shapes[knot]), guess * LEVEL_RANGE if largest is None else largest
-            )
-
-            def runs(
-                level: float, numbers: npt.NDArray[np.intp], knot: int = knot, done: int = done, last: str = last
-            ) -> npt.NDArray[np.bool_]:
-                nonlocal run
-                tell(done, len(starts), f"trying level {level:.3g} at knot {knot}{last}; {run:,} trials")
-                run += len(numbers)
-                return runner.reached(blank, knot, level, numbers)
-
-            levels.append(find_level(runs, test, guess=guess, largest=highest, rate=rate))
+            highest = guess * LEVEL_RANGE if largest is None else largest
+            highest = min(_half_turn_level(solution, chosen, shapes[knot]), highest)
+            levels.append(find_level(partial(runs, knot), test, guess=guess, largest=highest, rate=rate))
         tell(len(starts), len(starts), f"level {levels[-1].level:.3g} at knot {starts[-1]}; {run:,} trials")
     return so_far()
 

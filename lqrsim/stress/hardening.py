@@ -202,8 +202,6 @@ def harden(
 
 
 class _Search:
-    """The plans so far."""
-
     def __init__(
         self, problem: ReliabilityProblem, chance: float, options: dict[str, int], progress: TextProgress | None = None
     ) -> None:
@@ -230,7 +228,6 @@ class _Search:
         return law
 
     def next(self) -> Solution | None:
-        """The next plan; None if there is none."""
         stated = self.scenario.problem
         if not self.rounds:
             if self.problem.given is not None:
@@ -348,8 +345,8 @@ class _Search:
     @property
     def remedy(self) -> str:
         """What helps against runs that leave their plan for good."""
-        told = self.problem.policy in DESIGNED and self.problem.design_disturbances is not None
-        design = ", design the law for what is run (without design_disturbances)" if told else ""
+        designed = self.problem.policy in DESIGNED and self.problem.design_disturbances is not None
+        design = ", design the law for what is run (without design_disturbances)" if designed else ""
         return f"give the controls more range{design}, or allow a higher chance"
 
     def safest(self) -> int:

@@ -152,12 +152,7 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
 
 
 def make_controller(
-    name: str,
-    scenario: Scenario,
-    solution: Solution,
-    *,
-    design: Design = None,
-    replan_every: float | None = None,
+    name: str, scenario: Scenario, solution: Solution, *, design: Design = None, replan_every: float | None = None
 ) -> Controller | AffinePolicy:
     """A controller for a solution of the scenario.
 

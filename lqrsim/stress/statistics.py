@@ -151,9 +151,7 @@ def holm(p_values: npt.ArrayLike) -> Array:
         check_number("p_values", value, at_least=0.0, at_most=1.0)
     order = np.argsort(values, kind="stable")
     raised = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
-    adjusted = np.empty(len(values))
-    adjusted[order] = raised
-    return adjusted
+    return raised[np.argsort(order)]
 
 
 def rounded(number: float) -> str:
