@@ -304,6 +304,23 @@ def test_errors_of_estimates_are_as_large_as_the_filter_says(cage, law):
     np.testing.assert_allclose(kept[:, :12, :12], np.tile(law.filter.corrected[59, :12, :12], (60, 1, 1)), rtol=1e-6)
 
 
+@given(name=st.from_regex(r"wind_[a-z]{0,3}", fullmatch=True))
+@settings(max_examples=examples(8))
+def test_a_load_on_a_body_whose_name_begins_like_a_wind_is_no_wind(tmp_path_factory, name):
+    """The parameter of such a load, `wind_vane_load`, moves no reading as a force of the wind would."""
+    path = tmp_path_factory.mktemp("vane") / "cart.xml"
+    path.write_text(CART.replace('body name="sled"', f'body name="{name}"'))
+    robot = ls.MjcfRobot(path)
+    problem = robot.problem(np.zeros(2), np.array([1.0, 0.0]), steps=10, dt=0.02)
+    solution = ls.smooth(problem)
+    load = Uncertainty(unknowns=[Unknown(f"{name}_load", 0.1)], start=0.1)
+    sensors = ls.Plant(robot, robot.scene).sensors([Sensor("place")])
+    law = ls.OffsetFree(problem, solution, load, sensors=sensors, tolerate={"m": 0.1, "m/s": 0.2}, effort=5.0)
+    assert law.model.parameters == (f"{name}_load",)
+    acting = SensorFilter(law.model, sensors).acting(np.ones((1, law.model.size)), np.zeros((1, 1)))
+    np.testing.assert_array_equal(acting[1], np.zeros((1, 6)))
+
+
 def test_a_trial_is_the_same_alone_and_among_others(cage, law):
     lossy = [dataclasses.replace(one, loss=0.3) for one in IMU]
     met = [*MET, SensorErrors(lossy)]

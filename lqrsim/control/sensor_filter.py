@@ -28,6 +28,7 @@ from lqrsim.robots.sensors import RobotSensors
 # A reading does not depend on the state if its derivatives are below this: differences of MuJoCo's are good to 1e-9.
 _SILENT = 1e-8
 _WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+_WIND = "wind_x", "wind_y", "wind_z"
 
 
 class Estimate(NamedTuple):
@@ -65,8 +66,8 @@ class SensorFilter:
         for j, name in enumerate(names):
             if name in _WRENCH:
                 wrench[_WRENCH.index(name), j] = 1.0
-            elif name.startswith("wind_"):
-                wrench["xyz".index(name[-1]), j] = self.sensors.drag
+            elif name in _WIND:
+                wrench[_WIND.index(name), j] = self.sensors.drag
         return wrench
 
     def acting(self, z: Array, controls: Array) -> tuple[Array, Array]:
@@ -94,7 +95,7 @@ class SensorFilter:
                 moved = at.copy()
                 moved[:, j] += sign * step
                 sides.append(read(*np.split(moved, [model.n, model.n + model.m], axis=1)))
-            slopes[:, :, j] = (self._aligned(sides[0], sides[1]) - sides[1]) / (2 * step[:, None])
+            slopes[:, :, j] = (self.aligned(sides[0], sides[1]) - sides[1]) / (2 * step[:, None])
         slopes[np.isnan(slopes)] = 0.0  # where a rangefinder meets nothing
         states, controls, wrench = np.split(slopes, [model.n, model.n + model.m], axis=2)
         return states, controls, wrench
@@ -177,10 +178,7 @@ class SensorFilter:
 
     def due(self, knot: int) -> npt.NDArray[np.bool_]:
         """Which numbers of the readings (Y,) are taken at a knot."""
-        mask = np.zeros(len(self.sensors.names), dtype=bool)
-        for at, due in zip(self.sensors.columns, self.sensors.due(knot, self.model.plan.dt), strict=True):
-            mask[at] = due
-        return mask
+        return np.repeat(self.sensors.due(knot, self.model.plan.dt), self._sizes)
 
     @cached_property
     def along(self) -> KalmanFilter:
@@ -214,17 +212,13 @@ class SensorFilter:
     def _sizes(self) -> list[int]:
         return [at.stop - at.start for at in self.sensors.columns]
 
-    def _aligned(self, readings: Array, reference: Array) -> Array:
+    def aligned(self, readings: Array, reference: Array) -> Array:
         """The readings (K, Y), with each quaternion or its negative, whichever is nearer to that of the reference."""
         aligned = readings.copy()
         for at, turns in zip(self.sensors.columns, self.sensors.quaternions, strict=True):
             if turns:
                 aligned[:, at] *= np.where(np.vecdot(readings[:, at], reference[:, at]) < 0, -1.0, 1.0)[:, None]
         return aligned
-
-    def difference(self, readings: Array, expected: Array) -> Array:
-        """Readings minus expectations, (K, Y)."""
-        return self._aligned(readings, expected) - expected
 
 
 def _root(covariance: Array) -> Array:
@@ -283,7 +277,7 @@ class SensorRun(FilterRun):
         if known.any():
             expected = self._read(states[0], *filter_.acting(z, self._acting[knot]))
             expected[:, filter_.biased] += bias
-            off = filter_.difference(self._readings[knot], expected)
+            off = filter_.aligned(self._readings[knot], expected) - expected
             moved = filter_.correct(covariance, knot, known & np.isfinite(off), off)
             z += moved[:, : model.size]
             bias += moved[:, model.size :]
