@@ -282,10 +282,9 @@ class _Search:
         if self._gave_up(0):
             return None
         if np.isfinite(self.impossible):  # between a margin with a plan and a margin without
-            low = self.too_few if not np.isfinite(self.enough) else None
-            if low is None or self.impossible - low < 0.05 * self.impossible:
+            if np.isfinite(self.enough) or self.impossible - self.too_few < 0.05 * self.impossible:
                 return None
-            return (low + self.impossible) / 2
+            return (self.too_few + self.impossible) / 2
         wanted = max(float(-ndtri(self.asked)), 0.5) if first else self._needed(plan)
         if not np.isfinite(self.enough):
             return max(wanted, 1.01 * self.too_few)

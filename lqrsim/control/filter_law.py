@@ -216,7 +216,7 @@ class ReplannedRun(ControllerRun):
         # The unknowns' states that are constant to the end of the horizon and change only parameters.
         on_controls = (model.output[len(model.parameters) :] != 0).any(axis=0)
         modelled = (model.output != 0).any(axis=0) & ~on_controls
-        for unknown, states in zip(model.remembered, model.own_states, strict=True):
+        for unknown, states in zip(model.remembered, model.unknown_states, strict=True):
             modelled[list(states)] &= unknown.constant
         in_plan = np.where(modelled, z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ in_plan
@@ -289,7 +289,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
         at = min(t + delay, steps - 1)
         arrays["gain"][t], arrays["offset"][t] = law.gain[at] @ onto, law.gain[at] @ constant + law.offset[at]
         arrays["nominal"][t, :size] = nominal[knot]
-        places = np.clip(t + delay - np.arange((latency + delay), 0, -1), 0, steps - 1)
+        places = np.clip(t + delay - np.arange(latency + delay, 0, -1), 0, steps - 1)
         arrays["nominal"][t, size:] = plan.controls[places].ravel()
         _write_step({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
     return OutputFeedbackPolicy(

@@ -79,7 +79,7 @@ def _gains(correction_root: Array, root: Array) -> Array:
 def check_observable(model: PlanModel) -> None:
     """Raise InputError that names an unknown, if it moves the robot but changes no measurement of the plan's model."""
     first = model.n + model.lagging
-    effect, groups = np.eye(model.size)[:, first:], [list(indices) for indices in model.own_states]
+    effect, groups = np.eye(model.size)[:, first:], [list(indices) for indices in model.unknown_states]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))

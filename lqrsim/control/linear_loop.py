@@ -22,7 +22,7 @@ from lqrsim.kernels import loop_moments
 from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork, zeros_of
 
 
-def moments_of(loops: LoopArrays, stated: int, count: int | None = None, lost: float = 0.0) -> LoopMoments:
+def moments_of(loops: LoopArrays, stated: int, count: int | None, lost: float = 0.0) -> LoopMoments:
     """The moments of the first entries of y, or of all, in each of L systems under each of C laws, (L, C, ...).
 
     Args:
@@ -71,7 +71,7 @@ class LinearLoop:
         moments = self.in_systems([self.model], count)
         return LoopMoments(*(moment[0, 0] if self.gain.ndim == 3 else moment[0] for moment in moments))
 
-    def in_systems(self, models: Sequence[PlanModel], count: int | None = None) -> LoopMoments:
+    def in_systems(self, models: Sequence[PlanModel], count: int | None) -> LoopMoments:
         """The moments in several true systems, which differ in no sizes, and in neither sensors nor losses."""
         first, steps, m = models[0], self.model.plan.steps, self.model.m
         n, stated, unknown = first.n, first.n + first.lagging, len(first.transition)
@@ -98,10 +98,8 @@ class LinearLoop:
             jointly = np.zeros((*gain.shape[:-1], size))
             jointly[..., stated:] = on_command @ measured.swapaxes(-1, -2)
         for i, model in enumerate(models):
-            F[:, i, :stated, :stated], F[:, i, :stated, size:] = (
-                model.F[:, :stated, :stated],
-                model.F[:, :stated, stated:],
-            )
+            F[:, i, :stated, :stated] = model.F[:, :stated, :stated]
+            F[:, i, :stated, size:] = model.F[:, :stated, stated:]
             G[:, i, :, :stated], c[:, i, :stated] = model.G[:, :stated].swapaxes(1, 2), model.c[:, :stated]
             start, process = model.start_root @ model.start_root.T, model.process_noise
             noise[0, i, :stated, :stated], drawn[0, i] = start[:stated, :stated], start[stated:, stated:]

@@ -168,7 +168,7 @@ class PlanModel:
         """Names of the entries of z for messages, (Z,)."""
         controls = self.dynamics.control_coordinates.names[: self.lagging]
         unknowns = (
-            unknown.name for unknown, states in zip(self.remembered, self.own_states, strict=True) for _ in states
+            unknown.name for unknown, states in zip(self.remembered, self.unknown_states, strict=True) for _ in states
         )
         return (
             *self.dynamics.state_coordinates.names,
@@ -203,7 +203,7 @@ class PlanModel:
         return tuple(unknown for unknown in self.uncertainty.unknowns if not unknown.white)
 
     @cached_property
-    def own_states(self) -> list[range]:
+    def unknown_states(self) -> list[range]:
         """For each remembered unknown, the indices of its states."""
         ends = np.cumsum([0, *(len(shaping.output) for shaping in self._filters)])
         return [range(first, end) for first, end in pairwise(ends.tolist())]

@@ -261,9 +261,8 @@ class ReplanRule:
         if self.horizon == "moving":
             problem, after = problem.later(request.first * problem.dt), 0
         return self.solver.solve(
-            request.state, request.start, problem=problem, after=after, time_limit=time_limit,
-            previous=request.previous,
-        )  # fmt: skip
+            request.state, request.start, problem=problem, after=after, time_limit=time_limit, previous=request.previous
+        )
 
 
 def within_rates(commands: Array, problem: Problem, sent: Array | None) -> Array:

@@ -92,10 +92,8 @@ def choose_tolerances(
     """
     norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    tried, limits = (
-        tolerances_to_try(model, effort, at_end, solution.target),
-        solution.policy.control_coordinates.limits,
-    )
+    tried = tolerances_to_try(model, effort, at_end, solution.target)
+    limits = solution.policy.control_coordinates.limits
     laws = tracking_laws(model, tried)
     loop_moments = moments(laws)
     predicted = predictions(solution, surroundings, norm, loop_moments)

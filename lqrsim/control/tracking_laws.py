@@ -69,7 +69,7 @@ class Weights:
         return cls(state**-2.0, effort**-2.0, end**-2.0)
 
     def pick(self, i: int | None) -> "Weights":
-        """One of C."""
+        """One of C; with None, those of a single law as the only ones of C = 1."""
         emphasis = None if self.emphasis is None else self.emphasis[i]
         return Weights(self.state[i], self.control, self.end[i], emphasis)
 
