@@ -309,6 +309,8 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: of.Dryden(altitude=400.0), "^Dryden: altitude: got 400.0, want a finite number >= 0 and <= 304.8$"),
     (lambda: of.Saturation(), "^Saturation: share: got neither share and limits, want"),
     (lambda: of.Saturation(share=1.1), "^Saturation: share: got 1.1, want"),
+    (lambda: of.SensorErrors([of.Sensor("gyro", noise=1.0), of.Sensor("gyro")]),
+     r"^SensorErrors: sensors: got \['gyro', 'gyro'\], want each at most once"),
     (lambda: of.ActuatorLoss(remaining=1.1), "^ActuatorLoss: remaining: got 1.1, want"),
     (lambda: of.MassMismatch(), "^MassMismatch: got neither of std and factor, want one of the two$"),
     (lambda: of.AxleMismatch(0.1, 1.1), "^AxleMismatch: got both std and factor, want one of the two$"),

@@ -356,6 +356,17 @@ def test_errors_of_sensors_are_stored_as_plain_data():
     assert disturbances_from_json(disturbances_as_json([one]), ls.scenarios.quadrotor()) == (one,)
 
 
+@given(names=st.lists(st.sampled_from([one.name for one in IMU]), max_size=4))
+def test_errors_of_a_sensor_are_stated_once(names):
+    """Two of the same name are refused, where the last of them alone would act."""
+    stated = [Sensor(name, noise=0.1 * i) for i, name in enumerate(names)]
+    if len({*names}) < len(names):
+        with pytest.raises(InputError, match=r"SensorErrors: sensors: got .*, want each at most once"):
+            SensorErrors(stated)
+    else:
+        assert [one.noise for one in SensorErrors(stated).known] == [one.noise for one in stated]
+
+
 def test_what_cannot_be_read_is_refused_by_name(on_track, cage, law, plan, problem):
     cart_problem, solution, plant = on_track
     with pytest.raises(InputError, match=r"sensors: got 'gyro', want .*place.*speed"):

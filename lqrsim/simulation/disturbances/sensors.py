@@ -9,7 +9,7 @@ import numpy as np
 
 from lqrsim.annotations import NonNegative, Share, checked
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, check_items, check_kind, check_name, keep
+from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, keep
 from lqrsim.problem.belief import Belief
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import Sensor
@@ -17,7 +17,7 @@ from lqrsim.simulation.disturbances.base import Disturbance, Effect, normal, uni
 from lqrsim.simulation.plant import Plant
 
 READINGS, DEVIATIONS = "readings", "standard deviations"  # of a belief, by which `read` has them
-SETTINGS = tuple(one.name for one in fields(Sensor)[1:])  # all but the name
+SETTINGS = tuple(field.name for field in fields(Sensor)[1:])  # all but the name
 
 
 @checked
@@ -40,16 +40,18 @@ class SensorErrors(Disturbance):
     _scales = "strength"
 
     def __post_init__(self) -> None:
-        sensors = self.sensors
-        if not isinstance(sensors, Mapping):
-            known = check_items("SensorErrors: sensors", sensors, Sensor, "a list of Sensor")
-            sensors = {sensor.name: {key: getattr(sensor, key) for key in SETTINGS} for sensor in known}
-        for name, settings in sensors.items():
-            wanted = "settings of a Sensor by name"
-            for key in check_kind(f"SensorErrors: sensors: {name}", settings, Mapping, wanted):
-                check_name(f"SensorErrors: sensors: {name}", key, SETTINGS)
-        keep(self, sensors=sensors)
-        keep(self, sensors={sensor.name: {key: getattr(sensor, key) for key in SETTINGS} for sensor in self.known})
+        if isinstance(self.sensors, Mapping):
+            for name, settings in self.sensors.items():
+                field = f"SensorErrors: sensors: {name}"
+                for key in check_kind(field, settings, Mapping, "settings of a Sensor by name"):
+                    check_name(field, key, SETTINGS)
+            sensors = [Sensor(name, **settings) for name, settings in self.sensors.items()]
+        else:
+            sensors = check_items("SensorErrors: sensors", self.sensors, Sensor, "a list of Sensor")
+        by_name = {sensor.name: {key: getattr(sensor, key) for key in SETTINGS} for sensor in sensors}
+        if len(by_name) < len(sensors):
+            raise InputError(f"SensorErrors: sensors: got {[one.name for one in sensors]}, want each at most once")
+        keep(self, sensors=by_name)
 
     @cached_property
     def known(self) -> tuple[Sensor, ...]:
