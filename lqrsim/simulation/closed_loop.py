@@ -149,11 +149,8 @@ class Records:
 
         self.plan, steps = plan, plan.steps
         n, m = plan.states.shape[1], plan.controls.shape[1]
-        self.states, self.measured, self.clearance = (
-            zeros(steps + 1, n),
-            zeros(steps + 1, n),
-            zeros(steps + 1, 1)[..., 0],
-        )
+        self.states, self.measured = zeros(steps + 1, n), zeros(steps + 1, n)
+        self.clearance = zeros(steps + 1, 1)[..., 0]
         self.commanded, self.applied, self.wrench = zeros(steps, m), zeros(steps, m), zeros(steps, 6)
         self.contacts = np.zeros(trials, dtype=np.int64)
         self.lost_since, self.failed_since = np.full(trials, steps + 1), np.full(trials, steps + 1)
@@ -221,10 +218,10 @@ class ClosedLoop:
     Attributes:
       starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
         which they begin. Both are for `simulate_from`.
-      acting: the disturbances, each `Noise` as a StateNoise. law: the controller, by default the plan's policy.
-      whole: the plan's trajectory from its own first knot on.
-      followed: the plan of the run: the given one, or else the controller's own; from the knot on. trajectory: its
-        trajectory.
+      active_disturbances: the disturbances, each `Noise` as a StateNoise.
+      law: the controller, by default the plan's policy.
+      full_trajectory: the plan's trajectory from its own first knot on. trajectory: the same from the knot on.
+      remaining_plan: the plan of the run, the given one or else the controller's own, from the knot on.
       state_coordinates, control_coordinates: those of the controller, with limits within the robot's limits.
       step: number of the next control period. measured: (K, n), the measured states at its beginning.
       controller_run: the run of the controller.
@@ -254,30 +251,30 @@ class ClosedLoop:
     @unlogged()
     def __post_init__(self) -> None:
         plant, trials = self.plant, self.trials
-        self.acting = as_disturbances(self.disturbances)
+        self.active_disturbances = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
         self.state_coordinates, self.control_coordinates = _coordinates_of(self.law, plan, plant)
-        self.whole = plan.trajectory
-        if self.knot >= self.whole.steps:
-            raise InputError(f"knot: got {self.knot}, want one from 0 to {self.whole.steps - 1}, before the plan's end")
-        self.followed = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
+        self.full_trajectory = full = plan.trajectory
+        if self.knot >= full.steps:
+            raise InputError(f"knot: got {self.knot}, want one from 0 to {full.steps - 1}, before the plan's end")
+        self.remaining_plan = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
         if self.starts is not None:
-            self.starts = check_array("states", self.starts, (trials, self.whole.states.shape[1]))
-        self.trajectory, dt = self.followed.trajectory, self.whole.dt
-        self._target = Target(self.state_coordinates, self.followed.goal, self.trajectory.states)
+            self.starts = check_array("states", self.starts, (trials, full.states.shape[1]))
+        self.trajectory, dt = self.remaining_plan.trajectory, full.dt
+        self._target = Target(self.state_coordinates, self.remaining_plan.goal, self.trajectory.states)
         self._radius = self._target.radius(plant.robot.radius, self.goal_radius, self.goal_tolerance)
         substeps = plant.substeps(dt)
         passing = None if self.moving is None else _shape_among(plant, self.moving.moved(self.knot * dt))
         _check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
         numbers = range(self.first_trial, self.first_trial + trials)
-        self.effects = Effects(plant, self.whole, self.acting, numbers, self.generators or seeded(self.seed))
+        self.effects = Effects(plant, full, self.active_disturbances, numbers, self.generators or seeded(self.seed))
         self.physics: AnyPhysics
         if plant.simulator is not None:
             self.physics = SimulatorPhysics(plant, plant.simulator, trials, substeps)
         else:
             self.physics = MujocoPhysics(plant, trials, substeps, contacts=self.contacts, threads=threads)
-        self.physics.place(self.effects.initial_states(np.tile(self.whole.states[0], (trials, 1)), self.starts))
+        self.physics.place(self.effects.initial_states(np.tile(full.states[0], (trials, 1)), self.starts))
         self.physics.prepare(altered=self.effects.alter_models(self.physics))
         name = f"{type(self.law).__name__}.start"
         self.controller_run = check_kind(name, self.law.start(trials), ControllerRun, "a ControllerRun returned")
@@ -309,9 +306,8 @@ class ClosedLoop:
     def begin(self) -> None:
         """Let disturbances and controller follow the plan to the first knot, and measure the states there."""
         for step in range(self.knot):
-            states, controls = (
-                np.tile(rows[step], (self.trials, 1)) for rows in (self.whole.states, self.whole.controls)
-            )
+            states = np.tile(self.full_trajectory.states[step], (self.trials, 1))
+            controls = np.tile(self.full_trajectory.controls[step], (self.trials, 1))
             self.effects.follow(step, states, controls)
             observed = states if self._readings is None else self._readings.follow(step, states, self._held(step))
             self.controller_run.control(step, observed)
@@ -363,7 +359,7 @@ class ClosedLoop:
 
     def _held(self, knot: int) -> Array:
         """The plan's controls (K, m) of the period before a knot; at the first knot those of its first period."""
-        return np.tile(self.whole.controls[max(knot - 1, 0)], (self.trials, 1))
+        return np.tile(self.full_trajectory.controls[max(knot - 1, 0)], (self.trials, 1))
 
     def actuate(self, step: int, commands: Array) -> Array:
         """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""
@@ -429,10 +425,10 @@ class ClosedLoop:
         A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
         plant repeats, there is a further run; the plant remembers it until another plan runs there.
         """
-        plant, plan, records = self.plant, self.followed, self.records
+        plant, plan, records = self.plant, self.remaining_plan, self.records
         if self.starts is not None or self.moving is not None:
             return None
-        if not self.acting and self.law.digest == plan.policy.digest:
+        if not self.active_disturbances and self.law.digest == plan.policy.digest:
             records.turn_to_plan(self.state_coordinates)
             ended = min(self.collisions.at[0], records.time_of(records.lost_since)[0])
             return np.where(plan.trajectory.times[:, None] < ended, records.states[0], np.nan)
@@ -448,12 +444,13 @@ class ClosedLoop:
         """A Rollout of all records, with the states of an undisturbed run."""
         records, collisions = self.records, self.collisions
         plant, plan, parts = self.plant, self.trajectory, self.physics.drawn_parts
-        goal, radius = self.followed.goal, self._radius
+        goal, radius = self.remaining_plan.goal, self._radius
         if (moved := self.controller_run.moved_goal()) is not None:
             # A radius that was given holds for another goal only in the same unit.
             target = replace(self._target, goal=moved)
             stated = (self.goal_radius, self.goal_tolerance) if target.unit == self._target.unit else (None, None)
             goal, radius = moved, target.radius(plant.robot.radius, *stated)
+        described = (disturbance.describe(plant) for disturbance in self.active_disturbances)
         changed = () if moved is None else (GOAL_MOVED,)
         begun = () if self.starts is None else ("given first states",)
         passing = () if self.moving is None else (f"moving obstacles {', '.join(self.moving.names)}",)
@@ -487,7 +484,7 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / parts),
             frames=frames,
-            disturbances=(*(disturbance.describe(plant) for disturbance in self.acting), *begun, *passing, *changed),
+            disturbances=(*described, *begun, *passing, *changed),
             seed=self.seed,
             first_trial=self.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
@@ -526,7 +523,7 @@ def _shape_among(plant: Plant, moving: World) -> ShapeInWorld:
     return plant.robot.among(moving)
 
 
-def _coordinates_of(controller: Controller, followed: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
+def _coordinates_of(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
     """The coordinates of the controller's states and controls.
 
     Raises:
@@ -548,13 +545,13 @@ def _coordinates_of(controller: Controller, followed: Plan, plant: Plant) -> tup
             f"controller: got a policy for a position {_place(meant)}, want the position of robot {plant.robot.name}:"
             f" {_place(moves)}"
         )
-    plan = followed.trajectory
+    trajectory = plan.trajectory
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    if plan.states.shape[1] != n or plan.controls.shape[1] != m:
-        shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
+    if trajectory.states.shape[1] != n or trajectory.controls.shape[1] != m:
+        shapes = f"{trajectory.states.shape[1]} states and {trajectory.controls.shape[1]} controls"
         raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
-    if not plan.finite:
-        raise InputError(f"plan: got a plan that is not finite ({followed.status.name}), want one that can be run")
+    if not trajectory.finite:
+        raise InputError(f"plan: got a plan that is not finite ({plan.status.name}), want one that can be run")
     # A command that the robot clips is at a limit, whatever limits the policy assumed.
     control_space = dynamics.control_coordinates
     low, high = np.maximum(spaces[1].low, control_space.low), np.minimum(spaces[1].high, control_space.high)

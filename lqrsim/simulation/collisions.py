@@ -30,9 +30,7 @@ class Collisions:
       clearance: (K,) current signed distance to the nearest obstacle, minus the radius, in metres.
     """
 
-    def __init__(
-        self, plant: Plant, states: Array, displaced: Array, dt: float, passing: ShapeInWorld | None = None
-    ) -> None:
+    def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float, passing: ShapeInWorld | None) -> None:
         self.plant, self.shape, self.dt, self._passing = plant, plant.shape, dt, passing
         moving = () if passing is None else passing.world.obstacles
         self._velocities = np.array([obstacle.velocity for obstacle in moving]).reshape(-1, 3)

@@ -166,12 +166,9 @@ class Readings:
     def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
         """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
         exact = self._sensors.readings(self._physics.sense(held))
-        named = {sensor.name: exact[:, at] for sensor, at in self._columns()}
-        named = self._effects.read(step, named)
-        return self._arriving(step, np.concatenate([named[sensor.name] for sensor, _ in self._columns()], axis=1))
-
-    def _columns(self) -> zip:
-        return zip(self._sensors.sensors, self._sensors.columns, strict=True)
+        pairs = zip(self._sensors.sensors, self._sensors.columns, strict=True)
+        named = self._effects.read(step, {sensor.name: exact[:, at] for sensor, at in pairs})
+        return self._arriving(step, np.concatenate([named[sensor.name] for sensor in self._sensors.sensors], axis=1))
 
     def _arriving(self, step: int, readings: Array) -> Array:
         self._readings[step] = readings

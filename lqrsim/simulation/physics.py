@@ -19,14 +19,8 @@ from lqrsim.simulation.simulator import Simulator, states_of
 FRAME_PERIOD = 1 / 30  # s; positions are checked and recorded at least this often, unless the physics step is longer
 SENSED_DEPTH = 2.0**20  # m; inside an obstacle, up to which it exerts no force while contacts are only sensed
 
-_WARNINGS = mujoco.mjtWarning
 # Warnings after which MuJoCo resets the state or the controls.
-UNSTABLE = [
-    int(warning)
-    for warning in (
-        _WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC, _WARNINGS.mjWARN_BADCTRL
-    )
-]  # fmt: skip
+UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
 
 
 @dataclass(eq=False)
@@ -183,7 +177,7 @@ class MujocoPhysics(Physics):
         self.simulations.forward()
         return self._sensors[:, self.plant.contact] > 0
 
-    def sense(self, held: Array | None = None) -> Array:
+    def sense(self, held: Array | None) -> Array:
         """MuJoCo's current `sensordata` (K, any), under the last forces and the last controls, or `held` (K, m).
 
         The state of the simulations is restored afterwards.

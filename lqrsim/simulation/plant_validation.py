@@ -30,12 +30,8 @@ def check_names(robot: Robot, scene: Scene) -> None:
         raise InputError(f"robot {robot.name}: radius: got none, want a number >= 0, in m: {size}")
     check_number(f"robot {robot.name}: radius", robot.radius, at_least=0.0)
     check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
-    check_kind(
-        f"robot {robot.name}: balls",
-        robot.balls,
-        (CollisionSpheres, type(None)),
-        "CollisionSpheres(places, radii), or None",
-    )
+    kinds, wanted_balls = (CollisionSpheres, type(None)), "CollisionSpheres(places, radii), or None"
+    check_kind(f"robot {robot.name}: balls", robot.balls, kinds, wanted_balls)
     model = scene.model
     wanted = {
         "body": ("body", [robot.body], model.nbody),
@@ -129,12 +125,8 @@ def _check_limits(robot: Robot, scene: Scene, model: mujoco.MjModel) -> None:
 
 def _check_position(robot: Robot, model: mujoco.MjModel) -> None:
     """Raise InputError unless the body's origin is at the position, and moves with it, by MuJoCo's kinematics."""
-    space, (in_qpos, _, _), number = (
-        robot.dynamics.state_coordinates,
-        indices_in(robot, model),
-        model.body(robot.body).id,
-    )
-    n, data = len(space), mujoco.MjData(model)
+    space, (in_qpos, _, _) = robot.dynamics.state_coordinates, indices_in(robot, model)
+    n, data, number = len(space), mujoco.MjData(model), model.body(robot.body).id
 
     def body(state: Array) -> Array:
         data.qpos[in_qpos] = robot.configuration(state)[0]

@@ -98,29 +98,30 @@ class Saturation(Disturbance):
     def limits(self, plant: Plant) -> tuple[Array, Array]:
         """The narrowed limits, which the robot's own limits must contain."""
         space = plant.robot.dynamics.control_coordinates
-        own = np.array(space.limits)
+        full = np.array(space.limits)
         if self.share is not None:
-            if not np.isfinite(own).all():
+            if not np.isfinite(full).all():
                 raise InputError(f"Saturation: share: got robot {plant.robot.name} without limits, want one with them")
             # If a range does not contain zero, only its far side moves.
-            wanted = np.array([np.maximum(own[0], self.share * own[0]), np.minimum(own[1], self.share * own[1])])
+            wanted = np.array([np.maximum(full[0], self.share * full[0]), np.minimum(full[1], self.share * full[1])])
         else:
-            sides = zip(("lowest", "highest"), (self.lowest, self.highest), own, strict=True)
+            sides = zip(("lowest", "highest"), (self.lowest, self.highest), full, strict=True)
             wanted = np.array([self._fit(o if v is None else v, space.names, name) for name, v, o in sides])
-        if (wanted != np.clip(wanted, *own)).any() or (wanted[0] > wanted[1]).any():
-            i = int(np.argmax((wanted != np.clip(wanted, *own)).any(axis=0) | (wanted[0] > wanted[1])))
+        wrong = (wanted != np.clip(wanted, *full)).any(axis=0) | (wanted[0] > wanted[1])
+        if wrong.any():
+            i = int(wrong.argmax())
             raise InputError(
                 f"Saturation: got {wanted[0, i]:g} to {wanted[1, i]:g} for {space.names[i]}, want a range within that"
-                f" of {plant.robot.name}, {own[0, i]:g} to {own[1, i]:g}"
+                f" of {plant.robot.name}, {full[0, i]:g} to {full[1, i]:g}"
             )
-        moved = wanted != own
         if self.strength != 1:
-            if not np.isfinite(own[moved]).all():
+            moved = wanted != full
+            if not np.isfinite(full[moved]).all():
                 raise InputError(
                     f"Saturation: strength: got {self.strength:g} for robot {plant.robot.name}, which has no limits of"
                     " its own to interpolate from, want 1"
                 )
-            wanted[moved] = own[moved] + self.strength * (wanted[moved] - own[moved])
+            wanted[moved] = full[moved] + self.strength * (wanted[moved] - full[moved])
         low, high = wanted
         crossed = low > high
         low[crossed] = high[crossed] = (low[crossed] + high[crossed]) / 2

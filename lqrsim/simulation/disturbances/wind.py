@@ -33,7 +33,7 @@ class Wind(Disturbance):
                 " with a `drag` in N s/m, or an MJCF with the density or viscosity of a fluid"
             )
 
-    def blow(self, plant: Plant, wind: Array) -> Effect:
+    def blow(self, wind: Array) -> Effect:
         """The effect of winds (K, T, 3) in m/s, held over each control period."""
         return Effect(wind=lambda step, states: wind[:, step])
 
@@ -58,7 +58,7 @@ class MeanWind(Wind):
         return f"wind of {words(self.velocity)} m/s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
+        return self.blow(np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The wind as an unknown constant of mean zero, with the wind's size as std: its direction is unknown."""
@@ -92,7 +92,7 @@ class Gusts(Wind):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         noise = normal(generators, plan.steps, 3)
-        return self.blow(plant, self._fit(self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
+        return self.blow(self._fit(self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         winds = zip("xyz", self._fit(self.std, "xyz"), strict=True)
@@ -163,7 +163,7 @@ class Dryden(Wind):
         across = self.std[1] * second_order(noise[..., 1:3], steps[1])
         upward = self.std[2] * second_order(noise[..., 3:], steps[2])
         cosine, sine = np.cos(self.direction), np.sin(self.direction)
-        return self.blow(plant, np.stack([cosine * along - sine * across, sine * along + cosine * across, upward], -1))
+        return self.blow(np.stack([cosine * along - sine * across, sine * along + cosine * across, upward], -1))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         if self.wind_at_20_ft == 0:
