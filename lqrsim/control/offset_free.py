@@ -206,10 +206,10 @@ class OffsetFree(Controller):
             gets lost; or the uncertainty does not fit the system.
         """
         self._check_in_advance("loop")
-        met = self.uncertainty if uncertainty is None else uncertainty
-        check_kind("uncertainty", met, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
-        met.check(self.problem.dynamics)
-        truth = self.model.under(met.steady(np.inf))
+        stated = self.uncertainty if uncertainty is None else uncertainty
+        check_kind("uncertainty", stated, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
+        stated.check(self.problem.dynamics)
+        truth = self.model.under(stated.steady(np.inf))
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, self.coordinates[1].limits, self.model)
@@ -271,8 +271,8 @@ def robust_to_lag(
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
-    none = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
-    systems = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, none)]
+    no_lag = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
+    systems = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, no_lag)]
 
     def predicted(design: Design) -> Predictions:
         """The predictions for C laws, (2, C): with the lag, and without it."""

@@ -166,15 +166,11 @@ class PlanModel:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of z for messages, (Z,)."""
-        controls = self.dynamics.control_coordinates.names[: self.lagging]
-        unknowns = (
-            unknown.name for unknown, states in zip(self.remembered, self.unknown_states, strict=True) for _ in states
-        )
-        return (
-            *self.dynamics.state_coordinates.names,
-            *(f"what {control} has reached" for control in controls),
-            *unknowns,
-        )
+        names = [*self.dynamics.state_coordinates.names]
+        names += [f"what {control} has reached" for control in self.dynamics.control_coordinates.names[: self.lagging]]
+        for unknown, states in zip(self.remembered, self.unknown_states, strict=True):
+            names += [unknown.name] * len(states)
+        return tuple(names)
 
     # Sizes.
 

@@ -159,22 +159,22 @@ class SensorFilter:
         biases = size + np.arange(len(self.biased))
         covariance[:, biases, biases] += self.sensors.per_reading("bias_walk")[self.biased] ** 2 * model.plan.dt
 
-    def correct(self, covariance: Array, knot: int, known: npt.NDArray[np.bool_], off: Array) -> Array:
-        """Correct covariances in place by the readings that are known (K, Y), one number after the other.
+    def correct(self, covariance: Array, knot: int, arrived: npt.NDArray[np.bool_], innovation: Array) -> Array:
+        """Correct covariances in place by the readings that have `arrived` (K, Y), one number after the other.
 
-        By readings minus their predictions, `off` (K, Y), it returns the corrections of (z, b), (K, Z+B).
+        By readings minus their predictions, `innovation` (K, Y), it returns the corrections of (z, b), (K, Z+B).
         """
         t = min(knot, self.model.plan.steps)
-        moved = np.zeros(covariance.shape[:2])
-        for i in np.flatnonzero(known.any(axis=0)):
+        correction = np.zeros(covariance.shape[:2])
+        for i in np.flatnonzero(arrived.any(axis=0)):
             row = self.H[t, i]
             seen = np.vecdot(covariance, row)
             variance = np.vecdot(seen, row)
             variance += np.maximum(self.noise[t, i], RESOLUTION**2 * variance) + LEAST_STD**2
-            gain = np.where(known[:, i, None], seen / variance[:, None], 0.0)
-            moved += gain * np.where(known[:, i], off[:, i] - np.vecdot(moved, row), 0.0)[:, None]
+            gain = np.where(arrived[:, i, None], seen / variance[:, None], 0.0)
+            correction += gain * np.where(arrived[:, i], innovation[:, i] - np.vecdot(correction, row), 0.0)[:, None]
             covariance -= gain[:, :, None] * seen[:, None, :]
-        return moved
+        return correction
 
     def due(self, knot: int) -> npt.NDArray[np.bool_]:
         """Which numbers of the readings (Y,) are taken at a knot."""
@@ -189,18 +189,18 @@ class SensorFilter:
         """
         model, size, knots = self.model, self.model.size, self.model.plan.steps + 1
         slowest, corrected = max(self.late), np.empty((knots, size, size))
-        settled, late = self.start(1, np.zeros(size)).covariance, np.repeat(self.late, self._sizes)
+        fully_corrected, late = self.start(1, np.zeros(size)).covariance, np.repeat(self.late, self._sizes)
         for t in range(knots):
-            now = settled
-            for j in range(max(t - slowest, 0), t + 1):
-                now = now.copy()
-                if j:
-                    self.predict(now, j)
-                known = self.due(j) & (j + late <= t)
-                self.correct(now, j, known[None], np.zeros((1, len(known))))
-                if j == t - slowest:
-                    settled = now
-            corrected[t] = now[0, :size, :size]
+            covariance = fully_corrected
+            for k in range(max(t - slowest, 0), t + 1):
+                covariance = covariance.copy()
+                if k:
+                    self.predict(covariance, k)
+                arrived = self.due(k) & (k + late <= t)
+                self.correct(covariance, k, arrived[None], np.zeros((1, len(arrived))))
+                if k == t - slowest:
+                    fully_corrected = covariance
+            corrected[t] = covariance[0, :size, :size]
         before = model.start_root @ model.start_root.T
         predicted = np.concatenate([before[None], model.F @ corrected[:-1] @ model.F.transpose(0, 2, 1)])
         predicted[1:] += model.process_noise

@@ -40,11 +40,7 @@ def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any
 
 
 def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-    """Make many environments of one scenario, run by MuJoCo as one batch: see `VectorEnvironment`.
-
-    Args:
-      scenario: as in `make_env`. num_envs: number of environments. options: options of `VectorEnvironment`.
-    """
+    """Make many environments of one scenario, run by MuJoCo as one batch, with options of `VectorEnvironment`."""
     return VectorEnvironment(scenario, num_envs=num_envs, **options)
 
 

@@ -97,7 +97,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
             gymnasium.logger.warn("render() draws nothing without render_mode='rgb_array'")
             return None
         episode = self._current()
-        return self._picture.draw(episode.rollout, episode.loop.physics.frame()[0], episode.time)
+        return self._picture.draw(episode.loop.so_far, episode.loop.physics.frame()[0], episode.time)
 
     def close(self) -> None:
         self._picture.close()

@@ -188,7 +188,7 @@ class Resettable:
 
     def rollout(self) -> Rollout:
         """The current episode so far, as `simulate` records it, for `render`, `outcomes` and `save`."""
-        return self._current().rollout()
+        return self._current().loop.so_far()
 
     def _begin(self, seed: int | None, random: np.random.Generator, options: Any) -> "Episode":
         """Begin an episode: the first trials of a seed, or those after the last episode."""
@@ -279,12 +279,8 @@ class Episode:
         if ending.any():
             first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
             early = np.where(collided & first, "collided", "diverged").astype(object)
-            self.outcomes[ending] = (np.array(self.rollout().outcome, dtype=object) if at_horizon else early)[ending]
+            self.outcomes[ending] = (np.array(loop.so_far().outcome, dtype=object) if at_horizon else early)[ending]
         return self.observations, rewards, self._terminated.copy(), self._truncated.copy()
-
-    def rollout(self) -> Rollout:
-        """The records so far, in the form of `simulate`; NaN from now on."""
-        return self.loop.so_far()
 
     def _observe(self, lost: Flags | None = None) -> Array:
         """Measured states, and time as a fraction of the horizon; for unstable trials the last valid states."""

@@ -143,15 +143,15 @@ def check_plant(
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
     region = _Region.of(robot, problem, plan, around, spread, controls)
-    taken_away = [plant.model.geom(name).id for name in plant.obstacles]
-    plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
+    obstacles = [plant.model.geom(name).id for name in plant.obstacles]
+    plant.model.geom_contype[obstacles] = plant.model.geom_conaffinity[obstacles] = 0
     rng = np.random.default_rng(seed)
     if settle is None:
         settle = 0.5 if simulator is None and 2 * len(plant.qvel) > n else 0.0
-    waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
-    if not samples * (waiting + substeps) <= MOST_STEPS:
+    settling = check_number("settle", settle, at_least=0.0) / plant.timestep
+    if not samples * (settling + substeps) <= MOST_STEPS:
         raise InputError(
-            f"samples: got {samples}, which take {samples * (waiting + substeps):.3g} physics steps, want at most"
+            f"samples: got {samples}, which take {samples * (settling + substeps):.3g} physics steps, want at most"
             f" {MOST_STEPS}: fewer samples, or a shorter period or time to settle"
         )
     compared, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
@@ -159,10 +159,10 @@ def check_plant(
         for _ in range(samples):
             state, control = region.draw(rng)
             if simulator is None:
-                sample, touched = _sample(plant, data, state, control, round(waiting), period)
+                sample, touched = _sample(plant, data, state, control, round(settling), period)
                 touching.update(sorted(touched))
             else:
-                sample = _in_simulator(simulator, plant, state, control, round(waiting), period)
+                sample = _in_simulator(simulator, plant, state, control, round(settling), period)
             compared.append(sample)
     return _worst_of(compared, plant, period, tolerance, touching)
 
@@ -272,16 +272,16 @@ def _control_range(robot: Robot, controls: Limits | None, problem: Problem | Non
 
 
 def _sample(
-    plant: Plant, data: mujoco.MjData, state: Array, control: Array, waiting: int, period: float
+    plant: Plant, data: mujoco.MjData, state: Array, control: Array, settling: int, period: float
 ) -> tuple[_Sample, set[tuple[str, str]]]:
-    """Run one control period after `waiting` physics steps. Returns it with the pairs of geoms that touched."""
+    """Run one control period after `settling` physics steps. Returns it with the pairs of geoms that touched."""
     robot = plant.robot
     mujoco.mj_resetData(plant.model, data)
     data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
     if robot.activations:
         data.act[:] = state[len(state) - robot.activations :]
     data.ctrl[plant.ctrl] = robot.actuation(control)
-    for _ in range(waiting):
+    for _ in range(settling):
         mujoco.mj_step(plant.model, data)
     before = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=state)
     touched, model = set[tuple[str, str]](), plant.model
@@ -302,11 +302,11 @@ def _sample(
 
 
 def _in_simulator(
-    simulator: Simulator, plant: Plant, state: Array, control: Array, waiting: int, period: float
+    simulator: Simulator, plant: Plant, state: Array, control: Array, settling: int, period: float
 ) -> _Sample:
     dynamics, states = plant.robot.dynamics, [state]
     running = simulator.start(state[None], {}, plant.timestep)
-    for steps in (waiting, plant.substeps(period)):
+    for steps in (settling, plant.substeps(period)):
         if steps:
             simulator.step(running, control[None], np.zeros((1, 6)), np.zeros((1, 3)), steps)
         (after,) = states_of(simulator, running, (1, len(state)))

@@ -70,9 +70,8 @@ def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
     """Whether the plan is the solution's; not checked if another policy was run."""
     if solution is None:
         return Criterion("plan", None, "not checked without the solution")
-    same = np.array_equal(rollout.plan.states, solution.trajectory.states)
-    same = same and np.array_equal(rollout.plan.controls, solution.trajectory.controls)
-    if not same:
+    run, plan = rollout.plan, solution.trajectory
+    if not (np.array_equal(run.states, plan.states) and np.array_equal(run.controls, plan.controls)):
         return Criterion("plan", False, "not that of the solution")
     if not ran_policy_of(solution, rollout):
         unknown = "whether the controller followed it is unknown, for it was not the solution's policy"

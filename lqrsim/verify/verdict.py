@@ -44,13 +44,13 @@ def diagnose(
         candidates.append((where - expected, f"pictures show the run {_in_frames(late, interval)}"))
     if abs(jump) > interval / 4 and split > FEW_FRAMES:  # otherwise the whole video is late or early
         expected = positions_at(times, actual, times[numbers] + jump * (np.arange(len(numbers)) >= split))
-        said = "left out" if jump > 0 else "shown twice"
-        said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(jump, interval)}"
-        candidates.append((where - expected, said))
+        fault = "left out" if jump > 0 else "shown twice"
+        text = f"frames are {fault} at frame {numbers[split]}: from there on, the run is {_in_frames(jump, interval)}"
+        candidates.append((where - expected, text))
     if candidates:
-        residual, said = min(candidates, key=lambda candidate: _quantile_95(candidate[0]))
+        residual, text = min(candidates, key=lambda candidate: _quantile_95(candidate[0]))
         if _quantile_95(residual) <= 2 * bound:
-            return said
+            return text
     if _quantile_95(error) <= 2 * bound:
         return "the pictures are too small or too coarse"
     return "pictures of another run than the record's: another seed, trial or policy; or another robot's body"
@@ -70,7 +70,7 @@ def _single_frames(
 
 def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
     """The first frame whose error is velocity times a delay, and the delay; earlier frames have no errors."""
-    products, squares = ((error * velocity).sum(axis=1), (velocity**2).sum(axis=1))
+    products, squares = (error * velocity).sum(axis=1), (velocity**2).sum(axis=1)
     tails = [np.cumsum(part[::-1])[::-1] for part in (products, squares)]
     gained = tails[0] ** 2 / np.maximum(tails[1], 1e-12)  # reduction of the sum of squares by a break there
     split = int(gained.argmax())
@@ -208,9 +208,7 @@ def compare(
         tests.append(Criterion("time", abs(shift) <= late, detail))
         tests.append(Criterion("scale", abs(stretch) <= wide, f"{scale:.4f}, want 1 within {wide:.4f}"))
         likely = _likely_cause(tests, times, seen, actual, bound, interval)
-    return Verification(
-        subject, method, times, seen, actual, planned, rms, worst, shift, scale, tuple(tests), likely
-    )  # fmt: skip
+    return Verification(subject, method, times, seen, actual, planned, rms, worst, shift, scale, tuple(tests), likely)
 
 
 def _likely_cause(

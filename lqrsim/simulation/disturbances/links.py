@@ -23,13 +23,13 @@ class Late(Disturbance):
     periods: Index
 
     what: ClassVar[str]
-    known_as: ClassVar[str]  # the field of an Uncertainty
+    uncertainty_field: ClassVar[str]  # the field of an Uncertainty
 
     def describe(self, plant: Plant) -> str:
         return f"{self.what} late by {self.periods} control period{'' if self.periods == 1 else 's'}"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return replace(Uncertainty(), **{self.known_as: self.periods})
+        return replace(Uncertainty(), **{self.uncertainty_field: self.periods})
 
     def scaled(self, strength: float) -> Self:
         """The delay with `strength` times the periods, rounded to whole periods."""
@@ -39,7 +39,7 @@ class Late(Disturbance):
 class ControlDelay(Late):
     """Commands arrive late, by control periods; until the first one arrives, the plan's controls are applied."""
 
-    what, known_as = "commands", "delay"
+    what, uncertainty_field = "commands", "delay"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         under_way: list[Array] = []
@@ -56,7 +56,7 @@ class ControlDelay(Late):
 class MeasurementLatency(Late):
     """Measurements arrive late, by control periods; until then the first one is repeated."""
 
-    what, known_as = "measurements", "latency"
+    what, uncertainty_field = "measurements", "latency"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         seen: list[Array] = []
@@ -116,7 +116,7 @@ class Dropouts(Disturbance):
     what: ClassVar[str]
     discrete = True
     hook: ClassVar[Literal["measure", "actuate"]]  # the field of an `Effect`
-    known_as: ClassVar[str]  # the field of an Uncertainty
+    uncertainty_field: ClassVar[str]  # the field of an Uncertainty
 
     def __post_init__(self) -> None:
         if not isinstance(self.loss, GilbertElliott):
@@ -143,7 +143,7 @@ class Dropouts(Disturbance):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The fraction that is lost, as if losses were independent."""
-        return replace(Uncertainty(), **{self.known_as: self.share})
+        return replace(Uncertainty(), **{self.uncertainty_field: self.share})
 
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
         if isinstance(self.loss, GilbertElliott):
@@ -170,7 +170,7 @@ class MeasurementDropouts(Dropouts):
     The last measurement that arrived is repeated; at first, the plan's first state.
     """
 
-    what, hook, known_as = "measurements", "measure", "loss"
+    what, hook, uncertainty_field = "measurements", "measure", "loss"
 
 
 class CommandDropouts(Dropouts):
@@ -179,4 +179,4 @@ class CommandDropouts(Dropouts):
     The actuators keep the last command that arrived; at first, the plan's first control.
     """
 
-    what, hook, known_as = "commands", "actuate", "command_loss"
+    what, hook, uncertainty_field = "commands", "actuate", "command_loss"

@@ -280,9 +280,9 @@ def load_of(plant: Plant, body: int) -> str:
 def controls_of(plant: Plant) -> dict[str | None, str]:
     """Map each actuator to the control that it is proportional to, if no other actuator depends on that control."""
     names = plant.robot.dynamics.control_coordinates.names
-    commands = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
-    none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in commands)
-    follows = (one != none) | (two != none) | ~np.isfinite(one + two)  # (controls, MuJoCo's controls)
+    commands = (level * np.eye(len(names)) for level in (0.0, 1.0, 2.0))
+    at_zero, at_one, at_two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in commands)
+    follows = (at_one != at_zero) | (at_two != at_zero) | ~np.isfinite(at_one + at_two)  # (controls, MuJoCo's controls)
     controls: dict[str | None, str] = {}
     counts = plant.model.actuator_ctrlnum[plant.actuators]
     for j, actuator, count in zip(np.cumsum(counts) - counts, plant.robot.actuators, counts, strict=True):
@@ -291,7 +291,7 @@ def controls_of(plant: Plant) -> dict[str | None, str]:
         followed = np.flatnonzero(follows[:, j])
         if len(followed) == 1:
             i = followed[0]
-            proportional = none[i, j] == 0 and np.isclose(two[i, j], 2 * one[i, j], rtol=1e-9, atol=0)
+            proportional = at_zero[i, j] == 0 and np.isclose(at_two[i, j], 2 * at_one[i, j], rtol=1e-9, atol=0)
             if proportional and follows[i].sum() == 1:
                 controls[actuator] = names[i]
     return controls

@@ -25,8 +25,8 @@ class AddedError(GaussianDisturbance):
 
     what: ClassVar[str]
     hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # the field of an `Effect`
-    lasts: ClassVar[bool] = True
-    known_as: ClassVar[str]  # the field of an Uncertainty
+    constant: ClassVar[bool] = True
+    uncertainty_field: ClassVar[str]  # the field of an Uncertainty
     by_name = True
 
     def _coordinates(self, plant: Plant) -> Coordinates:
@@ -41,22 +41,22 @@ class AddedError(GaussianDisturbance):
         return self._fit(self.std, self._coordinates(plant))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std, steps = self._deviations(plant), 1 if self.lasts else plan.steps + (self.hook == "measure")
+        std, steps = self._deviations(plant), 1 if self.constant else plan.steps + (self.hook == "measure")
         errors = std * normal(generators, steps, len(std))
         if self.hook == "initial_states":
             return Effect(initial_states=lambda states: _moved(plant, states, errors[:, 0]))
-        hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.lasts else step]}
+        hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.constant else step]}
         return Effect(**hooks)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         std = self._deviations(plant)
-        return replace(Uncertainty(), **{self.known_as: tuple(std.tolist()) if std.any() else 0.0})
+        return replace(Uncertainty(), **{self.uncertainty_field: tuple(std.tolist()) if std.any() else 0.0})
 
 
 class ControlNoise(AddedError):
     """White noise on each control, redrawn each control period; `std` as one number, one each, or by name or unit."""
 
-    what, hook, lasts, known_as = "control noise", "actuate", False, "control"
+    what, hook, constant, uncertainty_field = "control noise", "actuate", False, "control"
 
 
 class ControlOffset(AddedError):
@@ -72,7 +72,7 @@ class ControlOffset(AddedError):
 class MeasurementNoise(AddedError):
     """White noise on each measured state; `std` as one number, one each, or by unit: {"m": 0.01, "rad": 0.02}."""
 
-    what, hook, lasts, known_as = "measurement noise", "measure", False, "measurement"
+    what, hook, constant, uncertainty_field = "measurement noise", "measure", False, "measurement"
 
 
 class MeasurementBias(AddedError):
@@ -92,7 +92,7 @@ class InitialStateError(AddedError):
     meets them and is nearest to the drawn one.
     """
 
-    what, hook, known_as = "initial state off", "initial_states", "start"
+    what, hook, uncertainty_field = "initial state off", "initial_states", "start"
 
 
 def _moved(plant: Plant, states: Array, errors: Array) -> Array:
