@@ -189,7 +189,7 @@ class PlanModel:
 
     @cached_property
     def lag(self) -> Lag:
-        """The steps as means over commands that arrive and commands that get lost."""
+        """The lag, as a mean over commands that arrive and commands that get lost."""
         lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
         return Lag(lost + (1 - lost) * arrived.left, lost + (1 - lost) * arrived.mean)
 

@@ -118,7 +118,6 @@ def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **o
     happens at that time. The physics begins at the knot.
 
     Args:
-      plant, plan: as in `simulate`.
       states: (K, n), where the trials begin.
       options: other options of `simulate`, except `trials`. Disturbances that change the start, such as
         `InitialStateError`, are refused. Times of the rollout count from the knot.

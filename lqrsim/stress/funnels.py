@@ -343,11 +343,7 @@ def level_test(
 @checked
 @dataclass(frozen=True, eq=False)
 class FunnelCheck:
-    """New trials at a knot of a funnel.
-
-    Attributes:
-      reached: the success rate with its exact interval.
-    """
+    """New trials at a knot of a funnel; `reached` is their success rate with its exact interval."""
 
     knot: Index
     level: NonNegative

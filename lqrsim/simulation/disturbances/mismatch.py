@@ -173,10 +173,7 @@ class Payload(Disturbance):
 
 
 class InertiaMismatch(Mismatch):
-    """Another inertia of the robot's bodies about their centres of mass, with the same factor for all axes.
-
-    The mass does not change. Drawn for each trial from a truncated normal distribution, or a fixed factor.
-    """
+    """Another inertia of the robot's bodies about their centres of mass, by one factor for all axes; masses stay."""
 
     what = parameter = "inertia"
 
