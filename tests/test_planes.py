@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from tracking import track
 
 import lqrsim as ls
+from lqrsim.control.collision_chance import Surroundings
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.scenes.world import KINDS, PLANES
@@ -485,3 +486,14 @@ def test_it_is_the_robot_that_is_measured_and_not_what_moves_before_it_in_the_fi
     assert ls.load(ls.save(rollout, tmp_path / "run.npz"), ls.Rollout).body == "drone"
     with pytest.raises(ls.InputError, match=r"rollout.body: got 'ghost', want the name of a body of the model"):
         ls.verify_run(dataclasses.replace(rollout, body="ghost"))
+
+
+@pytest.mark.parametrize(("level", "names"), [("x", ("x", "z")), ("x", ("z", "x")), ("y", ("y", "z"))])
+def test_predicted_trials_displace_obstacles_as_runs_do(level, names):
+    """Across a vertical plane, too, where a ball beside the plane comes nearer to it."""
+    robot = PlanarQuadrotor(names=names)
+    problem = planar_quadrotor.problem(robot, scene_from_xml(mjcf(level=level), "planar").world)
+    surroundings, rng = Surroundings.of(problem, 0.1), np.random.default_rng(0)
+    predicted = surroundings.displacements(rng, 4000)[0]
+    runs = surroundings.shapes[0].across(0.1 * rng.standard_normal(predicted.shape))
+    np.testing.assert_allclose(predicted.std(axis=0), runs.std(axis=0), rtol=0.05)

@@ -77,10 +77,13 @@ class Surroundings:
         return any("geoms" in term.shape for term in self.kept)
 
     def displacements(self, rng: np.random.Generator, trials: int) -> list[Array]:
-        """Random displacements of each world's obstacles in K trials, (K, O, 3), in their plane; planes stay."""
-        axes, worlds = np.arange(3) < (len(self.place) or 3), [shape.world.obstacles for shape in self.shapes]
-        std = [np.array([self.std * axes * (obstacle.kind != "plane") for obstacle in world]) for world in worlds]
-        return [scale * rng.standard_normal((trials, *scale.shape)) for scale in std]
+        """Random displacements (K, O, 3) of each world's obstacles in K trials; planes stay, and heights from above."""
+        displaced = []
+        for shape in self.shapes:
+            axes = [1.0, 1.0, 0.0 if shape.dynamics.state_coordinates.from_above else 1.0]
+            moves = np.array([[obstacle.kind != "plane"] for obstacle in shape.world.obstacles])
+            displaced.append(self.std * moves * axes * rng.standard_normal((trials, len(moves), 3)))
+        return displaced
 
     def nearest(self, states: Array, displaced: list[Array]) -> Array:
         """Clearance of states (K, n) to the nearest obstacle, (K,), the obstacles of each world displaced (K, O, 3)."""
