@@ -104,7 +104,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
 
     def _info(self, episode: Episode) -> dict[str, Any]:
         info: dict[str, Any] = {
-            "seed": episode.seed, "trial": episode.first, "time": episode.time,
+            "seed": episode.loop.seed, "trial": episode.loop.first_trial, "time": episode.time,
             "state": episode.states[0], "clearance": float(episode.clearance[0]),
         }  # fmt: skip
         if episode.ended[0]:
@@ -208,9 +208,9 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         raise InputError("render: got a batch, want an Environment; or frames=True and lqrsim.render(rollout(), path)")
 
     def _info(self, episode: Episode) -> dict[str, Any]:
-        numbers = episode.first + np.arange(self.num_envs)
+        numbers = episode.loop.first_trial + np.arange(self.num_envs)
         return {
-            "seed": episode.seed, "trial": numbers, "time": episode.time, "state": episode.states,
+            "seed": episode.loop.seed, "trial": numbers, "time": episode.time, "state": episode.states,
             "clearance": episode.clearance, "outcome": episode.outcomes.copy(),
             "is_success": episode.outcomes == "reached",
         }  # fmt: skip

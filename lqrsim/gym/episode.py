@@ -198,8 +198,10 @@ class Resettable:
             self._seed = int(random.integers(2**63))
         assert self._seed is not None
         first, disturbances = self.task.trials(self._next_trial, options)
-        settings = {"seed": self._seed, "first_trial": first, "frames": self._frames, "threads": self._threads}
-        self._episode = Episode(self.task, disturbances, self._trials, **settings)
+        self._episode = Episode(
+            self.task, self._trials, disturbances=disturbances, seed=self._seed, first_trial=first,
+            frames=self._frames, threads=self._threads,
+        )  # fmt: skip
         self._next_trial = first + self._trials
         return self._episode
 
@@ -210,28 +212,19 @@ class Resettable:
 
 
 class Episode:
-    """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
+    """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have."""
 
-    The episodes are the trials `first` to `first + K - 1` of `seed`.
-    """
-
-    def __init__(
-        self, task: Task, disturbances: tuple[Disturbance, ...], count: int, *, seed: int, first_trial: int,
-        frames: bool, threads: int | None,
-    ) -> None:  # fmt: skip
-        self.task, self.seed, self.first = task, seed, first_trial
-        dynamics = task.plant.robot.dynamics
-        self._commanded = Commanded(spaces_of(dynamics), count)
+    def __init__(self, task: Task, trials: int, **options: Any) -> None:
+        self._commanded = Commanded(spaces_of(task.plant.robot.dynamics), trials)
         self.loop = ClosedLoop(
-            plant=task.plant, plan=task.solution, disturbances=disturbances, controller=self._commanded,
-            seed=seed, trials=count, first_trial=first_trial, frames=frames, threads=threads,
+            plant=task.plant, plan=task.solution, controller=self._commanded, trials=trials, **options,
             **task.scenario.near_enough(),
         )  # fmt: skip
         self._costs, self._plan = task.costs, self.loop.trajectory
         self.loop.begin()
-        self.ended = np.zeros(count, dtype=bool)
-        self.outcomes = np.full(count, "", dtype=object)  # empty while an episode is running
-        self._terminated, self._truncated = np.zeros((2, count), dtype=bool)
+        self.ended = np.zeros(trials, dtype=bool)
+        self.outcomes = np.full(trials, "", dtype=object)  # empty while an episode is running
+        self._terminated, self._truncated = np.zeros((2, trials), dtype=bool)
         self._observations = self._observe()
 
     @property
