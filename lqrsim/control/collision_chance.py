@@ -35,8 +35,7 @@ class Surroundings:
 
     kept: tuple[KeepsClear, ...]  # the costs and constraints that keep it away from obstacles, without repetitions
     shapes: tuple[ShapeInWorld, ...]  # for each of these, the shape of the robot among its obstacles
-    place: tuple[int, ...]  # the states that are the robot's position
-    position: tuple[int, ...]  # the same; with balls or geoms, all states that move these
+    position: tuple[int, ...]  # the states that are the robot's position; with balls or geoms, all that move these
     std: float  # of an obstacle's position, in m
 
     @classmethod
@@ -51,7 +50,7 @@ class Surroundings:
         shapes = tuple(shape for _, shape in pairs)
         states = [shape.depends_on for shape in shapes]
         position = place if set(states) <= {place} else tuple(sorted({i for indices in states for i in indices}))
-        return cls(tuple(term for term, _ in pairs), shapes, place, position, std)
+        return cls(tuple(term for term, _ in pairs), shapes, position, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:
         """Constraints that keep a margin from each obstacle, (T+1, O)."""

@@ -59,7 +59,7 @@ FRAGILE = 5.0
 # trials with unknowns that are drawn, which are run if more than LIMITED of the commands are beyond the limits.
 KNOTS, PAIRS, LOST = 3, 3, 6.0
 TRIALS, LIMITED = 100, 1e-3
-OPEN = Surroundings((), (), (), (), 0.0)
+OPEN = Surroundings((), (), (), 0.0)
 
 
 class Predictions(NamedTuple):

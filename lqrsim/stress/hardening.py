@@ -271,7 +271,8 @@ class _Search:
         """A plan with its failures. The next plan begins with its clearances."""
         measured = self._failures(solution, label)
         rare, unfailing = (None, measured.trials) if isinstance(measured, NoFailure) else (measured, 0)
-        problem, plan, place = self.scenario.problem, solution.trajectory, list(self.surroundings.place)
+        problem, plan = self.scenario.problem, solution.trajectory
+        place = list(problem.dynamics.state_coordinates.position)
         # Trials of the model, which take long, are needed for moments with a latency or a delay alone.
         samples = None if self.uncertainty.latency or self.uncertainty.delay else 0
         law = self.controller(problem, solution)
