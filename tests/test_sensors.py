@@ -16,6 +16,8 @@ import lqrsim as ls
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.disturbances import (
     ControlNoise,
+    Disturbance,
+    Effect,
     Gusts,
     InitialStateError,
     MassMismatch,
@@ -335,6 +337,32 @@ def test_a_run_from_a_knot_has_its_past(cage, law, plan):
     run = simulate_from(cage, plan, plan.trajectory.states[[20]], knot=20, controller=law, frames=False)
     np.testing.assert_allclose(run.controller_run.estimates[20, 0, :12], plan.trajectory.states[20], atol=1e-6)
     assert run.outcome == ("reached",)
+
+
+class Noting(Disturbance):
+    """No disturbance: it notes the steps in which readings are asked for."""
+
+    def __init__(self):
+        self.steps = []
+
+    def start(self, plant, plan, generators):
+        def read(step, readings):
+            self.steps.append(step)
+            return readings
+
+        return Effect(read=read)
+
+
+@given(knot=st.integers(0, 29))
+@settings(max_examples=examples(6))
+def test_hooks_of_readings_have_the_past_of_a_run_from_a_knot(on_track, knot):
+    """They are called in each period from the plan's first one on, as those of measured states are."""
+    _, solution, plant = on_track
+    noting, controller = Noting(), Reading(solution, plant.sensors([Sensor("place")]))
+    states = solution.trajectory.states[[knot]]
+    run = simulate_from(plant, solution, states, knot=knot, controller=controller, disturbances=[noting], frames=False)
+    assert run.reasons == ("",)
+    assert noting.steps == list(range(30))
 
 
 def test_the_file_says_what_is_not_given(cart, on_track):

@@ -101,7 +101,10 @@ class Effects:
         return moved or any(effect.alter or effect.factors for _, effect in self._effects)
 
     def follow(self, step: int, states: Array, controls: Array) -> None:
-        """Call all hooks with the plan's states (K, n) and controls (K, m), for disturbances that have a memory."""
+        """Call all hooks with the plan's states (K, n) and controls (K, m), for disturbances that have a memory.
+
+        Those of readings are called where a controller reads: see `Readings.follow`.
+        """
         for _, measure in self._measures:
             measure(step, states.copy())
         for _, actuate in self._actuations:
@@ -161,14 +164,18 @@ class Readings:
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """The exact readings that arrive at a knot of the plan, before the run begins; as `arriving`."""
         exact = self._sensors.reader()(states[:1], controls[:1], np.zeros((1, 6)))
-        return self._arriving(step, np.repeat(exact, len(states), axis=0))
+        exact = np.repeat(exact, len(states), axis=0)
+        self._with_errors(step, exact)
+        return self._arriving(step, exact)
 
     def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
         """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
-        exact = self._sensors.readings(self._physics.sense(held))
+        return self._arriving(step, self._with_errors(step, self._sensors.readings(self._physics.sense(held))))
+
+    def _with_errors(self, step: int, exact: Array) -> Array:
         pairs = zip(self._sensors.sensors, self._sensors.columns, strict=True)
         named = self._effects.read(step, {sensor.name: exact[:, at] for sensor, at in pairs})
-        return self._arriving(step, np.concatenate([named[sensor.name] for sensor in self._sensors.sensors], axis=1))
+        return np.concatenate([named[sensor.name] for sensor in self._sensors.sensors], axis=1)
 
     def _arriving(self, step: int, readings: Array) -> Array:
         self._readings[step] = readings
@@ -191,7 +198,9 @@ class BeliefReadings:
 
     def follow(self, step: int, states: Array, controls: Array) -> Array:
         """Exact readings and states at a knot of the plan, before the run begins; as `arriving`."""
-        return self._late(self.belief.read(states)[0], states)
+        exact, deviations = self.belief.read(states)
+        self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})
+        return self._late(exact, states)
 
     def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
         """The readings (K, Y) that arrive in the true states (K, n), NaN for lost ones; and measured known states."""
