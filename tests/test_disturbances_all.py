@@ -115,6 +115,12 @@ def test_every_class_is_found_by_its_name_and_exported():
     assert set(disturbances.__all__) >= set(KINDS)
 
 
+@pytest.mark.parametrize("kind", [*KINDS.values(), ls.belief.ReadingErrors], ids=lambda kind: kind.__name__)
+def test_what_decides_on_losses_is_discrete(kind):
+    """A splitting then says that it may miss failures by them."""
+    assert kind.discrete or "loss" not in {field.name for field in dataclasses.fields(kind)}
+
+
 @pytest.mark.parametrize(("fixture", "one"), FITTING, ids=NAMED)
 def test_a_trial_is_the_same_alone_and_among_four_and_each_trial_is_its_own(plants, solutions, calm, fixture, one):
     plant, solution = plants[fixture], solutions[fixture]

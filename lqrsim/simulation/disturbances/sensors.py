@@ -107,6 +107,7 @@ class ReadingErrors(Disturbance):
     loss: Share = 0.0
     strength: NonNegative = 1.0
 
+    discrete = True
     _scales = "strength"
 
     def describe(self, plant: Plant) -> str:
