@@ -92,6 +92,7 @@ ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the
 FARTHEST = 10.0  # largest violation relative to the first plan's
 SMALL, PER_GAP = 1e-4, 1e-2  # violation below which a step may be judged by its merit alone; the same for each gap
 AT_REST, HUGE = 1e-9, 1e100  # violation below which the merit may stay as it is; the most that a power can take
+ROUNDED = 1e3  # slope relative to the tolerance, from which on it counts as rounding if the cost does not change
 ROUNDING, RESTING = 1e-12, 1e-11  # relative differences of merits that may be rounding, in these two tests
 PER_ROW = 0.05  # that may be taken for the first plan's, relative to sizes: even rows far from active count in a sum
 EDGE = 0.05  # distance of the first controls from their limits, relative to the range
@@ -308,11 +309,12 @@ def cost_is_flat(mem):
 def within(learns, tolerance, violation, mem):
     """Whether the measures are within tolerance. The violation of elastic rows is in their slacks.
 
-    Where long steps no longer change the cost, what is left of the slope is rounding, which grows along unstable
+    Where long steps no longer change the cost, a slope far above the tolerance is rounding, which grows along unstable
     dynamics.
     """
     missed = mem.miss < tolerance if mem.elastic != 0 else mem.violation <= violation
-    stationary = mem.stationarity < tolerance or (not learns and mem.unchanged >= ENDS)
+    rounded = not learns and mem.unchanged >= ENDS and mem.stationarity > ROUNDED * tolerance
+    stationary = rounded or mem.stationarity < tolerance
     return stationary and mem.gap < tolerance and mem.complementarity < tolerance and missed
 
 

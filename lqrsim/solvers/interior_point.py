@@ -21,7 +21,6 @@ from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import Sizes, Stages
 
 NAME = "interior point"  # name of its iterations in the log
-ROUNDED = 10.0  # slope relative to the tolerance, from which on it counts as rounding if the cost does not change
 
 
 class Measures(NamedTuple):
@@ -181,10 +180,8 @@ class InteriorPoint:
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
-        measures, flat = self.measures, bool(self._memory["unchanged"][0] >= ENDS)
-        if flat and not stages.about.learns:  # just above the tolerance, what is left of the slope is not all rounding
-            flat, solved = False, solved and not 1 <= measures.stationarity / self._tolerances[0] <= ROUNDED
         return InteriorResult(
-            plan=Motion(*map(np.copy, self.plan)), gain=stages.about.policy.gain, measures=measures, multipliers=known,
-            pressing=pressing, solved=solved, flat=flat, sizes=self.sizes, scale=float(self._memory["scale"][0]),
+            plan=Motion(*map(np.copy, self.plan)), gain=stages.about.policy.gain, measures=self.measures,
+            multipliers=known, pressing=pressing, solved=solved,
+            flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self.sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip
