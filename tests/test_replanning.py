@@ -139,6 +139,17 @@ class TestPreparedSolver:
         solver.solve(solution.trajectory.states[4], found.shifted(2), problem=changed)
         assert len(compiled_module.compilations) == before
 
+    @settings(max_examples=examples(10))
+    @given(limit=st.floats(1.0, 30.0))
+    def test_the_policy_keeps_the_limits_of_the_problem_that_is_solved(
+        self, stated: ls.Problem, solution: ls.Solution, solver: ls.types.PreparedSolver, limit: float
+    ) -> None:
+        """And not those that were prepared; as far as actuators go."""
+        changed = problem(weight=1.0, limit=limit)
+        policy = solver.solve(solution.trajectory.states[0], solution, problem=changed).policy
+        assert policy.control_coordinates == changed.applied_coordinates
+        assert np.abs(policy(stated.start + 100.0, 0.0)).max() <= limit
+
     def test_an_obstacle_that_comes_into_the_way_is_gone_round(self) -> None:
         """A car on a plan 6 m long meets a ball whose centre is on it; there is a way round each of them.
 

@@ -16,7 +16,6 @@ from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.plan import Plan, Replan
-from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
@@ -102,8 +101,6 @@ class PreparedSolver(OneVersion):
         if problem.duration is not None:
             raise InputError("problem: got a free duration, want a fixed one for solves in real time")
         self.problem, self.settings, self.threads = problem, settings, threads
-        self._states = problem.dynamics.state_coordinates
-        self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
         self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
         # With a cost or limits of rates: the solver of the problem with the last command as a state.
@@ -117,13 +114,15 @@ class PreparedSolver(OneVersion):
             self._wide = PreparedSolver(wide, settings, threads)
 
     def __repr__(self) -> str:
-        return f"PreparedSolver({len(self._states)} states, {len(self._controls)} controls, {self.problem.steps} steps)"
+        system, steps = self.problem.dynamics, self.problem.steps
+        n, m = len(system.state_coordinates), len(system.control_coordinates)
+        return f"PreparedSolver({n} states, {m} controls, {steps} steps)"
 
     def _compile(self) -> None:
-        n, m, steps = len(self._states), len(self._controls), self.problem.steps
+        n, steps = len(self.problem.dynamics.state_coordinates), self.problem.steps
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
         control = self.problem.nominal_control.copy()
-        law = Policy(np.zeros((steps, m, n)), np.tile(control, (steps, 1)))
+        law = Policy(np.zeros((steps, len(control), n)), np.tile(control, (steps, 1)))
         guess, budget = InitialGuess(*law), Budget(self.settings.max_iterations)
         run = SolveRun(self.problem, self.settings, guess, state, budget)
         run.roll_out()
@@ -244,12 +243,9 @@ class PreparedSolver(OneVersion):
     ) -> Replan:
         # The next solve overwrites this memory.
         states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
-        policy = AffinePolicy(
-            gain=gain, offset=offset, nominal=states[:-1].copy(), dt=problem.dt, state_coordinates=self._states,
-            control_coordinates=self._controls,
-        )  # fmt: skip
         return Replan(
-            status=result.status, detail=result.detail, improved=best.improved, policy=policy,
+            status=result.status, detail=result.detail, improved=best.improved,
+            policy=compiled.policy_of(problem, gain, offset, states[:-1].copy()),
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
             violation=best.violation, cost_to_go=copy_of(best.cost_to_go), multipliers=best.multipliers,
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
