@@ -1358,7 +1358,7 @@ class TestPlanMethods:
         stages.about = stages.about._replace(learns=learns)
         point = InteriorPoint(stages, plan, price=price)
         stages.state(margin=1e-9)
-        known = np.abs(stages.numbers.ravel()) if informed else np.zeros(stages.live.size)
+        known = np.abs(stages.about.rows.numbers) if informed else np.zeros(stages.live.size)
         begun = PlanBeginning(plan, known, informed, 1.0, 0.02, 0.0)
         work, memory = stages.interior
         work = work._replace(filter=np.zeros((20, 2)))

@@ -279,9 +279,8 @@ class AugmentedLagrangian:
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._initial = [
-            multipliers.penalty for multipliers in self._own
-        ]  # zero, except multipliers of another solution
+        # Zero, except for multipliers of another solution.
+        self._initial = [multipliers.penalty for multipliers in self._own]
 
     def _restart(self) -> None:
         self._grown, self._missed = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)

@@ -60,12 +60,11 @@ class Stop:
     def not_counting(self) -> Iterator[None]:
         """A block that may compile, whose time does not count. If it compiles for long, a log line says so."""
         began, limit, compiled = time.perf_counter(), self.deadline - self.begun, len(compilations)
-        before = self._stopped
-        self._stopped = began if before is None else before
+        self._stopped = began
         try:
             yield
         finally:
-            self._stopped = before
+            self._stopped = None
             seconds = time.perf_counter() - began
             self.begun += seconds
             self.deadline += seconds

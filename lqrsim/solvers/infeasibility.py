@@ -123,11 +123,8 @@ def _balance(
         total = max(total, float((np.abs(slope) * control_size * free).max()))
         pressed = np.maximum(pressed, np.abs(slope) * control_size * ~free)
         reach = np.linalg.norm(B / state_size[:, None], axis=0) * control_size
-        of_all, of_own = (
-            np.linalg.norm(costate * state_size) * reach,
-            np.linalg.norm(costate_alone * state_size) * reach,
-        )
+        force = max(np.linalg.norm(costate * state_size), np.linalg.norm(costate_alone * state_size))
         pull = max(pull, float((np.abs(of_missed) * control_size).max()))
-        size = max(size, pull, float(of_all.max()), float(of_own.max()))
+        size = max(size, pull, float(force * reach.max()))
         costate, costate_alone = slopes[t, :n] + A.T @ costate, alone[t, :n] + A.T @ costate_alone
     return total, size, pull, pressed

@@ -83,16 +83,13 @@ class InteriorPoint:
       multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
       oldest: number of further steps for which derivatives of the dynamics may serve. Nothing is then learned of their
         curvature.
-
-    Attributes:
-      sizes: typical sizes. iterations: number of iterations so far.
     """
 
     def __init__(
         self, stages: Stages, plan: Motion, barrier: Barrier = MEDIUM, *,
         price: float | Array | Callable[[Sizes], Array] = np.inf, multipliers: tuple[Array, ...] = (), oldest: int = 0,
     ) -> None:  # fmt: skip
-        self.stages, self.iterations = stages, 0
+        self._stages, self._iterations = stages, 0
         problem = stages.problem
         begun = Motion(plan.states.copy(), np.clip(plan.controls, stages.low, stages.high))
         if isinstance(problem.initial, FixedState):
@@ -107,14 +104,9 @@ class InteriorPoint:
         self._log = np.zeros(0, MEASURES)
         self._tolerances = np.nan, np.nan
         self._call(SCALE, 0)
-        self.sizes = stages.sized(float(self._memory["typical"][0]))
-        stages.state(price=price(self.sizes) if callable(price) else price)
+        self._sizes = stages.sized(float(self._memory["typical"][0]))
+        stages.state(price=price(self._sizes) if callable(price) else price)
         self._call(BEGIN, 0)
-
-    @property
-    def plan(self) -> Motion:
-        """The current plan, in memory that iterations overwrite."""
-        return self._arrays.now.plan
 
     @property
     def measures(self) -> Measures:
@@ -140,24 +132,24 @@ class InteriorPoint:
           watch: called with the measures of each iteration, and its seconds; True ends the run.
           hurried: whether it is to be called after each iteration, rather than after `ATTENTION` seconds.
         """
-        functions = functions_of(self.stages.problem)
+        functions = functions_of(self._stages.problem)
         self._log = np.zeros(most, MEASURES)
         if len(self._arrays.filter) < most:  # like the log, the filter gets a row at each iteration
             self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
-            self.stages.interior = self._arrays, self._memory
+            self._stages.interior = self._arrays, self._memory
         self._tolerances = float(tolerance), float(violation)
-        self.stages.state(margin=INSIDE * violation)
+        self._stages.state(margin=INSIDE * violation)
         clock = time.perf_counter()
         if near and self._call(POLISH, 1)[1] == CONVERGED:
-            self.iterations = 1
+            self._iterations = 1
             watch(self.measures, time.perf_counter() - clock)
             return self._result(True)
         outcome, ended, bite = RUNNING, False, 1
-        while outcome == RUNNING and not ended and self.iterations < most:
-            first, clock = self.iterations, time.perf_counter()
+        while outcome == RUNNING and not ended and self._iterations < most:
+            first, clock = self._iterations, time.perf_counter()
             done, outcome = self._call(ITERATE, min(first + bite, most))
             seconds = (time.perf_counter() - clock) / max(done - first, 1)
-            self.iterations = done
+            self._iterations = done
             for row in self._log[first:done].tolist():
                 ended = watch(Measures(*row), seconds) or ended
             if error := interrupt_of(functions):
@@ -165,23 +157,23 @@ class InteriorPoint:
             if not hurried and not functions:
                 bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
         if outcome == RUNNING:
-            self._call(CLOSE, self.iterations)
+            self._call(CLOSE, self._iterations)
         return self._result(bool(self._memory["solved"][0]))
 
     def _call(self, task: int, last: int) -> tuple[int, int]:
-        return self.stages.call(
-            "interior_point", task, self.iterations, last, *self._tolerances, self._begun, self.stages.about,
+        return self._stages.call(
+            "interior_point", task, self._iterations, last, *self._tolerances, self._begun, self._stages.about,
             self._arrays, self._memory, self._log,
         )  # fmt: skip
 
     def _result(self, solved: bool) -> InteriorResult:
-        stages = self.stages
+        stages = self._stages
         known = tuple(stages.force[:, stages.owners == k].copy() for k in range(len(stages.problem.constraint_terms)))
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
         return InteriorResult(
-            plan=Motion(*map(np.copy, self.plan)), gain=stages.about.policy.gain, measures=self.measures,
-            multipliers=known, pressing=pressing, solved=solved,
-            flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self.sizes, scale=float(self._memory["scale"][0]),
+            plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain, measures=self.measures,
+            multipliers=known, pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS),
+            sizes=self._sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip

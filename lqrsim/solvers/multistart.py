@@ -174,9 +174,7 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
     Args:
       cycles: their number along the plan; negative for controls that begin the other way.
     """
-    space, nominal = problem.control_coordinates, problem.nominal_control
-    actuators = problem.dynamics.control_coordinates
-    low, high = np.maximum(space.low, actuators.low), np.minimum(space.high, actuators.high)
+    (low, high), nominal = problem.applied_coordinates.limits, problem.nominal_control
     margin = np.minimum(high - nominal, nominal - low)
     amplitude = SWAY * np.where(np.isfinite(margin), np.maximum(margin, 0.0), 1.0)
     times = np.arange(problem.steps)[:, None] / problem.steps
@@ -211,9 +209,8 @@ def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
     Args:
       problem: one that names a start.
     """
-    space, actuators = problem.control_coordinates, problem.dynamics.control_coordinates
-    low, high = np.maximum(space.low, actuators.low), np.minimum(space.high, actuators.high)
-    start, steps = problem.start, problem.steps
+    space, start, steps = problem.applied_coordinates, problem.start, problem.steps
+    low, high = space.limits
     nominal = np.broadcast_to(problem.nominal_controls, (steps, len(low)))
     gain = np.zeros((steps, len(low), len(nominal[0]) if start is None else len(start)))
     for i, side, fraction, duration in itertools.product(range(len(low)), (high, low), PUSHED, PARTS):

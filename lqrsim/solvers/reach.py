@@ -18,9 +18,8 @@ from lqrsim.solvers.engine import RunResult
 from lqrsim.solvers.multistart import FOLLOWED, SWAYS, sinusoidal_controls
 
 LEFT = 1e-3  # slope of the final cost, relative to the slope at the end of a given plan, that has died away
-MOST_OF = (
-    0.1  # part of the cost that a change of a state by its size would save, from which on its goal counts as missed
-)
+# Part of the cost that a change of a state by its size would save, from which on its goal counts as missed.
+MOST_OF = 0.1
 NEARER = 0.3  # part of the way to its goal that a body must be taken
 LEAST_WAY = 0.1  # least way of a joint, relative to the longest, by which its weight along an approach is scaled
 NONE = 1e-9  # change of a state, relative to its size, that counts as none

@@ -1,6 +1,5 @@
 """Costs under noise: of sampled runs; and the largest risk for which the expectation of exp(risk * cost) exists."""
 
-from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
@@ -19,7 +18,6 @@ from lqrsim.solvers.settings import SmootherSettings
 
 DIGITS = 1e-12  # relative accuracy of the bisection
 MOST_TRIALS = 10_000_000
-Fails = Callable[[float], int]  # maps a risk to the step at which a backward pass fails, or -1
 
 
 @checked
@@ -66,14 +64,13 @@ def sample_costs(
 def largest_risk(problem: Problem, solution: Solution) -> float:
     """The largest `risk` for which a backward pass about a solution's plan succeeds, found by bisection.
 
-    For a linear-quadratic problem with noise that does not depend on the state, the plan does not matter. Infinite if
-    no risk is too high, as when the noise costs nothing.
+    For a linear-quadratic problem with noise that does not depend on the state, the plan does not matter.
 
     Args:
       problem: a problem with noise; its own risk does not count.
 
     Returns:
-      The risk, in units of 1/cost; infinite if no risk is too high.
+      The risk, in units of 1/cost; infinite if no risk is too high, as when the noise costs nothing.
 
     Raises:
       InputError: the problem has no noise, the solution is not of such a problem, or the pass fails even without risk.
@@ -84,7 +81,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     wanted = (problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates))
     if (got := (*plan.controls.shape, plan.states.shape[1])) != wanted:
         raise InputError(f"solution: got a plan of {got} steps, controls and states, want {wanted}")
-    settings = SmootherSettings(tolerance=1e-4, max_iterations=1, start=plan, constraint_tolerance=1e-3)
+    settings = SmootherSettings(tolerance=1e-4, max_iterations=1, constraint_tolerance=1e-3)
     run = SolveRun(problem, settings, resolve(plan.controls, problem), plan.states[0].copy(), Budget(1))
     run.work.set_best(Motion(plan.states, plan.controls))
     if run.fails_at(0.0) >= 0:
@@ -94,7 +91,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
         high *= 2
         if high > 1e200:
             return float("inf")
-    return _bisect(run.fails_at, high)
+    return _bisect(run, high)
 
 
 def name_risk(run: SolveRun, result: RunResult) -> str:
@@ -107,16 +104,16 @@ def name_risk(run: SolveRun, result: RunResult) -> str:
     failed = run.fails_at(risk)
     if failed < 0 or run.fails_at(0.0) >= 0:
         return result.detail
-    most = _bisect(run.fails_at, risk) * (1 - 1e-5)  # so that even the rounded number works
+    most = _bisect(run, risk) * (1 - 1e-5)  # so that even the rounded number works
     too_high = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}"
     too_high += f", and at most {most:.5g} will do"
     return f"{too_high}; {result.detail}" if result.detail else too_high
 
 
-def _bisect(fails: Fails, high: float) -> float:
-    """The largest risk at which there is no failure, given one above it."""
+def _bisect(run: SolveRun, high: float) -> float:
+    """The largest risk with which a pass about the plan of a run does not fail, given one above it."""
     low = 0.0
     while high - low > DIGITS * high:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if fails(middle) < 0 else (low, middle)
+        low, high = (middle, high) if run.fails_at(middle) < 0 else (low, middle)
     return low

@@ -99,8 +99,8 @@ class Stages:
         self.models = self.about.models
         self.slopes = self.models.slopes.reshape(steps + 1, rows, n + m)
         by_step = (array.reshape(steps + 1, rows) for array in stage_rows[4:])
-        self._acts, self._live, self.held, self._kinds, self._sizes, self._targets, self._prices, *others = by_step
-        self.numbers, self.force = others
+        self._acts, self._live, self.held, self._kinds, *others = by_step
+        self._sizes, self._targets, self._prices, _, self.force = others
         self._read_problem(problem)
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign

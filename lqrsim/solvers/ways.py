@@ -170,14 +170,13 @@ class Grid:
     """Cells of the space of the position.
 
     Attributes:
-      axes: coordinates of the cells along each axis, in m. cell: their size. shape: their number along each axis.
-      points: (N, 2 or 3), their centres.
+      cell: their size in m. shape: their number along each axis. points: (N, 2 or 3), their centres.
     """
 
     def __init__(self, low: Array, high: Array, cell: float) -> None:
-        self.axes = [a + cell * np.arange(1 + int(np.ceil((b - a) / cell))) for a, b in zip(low, high, strict=True)]
-        self.cell, self.shape = cell, tuple(len(axis) for axis in self.axes)
-        self.points = np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1).reshape(-1, len(low))
+        axes = [a + cell * np.arange(1 + int(np.ceil((b - a) / cell))) for a, b in zip(low, high, strict=True)]
+        self.cell, self.shape = cell, tuple(len(axis) for axis in axes)
+        self.points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(low))
 
     def nearest(self, places: Array) -> tuple[npt.NDArray[np.int64], ...]:
         """The indices along each axis of the cells nearest to places (K, 2 or 3)."""
