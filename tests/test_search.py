@@ -14,6 +14,7 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Iteration, Status
+from lqrsim.solvers import strategy
 from lqrsim.solvers.multistart import bends, guides, path, reweighted
 
 STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]
@@ -336,6 +337,22 @@ def test_where_no_control_helps_by_itself_some_do_together() -> None:
     assert [one.start for one in led.candidates] == ["the given start", "beside a saddle"]
     assert led.candidates[0].cost == pytest.approx(50.0)
     assert [one.start for one in found.candidates][:1] == ["nominal control"]
+
+
+@pytest.mark.parametrize("most", range(4))
+def test_a_saddle_is_not_said_to_have_converged(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor after others were left: here each of two states may go to either side, and one goes at a time."""
+    monkeypatch.setattr(strategy, "SADDLES", most)
+    dynamics = ls.Dynamics(lambda x, u, p: [u[0], u[1]], states={"a": "", "b": ""}, controls={"c": "", "d": ""})
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.2, steps=5, initial=ls.FixedState(np.zeros(2)), stage_cost=ls.ControlCost([0.1, 0.1]),
+        final_cost=ls.SymbolicCost(lambda x, u, p: (x.a**2 - 1) ** 2 + (x.b**2 - 1) ** 2),
+    )  # fmt: skip
+    solution = ls.smooth(problem, start=np.zeros(2))
+    assert solution.curvature == ("minimum" if most > 1 else "saddle")
+    assert solution.success == (solution.curvature == "minimum")
+    assert solution.detail.startswith("a saddle") != solution.success
+    assert np.count_nonzero(np.abs(solution.trajectory.states[-1]) > 0.5) == min(most, 2)
 
 
 @pytest.fixture(scope="module")

@@ -534,21 +534,19 @@ class Search:
 
         A saddle that is not left has not converged, and comes after a plan from elsewhere that costs less.
         """
-        for _ in range(SADDLES):
+        for count in range(SADDLES + 1):
             run, best = self.best
             if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
                 return
-            if not self._descend(run, best):
+            if count == SADDLES or not self._descend(run, best):
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
+                if count == SADDLES:
+                    detail = f"a saddle: the cost falls to second order, as it did at {count} plans that were left"
                 self._finished[0] = run, replace(best, status=status, detail=detail)
-                self._prefer_cheaper()
+                if (cheapest := self._cheaper_elsewhere(SADDLE_DECREASE)) is not None:
+                    self._finished.insert(0, self._finished.pop(cheapest))
                 return
-
-    def _prefer_cheaper(self) -> None:
-        """Put the cheapest plan that keeps the constraints first, if it costs less by more than rounding."""
-        if (cheapest := self._cheaper_elsewhere(SADDLE_DECREASE)) is not None:
-            self._finished.insert(0, self._finished.pop(cheapest))
 
     def _cheaper_elsewhere(self, less: float) -> int | None:
         """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
