@@ -455,4 +455,5 @@ def test_a_cheaper_plan_that_has_not_converged_is_the_answer_or_named(exact: boo
     assert (said in solution.detail) == bool(cheaper)
     assert solution.success or not cheaper
     if cheaper:
-        assert f"{said}, {min(cheaper):.6g}:" in solution.detail
+        (least,) = (one for one in solution.candidates if one.cost == min(cheaper))
+        assert f"{said}, {least.cost:.6g}: the trajectory of candidate {least.start!r}" in solution.detail

@@ -861,12 +861,12 @@ class Search:
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
-        number = next((i for i, (_, other) in enumerate(self._named) if other is run), None)
-        if number is None:
+        name = next((name for name, other in self._named if other is run), None)
+        if name is None:
             return ""
         return (
             f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}:"
-            f" candidates[{number}].trajectory, a start to go on from"
+            f" the trajectory of candidate {name!r}, a start to go on from"
         )
 
     def _with_unmoved_states(self, result: RunResult) -> RunResult:
