@@ -272,7 +272,7 @@ class AugmentedLagrangian:
     """
 
     def __init__(self, run: SolveRun) -> None:
-        self._problem, self._work, self._own = run.problem, run.work, run.work.multipliers
+        self._problem, self._work, self._constraints = run.problem, run.work, run.work.multipliers
         self._allowed = tolerance = run.settings.violation_tolerance(run.problem)
         # The tolerances of inequalities and of equalities, if there are any.
         terms = run.problem.constraint_terms
@@ -280,7 +280,7 @@ class AugmentedLagrangian:
         self.kept = self.solved = self.nearly = False
         self._restart()
         # Zero, except for multipliers of another solution.
-        self._initial = [multipliers.penalty for multipliers in self._own]
+        self._initial = [multipliers.penalty for multipliers in self._constraints]
 
     def _restart(self) -> None:
         self._grown, self._missed = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
@@ -296,11 +296,11 @@ class AugmentedLagrangian:
         self.kept = self._work.keeps(stated)
         excess = [
             violation_of(multipliers.term, values) - multipliers.term.equality * self._allowed
-            for multipliers, values in zip(self._own, stated, strict=True)
+            for multipliers, values in zip(self._constraints, stated, strict=True)
         ]
         self.nearly = not self.kept and max(excess, default=0.0) <= 0
         self._values = [
-            values.ravel() - multipliers.margin for multipliers, values in zip(self._own, stated, strict=True)
+            values.ravel() - multipliers.margin for multipliers, values in zip(self._constraints, stated, strict=True)
         ]
         self.solved = all(
             _missed(multipliers, values) <= self._tolerance[multipliers.term.equality]
@@ -332,7 +332,7 @@ class AugmentedLagrangian:
             more = growth * self._grown[kind] <= LARGEST or not near[kind]
             if more and missed[kind] > max(0.5 * self._missed[kind], tolerance):
                 self._grown[kind] *= growth
-                for multipliers in self._own:
+                for multipliers in self._constraints:
                     multipliers.penalty *= growth if multipliers.term.equality == kind else 1.0
         self._missed = missed
 
@@ -358,20 +358,20 @@ class AugmentedLagrangian:
         ]
         excess = [
             violation - allowed_violation(multipliers.term, self._allowed)
-            for violation, multipliers in zip(missed, self._own, strict=True)
+            for violation, multipliers in zip(missed, self._constraints, strict=True)
         ]
         which = int(np.argmax(excess))
-        term, (step, row) = self._own[which].term, self._worst_of(which)
+        term, (step, row) = self._constraints[which].term, self._worst_of(which)
         time = step * self._problem.dt
         return f"{term.describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
 
     def _each(self) -> Iterator[tuple[ConstraintMultipliers, Array]]:
         """For each constraint, its multipliers, and its values relative to the target."""
-        return zip(self._own, self._values, strict=True)
+        return zip(self._constraints, self._values, strict=True)
 
     def _worst_of(self, which: int) -> tuple[int, int]:
         """Step and row of a constraint's worst violation: the first of several equal; for an equality, the last."""
-        values, term = self._values[which], self._own[which].term
+        values, term = self._values[which], self._constraints[which].term
         last = len(values) - 1 - int(np.abs(values[::-1]).argmax()) if term.equality else int(values.argmin())
         return divmod(last, term.rows)
 
@@ -381,7 +381,7 @@ class AugmentedLagrangian:
         That is twice the total cost of a change by 1 unit, `1 / n' (S + Sbar)^-1 n` for the entry's slope n: the
         curvature of the total cost if the rest of the trajectory adapts.
         """
-        term, (step, worst) = self._own[which].term, self._worst_of(which)
+        term, (step, worst) = self._constraints[which].term, self._worst_of(which)
         states, controls = self._plan
         n, control = states.shape[1], min(step, len(controls) - 1)
         values = self._work.value_functions()

@@ -210,13 +210,13 @@ class InteriorRun:
     def _set_multipliers(self, interior: InteriorResult, values: list[Array], firmness: float) -> None:
         """Choose multipliers with which the augmented Lagrangian has the interior point's forces at these values."""
         triples = zip(self._run.work.multipliers, interior.multipliers, values, strict=True)
-        for k, (own, known, numbers) in enumerate(triples):
+        for k, (record, known, numbers) in enumerate(triples):
             size = interior.sizes.rows[self._run.stages.owners == k]
-            own.penalty = firmness * interior.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
-            force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
-            presses = known > own.penalty * (numbers - own.margin)  # other forces are remnants of the barrier
-            acts = np.isfinite(numbers) & (own.term.equality | presses)
-            own.values[...] = np.where(acts, force, 0.0).ravel()
+            record.penalty = firmness * interior.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            force = known + record.penalty * np.where(np.isfinite(numbers), numbers - record.margin, 0.0)
+            presses = known > record.penalty * (numbers - record.margin)  # other forces are remnants of the barrier
+            acts = np.isfinite(numbers) & (record.term.equality | presses)
+            record.values[...] = np.where(acts, force, 0.0).ravel()
 
     def _newton(self, lagrangian: AugmentedLagrangian, scale: float) -> RunResult:
         """Run Newton's method from the plan in memory, with these multipliers, to an optimality relative to `scale`."""
