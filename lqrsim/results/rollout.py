@@ -444,21 +444,13 @@ class Rollout:
     def _repr_html_(self) -> str:
         """Outcomes of the first trials, and their paths about the plan, for notebooks."""
         target, least, distance = self.target, self.least_clearance(), self.goal_distance
-        rows = [
-            (
-                "trial",
-                "outcome",
-                "ended",
-                f"largest error, {self.tracking_unit}",
-                f"from the {target.name}",
-                "clearance",
-            )
-        ]
+        error, end = f"largest error, {self.tracking_unit}", f"from the {target.name}"
+        rows = [("trial", "outcome", "ended", error, end, "clearance")]
         for k in range(min(self.trials, SHOWN)):
             worst = float(np.max(self.tracking_error[k], where=self.counts[k], initial=0.0))
-            end = f"{number_text(distance[k])} {target.unit}", f"{number_text(least[k])} m"
-            ended = f"{number_text(self.ended[k])} s"
-            rows.append((str(self.first_trial + k), self.outcome[k], ended, number_text(worst), *end))
+            ended, end = f"{number_text(self.ended[k])} s", f"{number_text(distance[k])} {target.unit}"
+            clearance = f"{number_text(least[k])} m"
+            rows.append((str(self.first_trial + k), self.outcome[k], ended, number_text(worst), end, clearance))
         remarks = ["; ".join(self.disturbances) or "undisturbed", self.tally()]
         if self.trials > SHOWN:
             remarks.append(f"the first {SHOWN} of {self.trials} trials are shown")

@@ -81,10 +81,7 @@ class Status(enum.StrEnum):
         "cost converged", "the change of cost is within tolerance; gap and optimality were not tested",
         'check the gap, or solve with stop="optimal"',
     )  # fmt: skip
-    MAX_ITERATIONS = (
-        "max iterations", "the iteration limit was reached",
-        "raise max_iterations",
-    )  # fmt: skip
+    MAX_ITERATIONS = "max iterations", "the iteration limit was reached", "raise max_iterations"
     STALLED = (
         "stalled", "no step makes the plan better, though it is not within tolerance",
         "begin with another start, or accept a larger tolerance",

@@ -170,9 +170,8 @@ def _deepest(missed: Array) -> tuple[Array, Array]:
 
 
 def solve_between_knots(
-    problem: Problem, settings: SmootherSettings,
-    solve: Callable[..., Solution], stop: Stop,
-) -> Solution:  # fmt: skip
+    problem: Problem, settings: SmootherSettings, solve: Callable[..., Solution], stop: Stop
+) -> Solution:
     """Solve a problem in rounds until its plan is as it is to be between the knots.
 
     `solve` solves a problem that is to be right at its knots, within the time of `stop`. With a free duration, its

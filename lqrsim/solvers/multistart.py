@@ -253,7 +253,7 @@ def _moving(problem: Problem) -> list[int]:
     return sorted({i for cost, term in pairs if cost.kept_clear is not None for i in term.nonconvex_in or ()})
 
 
-def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m") -> list[tuple[str, Array]]:
+def bends(way: Array, count: int, *, ring: float = RING, unit: str = "m") -> list[tuple[str, Array]]:
     """Offsets of the middle of each path from the straight path, with names: first none, then to the sides.
 
     In space the other paths form a ring about the straight path; in the plane, pairs to the left and the right; in more
@@ -261,9 +261,8 @@ def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m")
 
     Args:
       way: vector from start to goal, (k,). unit: unit of its numbers, for the names.
-      ring: bend of paths in more than two dimensions, relative to the way; by default RING.
+      ring: bend of paths in more than two dimensions, relative to the way.
     """
-    ring = RING if ring is None else ring
     distance = float(np.linalg.norm(way))
     straight: list[tuple[str, Array]] = [("straight", np.zeros(len(way)))]
     if count == 1 or len(way) == 1:

@@ -600,7 +600,9 @@ class Search:
         for name, through in reach.approaches(problem, before, places):
             if self._budget.stop.due:
                 break
-            drawn = self._solve_through(through)
+            run = self._another(resolve(None, through), through)
+            with through.dynamics.solving(self._threads), run.budget.limited(APPROACH):
+                drawn = refine(run, Known()).kept()
             self._approached.append(name)
             plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
             if consider(name, guess_from(drawn, name), plan):
@@ -617,12 +619,6 @@ class Search:
             self._offer(run, other, better=before.violation >= other.violation and other.cost < self.best[1].cost)
             if self._comes_nearer(other) and (self._best_nearer is None or other.cost < self._best_nearer[1].cost):
                 self._best_nearer = name, other
-
-    def _solve_through(self, through: Problem) -> RunResult:
-        """Plan along an approach through the body."""
-        run = self._another(resolve(None, through), through)
-        with through.dynamics.solving(self._threads), run.budget.limited(APPROACH):
-            return refine(run, Known()).kept()
 
     def _comes_nearer(self, plan: RunResult | Motion) -> bool:
         """Whether a plan brings states nearer to their goal that no control changed along the first plan."""
