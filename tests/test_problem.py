@@ -473,3 +473,49 @@ def test_formulas_know_states_and_controls_by_name(states: list[str], controls: 
     wrong = ls.Dynamics(lambda x, u, p: [x.speed], states={"v": "m/s"}, controls={"u": "N"})
     with pytest.raises(ls.InputError, match="got 'speed', want one of: v"):
         wrong.rate([0.0], [0.0])
+
+
+class TestProblemsThatBeginInside:
+    """The rest of a problem may begin inside an obstacle, whatever else is asked of it; a new problem may not."""
+
+    NOISE = ls.Noise(0.01 * np.eye(2))
+
+    def problem(self, **fields: Any) -> ls.Problem:
+        world = ls.World([ls.Obstacle("ball", "sphere", np.zeros(3), np.eye(3), np.array([0.3, 0.0, 0.0]))])
+        dynamics = ls.Dynamics(
+            lambda x, u, p: [u[0], u[1]], states={"x": "m", "y": "m"}, controls={"u": "m/s", "v": "m/s"},
+            position=("x", "y"),
+        )  # fmt: skip
+        return ls.Problem(
+            dynamics=dynamics, dt=0.1, steps=20, initial=ls.FixedState(x=-2.0),
+            stage_cost=ls.ControlCost([0.1, 0.1]) + ls.ObstacleCost(world, radius=0.1),
+            final_cost=ls.QuadraticCost([100.0, 100.0], about=[2.0, 0.0]), **fields,
+        )  # fmt: skip
+
+    @pytest.mark.parametrize(
+        "fields",
+        [
+            {}, {"noise": NOISE, "risk": 0.01}, {"accuracy": 1e-8}, {"between_knots": True},
+            {"duration": (0.5, 3.0), "time_weight": 1.0}, {"control_rate": ls.ControlRate(weight=0.01)},
+            {"segments": [10]},
+        ],
+    )  # fmt: skip
+    @settings(max_examples=examples(3))
+    @given(place=st.tuples(st.floats(-0.25, 0.25), st.floats(-0.25, 0.25)), after=st.integers(0, 9))
+    def test_they_are_solved_and_printed(self, fields: dict[str, Any], place: tuple[float, float], after: int) -> None:
+        stated = self.problem(**fields)
+        rest = stated.from_state(place, after=0 if stated.duration else after)
+        solution = ls.smooth(rest, max_iterations=30)
+        np.testing.assert_array_equal(solution.trajectory.states[0], place)
+        assert str(solution).startswith(solution.status.name)
+        if not {"control_rate", "duration", "accuracy"} & fields.keys():
+            assert np.isfinite(ls.smooth(rest, noise=self.NOISE, max_iterations=3).cost)
+        with pytest.raises(ls.InputError, match=r"initial: got a start at .* inside obstacle 'ball'"):
+            dataclasses.replace(rest, initial=ls.FixedState(place))
+
+    def test_a_segment_of_which_one_step_is_left_is_part_of_the_next(self) -> None:
+        stated = self.problem(segments=[4, 10])
+        for after, left in ((0, (4, 10)), (2, (2, 8)), (3, (7,)), (4, (6,)), (8, (2,)), (9, ()), (15, ())):
+            rest = stated.from_state([-1.0, 1.0], after=after)
+            assert rest.segments == left
+            assert dataclasses.replace(rest, risk=0.0).segments == left

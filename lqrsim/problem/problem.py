@@ -4,7 +4,7 @@ import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -66,6 +66,7 @@ class FixedState:
     """
 
     state: PerEntry
+    _must_be_clear: ClassVar[bool] = True  # of obstacles; see `Problem.from_state`
 
     def __init__(self, state: PerEntry | None = None, /, **named: float) -> None:
         if not named and (state is None or (isinstance(state, Mapping) and not state)):
@@ -93,6 +94,12 @@ class FixedState:
     def _cost(self) -> QuadraticCost:
         """A zero cost, with which fixed and soft starts share compiled code."""
         return QuadraticCost(np.zeros(len(self.numbers)), about=self.numbers)
+
+    def _extended(self, numbers: npt.ArrayLike) -> "FixedState":
+        """The state with further numbers at its end."""
+        other = FixedState(np.append(self.numbers, numbers))
+        keep(other, _must_be_clear=self._must_be_clear)
+        return other
 
     def _in(self, dynamics: Dynamics) -> "FixedState":
         """The state with numbers by name in the order of a system. Raises InputError if it does not fit."""
@@ -205,6 +212,8 @@ class Problem(OneVersion):
             keep(self, control_limits=(limited.low, limited.high))
         keep(self, control_coordinates=limited, applied_coordinates=limited.within(controls))
         start, terms = self.start, [cost.kept_clear for cost in self.obstacle_costs]
+        if isinstance(self.initial, FixedState) and not self.initial._must_be_clear:
+            return
         if start is not None and (collision := self._inside(terms, start, self.begin)) is not None:
             where, advice = collision
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
@@ -236,6 +245,7 @@ class Problem(OneVersion):
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
         start = FixedState(here)
+        keep(start, _must_be_clear=False)
         if isinstance(self.initial, FixedState):  # four times as fast as a new cost
             term = about_state(self._terms["initial"][0], here)
         else:
@@ -249,7 +259,7 @@ class Problem(OneVersion):
         other = self._with(initial=start, control_rate=rate, _terms=self._terms | {"initial": (term,)})
         if not after:
             return other
-        segments = tuple(knot - after for knot in self.segments if knot > after)
+        segments = tuple(knot - after for knot in self.segments if knot > after + 1)  # each has two steps at least
         constraints, stage_cost = tuple(part.ahead(after) for part in self.constraints), self.stage_cost.ahead(after)
         rest = {"steps": self.steps - after, "begin": self.begin + after * self.dt, "segments": segments}
         return other._with(**rest, constraints=constraints, stage_cost=stage_cost)._bound_anew()

@@ -472,11 +472,8 @@ def with_duration_state(problem: Problem, *, by_segment: bool = False) -> Proble
     assert problem.duration is not None
     dynamics, n = problem.dynamics, len(problem.dynamics.state_coordinates)
     stated, (low, high) = problem.steps * problem.dt, problem.duration
-    initial = problem.initial
-    if isinstance(initial, FixedState):
-        initial = FixedState(np.append(initial.numbers, stated))
-    else:
-        initial = initial.with_added_state(dynamics)
+    start = problem.initial
+    initial = start._extended(stated) if isinstance(start, FixedState) else start.with_added_state(dynamics)
     weight = problem.time_weight / (problem.steps if by_segment else 1)
     priced = SymbolicCost(lambda x, u, p: p.weight * x[n], parameters={"weight": weight}, convex=True)
     bounds = SymbolicConstraint(
