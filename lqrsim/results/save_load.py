@@ -1,7 +1,7 @@
 """Results on disk: arrays by the paths of their fields, and everything else as JSON with the structure of the record.
 
 `docs/file_format.md` describes the files, and shows how to load a policy with NumPy alone. The annotations of the
-records state the permitted contents of a file; see `fields.py`. `save` and `load` check this.
+records state the permitted contents of a file; see `annotations.py`. `save` and `load` check this.
 """
 
 import enum

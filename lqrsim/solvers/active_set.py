@@ -25,18 +25,17 @@ class ActiveSet:
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
-      plan: the current plan, which steps overwrite. measures: its measures. force, held: (T+1, R) the rows'
-        multipliers, and 1 for rows held at their targets, else 0. hopeless: whether the plan is stationary but violates
+      held: (T+1, R) 1 for rows held at their targets, else 0. hopeless: whether the plan is stationary but violates
         rows that no multiplier corrects. model_seconds: spent on the models of a plan.
     """
 
     def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
-        self.stages, self._violation, self.hopeless = stages, float(violation), False
+        self._stages, self._violation, self.hopeless = stages, float(violation), False
         self._arrays, self._memory = stages.active_set
-        self.plan, self.held, self.force = self._arrays.plan, stages.held, stages.force
-        self.plan.states[...], self.plan.controls[...] = plan
+        self.held, self._force = stages.held, stages.force
+        self._arrays.plan.states[...], self._arrays.plan.controls[...] = plan
         stages.state(price=np.inf, margin=INSIDE * violation)
-        self.force[...] = stages.of_constraints(multipliers)
+        self._force[...] = stages.of_constraints(multipliers)
         clock = time.perf_counter()
         self._call(BEGIN)
         self.model_seconds = time.perf_counter() - clock
@@ -44,7 +43,7 @@ class ActiveSet:
     @property
     def measures(self) -> Measures:
         """The measures of the plan."""
-        return Measures(*(float(self._memory[name][0]) for name in Measures._fields))
+        return Measures.of(self._memory)
 
     def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
         """Take steps until the measures are within tolerance; return whether they are.
@@ -88,20 +87,20 @@ class ActiveSet:
 
     def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
         """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values."""
-        stages, steps = self.stages, self.stages.steps
+        about, steps = self._stages.about, self._stages.steps
         self._call(ROLL_OUT)
-        values = [rows.reshape(steps + 1, -1) for rows in stages.about.values]
-        return Motion(*map(np.copy, self._arrays.out)), stages.about.policy.gain.copy(), self.measures.cost, values
+        values = [rows.reshape(steps + 1, -1) for rows in about.values]
+        return Motion(*map(np.copy, self._arrays.out)), about.policy.gain.copy(), self.measures.cost, values
 
     def multipliers(self) -> list[tuple[Array, float]]:
         """Multipliers (T+1, rows) and penalty of each constraint."""
-        owners, scale = self.stages.owners, float(self._memory["scale"][0])
+        owners, scale = self._stages.owners, float(self._memory["scale"][0])
         multipliers = []
-        for k in range(len(self.stages.problem.constraint_terms)):
-            sizes = self.stages.row_sizes[owners == k]
+        for k in range(len(self._stages.problem.constraint_terms)):
+            sizes = self._stages.row_sizes[owners == k]
             price = FIRMNESS * scale / float(np.median(sizes**2)) if len(sizes) else 1.0
-            multipliers.append((self.force[:, owners == k].copy(), price))
+            multipliers.append((self._force[:, owners == k].copy(), price))
         return multipliers
 
     def _call(self, task: int) -> int:
-        return self.stages.call("active_set", task, self._violation, self.stages.about, self._arrays, self._memory)
+        return self._stages.call("active_set", task, self._violation, self._stages.about, self._arrays, self._memory)

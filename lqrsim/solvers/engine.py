@@ -714,11 +714,11 @@ class Workspace:
       multipliers: multipliers of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
         that a line search from the best plan tries. core: the compiled iterations.
-      fixed: whether the start is given exactly. dual: whether the form is the dual form.
+      fixed: whether the start is given exactly.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        self.dual = settings.form == "dual"
+        self._dual = settings.form == "dual"
         self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
         self._evaluation: Call | None = None
         self._rollout: Call | None = None
@@ -727,7 +727,7 @@ class Workspace:
         sizes = {"T": problem.steps, "N": len(start), "M": initial_guess.offset.shape[1]}
         self.no_prior = zeros_of(Prior, **sizes)
         stated = {"homotopy_scaled": None, "prior": self.no_prior, "certificate": np.zeros(1, CERTIFICATE)}
-        self.arrays = zeros_of(SmootherArrays, stated, **sizes, S=problem.steps if self.dual else 1)
+        self.arrays = zeros_of(SmootherArrays, stated, **sizes, S=problem.steps if self._dual else 1)
         self.start, self.trial = self.arrays.start, zeros_of(Motion, **sizes)
         self.best, self.last = self.arrays.best, self.arrays.last
         self.begin(problem, settings, initial_guess, start)
@@ -791,7 +791,7 @@ class Workspace:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""
         to_go, to_come = Quadratic(*self.arrays.to_go), self.arrays.to_come
         inverse = self.arrays.smoothing.control_gain, self.arrays.smoothing.control
-        if not self.dual:
+        if not self._dual:
             return {"cost_to_go": to_go, "cost_to_come": Quadratic(*to_come), "inverse_law": inverse}
         covariance, mean, _ = to_come
         law = None

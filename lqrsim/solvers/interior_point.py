@@ -12,7 +12,7 @@ from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
 from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SCALE
-from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
+from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning, StructuredArray
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.solution_parts import Trajectory
@@ -31,6 +31,11 @@ class Measures(NamedTuple):
     violation: float  # of the worst constraint, in its unit
     gap: float  # the largest between two steps, relative to the states' ranges
     complementarity: float  # the largest product of a multiplier and its margin, relative to the cost
+
+    @classmethod
+    def of(cls, memory: StructuredArray) -> "Measures":
+        """Those that compiled code left in its memory."""
+        return cls(*(float(memory[name][0]) for name in cls._fields))
 
     def record(self, laps: Laps, method: str = NAME, seconds: float | None = None) -> None:
         """Record the residuals as those of an iteration; by default it took all the time since the last one."""
@@ -108,11 +113,6 @@ class InteriorPoint:
         stages.state(price=price(self._sizes) if callable(price) else price)
         self._call(BEGIN, 0)
 
-    @property
-    def measures(self) -> Measures:
-        """The measures of the plan."""
-        return Measures(*(float(self._memory[name][0]) for name in Measures._fields))
-
     def run(
         self,
         *,
@@ -142,7 +142,7 @@ class InteriorPoint:
         clock = time.perf_counter()
         if near and self._call(POLISH, 1)[1] == CONVERGED:
             self._iterations = 1
-            watch(self.measures, time.perf_counter() - clock)
+            watch(Measures.of(self._memory), time.perf_counter() - clock)
             return self._result(True)
         outcome, ended, bite = RUNNING, False, 1
         while outcome == RUNNING and not ended and self._iterations < most:
@@ -173,7 +173,7 @@ class InteriorPoint:
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
         return InteriorResult(
-            plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain, measures=self.measures,
-            multipliers=known, pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS),
+            plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain,
+            measures=Measures.of(self._memory), multipliers=known, pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS),
             sizes=self._sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip

@@ -298,7 +298,7 @@ def bends(way: Array, count: int, *, ring: float = RING, unit: str = "m") -> lis
 
 
 def path(start: Array, goal: Array, bend: Array, steps: int) -> Array:
-    """Positions (T+1, 2 or 3): from rest to rest with minimum jerk, displaced sideways by a sine."""
+    """Places, or states, (T+1, n): from rest to rest with minimum jerk, displaced sideways by a sine."""
     time = np.linspace(0, 1, steps + 1)[:, None]
     way = time**3 * (10 - 15 * time + 6 * time**2)
     return start + way * (goal - start) + np.sin(np.pi * way) * bend

@@ -67,7 +67,8 @@ def prepare(
     Args:
       problem: one of the problems; others may have other states, goals, obstacles and parameters.
       tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, multiplied by the
-        control's range and relative to the cost; by default 1e-6, and 1e-2 with limits of forces.
+        control's range and relative to the cost; by default 1e-6, or with an MJCF's dynamics 1e-5, and 1e-2 with limits
+        of forces.
       constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise,
         the margin of inequalities, by default 1e-3.
       finish: as in `smooth`; with None, the augmented Lagrangian method keeps the constraints.
@@ -355,16 +356,14 @@ class _Neighbour:
 
     def _result(self, active: ActiveSet, solved: bool) -> RunResult:
         """The rollout of the plan with a policy about it."""
-        problem = self._run.problem
+        problem, status = self._run.problem, Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         if not np.isfinite(active.measures).all():
-            status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
             return replace(_unchanged(self._best), status=status, detail=raised_by(functions_of(problem)))
         plan, gain, cost, values = active.carried_out()
         pairs = zip(problem.constraint_terms, values, strict=True)
         solved = solved and all(
             violation_of(term, numbers) <= allowed_violation(term, self._allowed) for term, numbers in pairs
         )
-        status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else status, detail=detail, plan=plan,
