@@ -25,15 +25,16 @@ class ActiveSet:
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
-      held: (T+1, R) 1 for rows held at their targets, else 0. hopeless: whether the plan is stationary but violates
-        rows that no multiplier corrects. model_seconds: spent on the models of a plan.
+      plan: the current plan, which steps overwrite. held: (T+1, R) 1 for rows held at their targets, else 0.
+      hopeless: whether the plan is stationary but violates rows that no multiplier corrects.
+      model_seconds: spent on the models of a plan.
     """
 
     def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
         self._stages, self._violation, self.hopeless = stages, float(violation), False
         self._arrays, self._memory = stages.active_set
-        self.held, self._force = stages.held, stages.force
-        self._arrays.plan.states[...], self._arrays.plan.controls[...] = plan
+        self.plan, self.held, self._force = self._arrays.plan, stages.held, stages.force
+        self.plan.states[...], self.plan.controls[...] = plan
         stages.state(price=np.inf, margin=INSIDE * violation)
         self._force[...] = stages.of_constraints(multipliers)
         clock = time.perf_counter()
