@@ -66,45 +66,45 @@ class LastCommand(Dynamics):
     def data(self) -> Array:
         """The addresses that the kernels read."""
         functions = *self.of.compiled.addresses("advance", "step_jacobian"), self.of.step_curvature
-        return np.array([*functions, self._system_numbers.ctypes.data], dtype=np.float64)
+        return np.array([*functions, self._own_numbers.ctypes.data], dtype=np.float64)
 
     @cached_property
-    def _system_numbers(self) -> Array:
-        """The numbers of `of`, kept where their address is in use."""
+    def _own_numbers(self) -> Array:
+        """The numbers of the dynamics without, kept where their address is in use."""
         return numbers_of(self.of)
 
-    def _inner(self, states: npt.ArrayLike) -> Array:
+    def _own(self, states: npt.ArrayLike) -> Array:
         """States (..., n) without the last command."""
         return np.asarray(states)[..., : len(self.of.state_coordinates)]
 
     def untouched_body(self, states: Array, state: int) -> str:
-        return self.of.untouched_body(self._inner(states), state) if state < len(self.of.state_coordinates) else ""
+        return self.of.untouched_body(self._own(states), state) if state < len(self.of.state_coordinates) else ""
 
     def softened(self, states: Array) -> Iterator[tuple[str, Dynamics]]:
-        return ((name, LastCommand(softer)) for name, softer in self.of.softened(self._inner(states)))
+        return ((name, LastCommand(softer)) for name, softer in self.of.softened(self._own(states)))
 
     def approaches(self, states: Array, change: Array) -> Iterator[tuple[str, Dynamics, Array]]:
         m = len(self.control_coordinates)
-        for words, dynamics, motion in self.of.approaches(self._inner(states), self._inner(change)):
+        for words, dynamics, motion in self.of.approaches(self._own(states), self._own(change)):
             yield words, LastCommand(dynamics), np.pad(motion, [(0, 0), (0, m)], constant_values=np.nan)
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
-        return self.of._runge_kutta(self._inner(states), controls, dt)
+        return self.of._runge_kutta(self._own(states), controls, dt)
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
         """That of the dynamics; 0 for the last command, which jumps."""
-        return np.pad(self.of.rate(self._inner(state), control), (0, len(self.control_coordinates)))
+        return np.pad(self.of.rate(self._own(state), control), (0, len(self.control_coordinates)))
 
     def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
-        fx, fu = self.of.rate_jacobian(self._inner(state), control)
+        fx, fu = self.of.rate_jacobian(self._own(state), control)
         m = len(self.control_coordinates)
         return np.pad(fx, (0, m)), np.pad(fu, [(0, m), (0, 0)])
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        return np.concatenate([self.of.step(self._inner(state), control, dt), np.asarray(control, dtype=np.float64)])
+        return np.concatenate([self.of.step(self._own(state), control, dt), np.asarray(control, dtype=np.float64)])
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
-        a, b, c = self.of.linearize(self._inner(state), control, dt)
+        a, b, c = self.of.linearize(self._own(state), control, dt)
         m = len(self.control_coordinates)
         return np.pad(a, (0, m)), np.vstack([b, np.eye(m)]), np.pad(c, (0, m))
 
@@ -126,7 +126,7 @@ def with_last_command(problem: Problem) -> Problem:
     begun: Cost
     initial = problem.initial
     if isinstance(initial, FixedState):
-        initial = initial._extended(np.zeros(m))
+        initial = FixedState(np.pad(initial.numbers, (0, m)))
         begun = initial._cost
     else:
         # A weight, which costs nothing: a cost-to-come needs one of each state.
