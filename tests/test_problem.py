@@ -513,6 +513,24 @@ class TestProblemsThatBeginInside:
         with pytest.raises(ls.InputError, match=r"initial: got a start at .* inside obstacle 'ball'"):
             dataclasses.replace(rest, initial=ls.FixedState(place))
 
+    @settings(max_examples=examples(6))
+    @given(away=st.floats(-0.2, 0.2), soft=st.booleans())
+    def test_so_may_those_that_begin_later(self, away: float, soft: bool) -> None:
+        """When an obstacle that moves is where the robot starts."""
+        ball = ls.Obstacle(
+            "ball", "sphere", np.array([-3.0, away, 0.0]), np.eye(3), np.array([0.3, 0.0, 0.0]),
+            velocity=np.array([1.0, 0.0, 0.0]),
+        )  # fmt: skip
+        stated = self.problem()
+        cost = ls.ControlCost([0.1, 0.1]) + ls.ObstacleCost(ls.World([ball]), radius=0.1)
+        start = ls.QuadraticCost([100.0, 100.0], about=[-2.0, 0.0]) if soft else stated.initial
+        later = dataclasses.replace(stated, initial=start, stage_cost=cost).later(1.0)
+        solution = ls.smooth(later, max_iterations=30)
+        assert str(solution).startswith(solution.status.name)
+        assert np.isfinite(ls.smooth(later, noise=self.NOISE, max_iterations=3).cost)
+        with pytest.raises(ls.InputError, match="inside obstacle 'ball'"):
+            dataclasses.replace(later, initial=start)
+
     def test_a_segment_of_which_one_step_is_left_is_part_of_the_next(self) -> None:
         stated = self.problem(segments=[4, 10])
         for after, left in ((0, (4, 10)), (2, (2, 8)), (3, (7,)), (4, (6,)), (8, (2,)), (9, ()), (15, ())):

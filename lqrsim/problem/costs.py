@@ -171,6 +171,7 @@ class Cost(ProblemPart[CostTerm]):
     """One term of a cost."""
 
     _want = "a cost such as QuadraticCost(...) or a sum of costs"
+    _must_be_clear = True  # whether a new problem refuses a start at which it is zero, if that is inside an obstacle
 
     @property
     def name(self) -> str:

@@ -4,7 +4,7 @@ import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -66,7 +66,7 @@ class FixedState:
     """
 
     state: PerEntry
-    _must_be_clear: ClassVar[bool] = True  # of obstacles; see `Problem.from_state`
+    _must_be_clear: ClassVar[bool] = True  # as of an initial cost
 
     def __init__(self, state: PerEntry | None = None, /, **named: float) -> None:
         if not named and (state is None or (isinstance(state, Mapping) and not state)):
@@ -108,6 +108,16 @@ class FixedState:
             return FixedState(space._numbers("FixedState", self.state))
         check_array("initial: FixedState", self.state, (len(space),))
         return self
+
+
+_Start = TypeVar("_Start", bound=Cost | FixedState)
+
+
+def _anywhere(start: _Start) -> _Start:
+    """A start that may be inside an obstacle."""
+    start = copy.copy(start)
+    keep(start, _must_be_clear=False)
+    return start
 
 
 @checked
@@ -211,9 +221,8 @@ class Problem(OneVersion):
                     )
             keep(self, control_limits=(limited.low, limited.high))
         keep(self, control_coordinates=limited, applied_coordinates=limited.within(controls))
-        start, terms = self.start, [cost.kept_clear for cost in self.obstacle_costs]
-        if isinstance(self.initial, FixedState) and not self.initial._must_be_clear:
-            return
+        start = self.start if self.initial._must_be_clear else None
+        terms = [cost.kept_clear for cost in self.obstacle_costs]
         if start is not None and (collision := self._inside(terms, start, self.begin)) is not None:
             where, advice = collision
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
@@ -244,8 +253,7 @@ class Problem(OneVersion):
         """
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
-        start = FixedState(here)
-        keep(start, _must_be_clear=False)
+        start = _anywhere(FixedState(here))
         if isinstance(self.initial, FixedState):  # four times as fast as a new cost
             term = about_state(self._terms["initial"][0], here)
         else:
@@ -285,13 +293,13 @@ class Problem(OneVersion):
 
     @checked
     def later(self, seconds: Finite) -> "Problem":
-        """The same problem with a later beginning: moving obstacles are at their positions at that time, and costs and
-        constraints with a row for each knot begin with a later one and repeat the last.
+        """The same problem with a later beginning: moving obstacles are at their positions at that time, also where the
+        robot starts; costs and constraints with a row for each knot begin with a later one and repeat the last.
 
         Args:
           seconds: the delay in seconds; with such costs or constraints, a multiple of dt.
         """
-        other = self._with(begin=self.begin + seconds)
+        other = self._with(begin=self.begin + seconds, initial=_anywhere(self.initial))
         if any(term.by_knot for term in (*terms_of(self.stage_cost), *self.constraints)):
             steps = round(seconds / self.dt)
             if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
