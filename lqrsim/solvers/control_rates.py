@@ -73,10 +73,7 @@ def feedback(
 ) -> tuple[AffinePolicy, Quadratic | None]:
     """A policy about a plan, and its cost-to-go: those of the problem with the quadratic in place of the rates' cost.
 
-    Without feedback, if there is none.
-
-    Args:
-      plan: the plan, with the last command among its states. multipliers: of its constraints.
+    Without feedback, if there is none. The states of the plan have the last command.
     """
     states, controls = _narrow(plan, problem).states, plan.controls
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None

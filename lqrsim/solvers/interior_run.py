@@ -164,12 +164,14 @@ class InteriorRun:
         lagrangian.evaluate(work.best)
         with self._budget.joined_with_last(NAME):
             if has_curvature(self._problem):
-                result = self._newton(lagrangian, interior.scale)
-                for _ in range(UPDATES):
-                    if lagrangian.kept or not result.success:
+                updates = 0
+                while True:
+                    result = self._run.newton(added=lagrangian.added(), least=interior.scale)
+                    lagrangian.evaluate(result.plan)
+                    if lagrangian.kept or not result.success or updates == UPDATES:
                         break
                     lagrangian.update(growth=1.0)
-                    result = self._newton(lagrangian, interior.scale)
+                    updates += 1
                 if not (result.success and lagrangian.kept):  # as where no other plan takes as little time
                     work.set_best(plan, cost)
                     result = self._ended_inside(lagrangian, interior)
@@ -217,12 +219,6 @@ class InteriorRun:
             presses = known > record.penalty * (numbers - record.margin)  # other forces are remnants of the barrier
             acts = np.isfinite(numbers) & (record.term.equality | presses)
             record.values[...] = np.where(acts, force, 0.0).ravel()
-
-    def _newton(self, lagrangian: AugmentedLagrangian, scale: float) -> RunResult:
-        """Run Newton's method from the plan in memory, with these multipliers, to an optimality relative to `scale`."""
-        result = self._run.newton(added=lagrangian.added(), least=scale)
-        lagrangian.evaluate(result.plan)
-        return result
 
     def _pressing(
         self, lagrangian: AugmentedLagrangian, interior: InteriorResult, result: RunResult

@@ -183,11 +183,7 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
 
 
 def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
-    """Constant controls (m,) under which all states are finite, and the plans that they make.
-
-    Args:
-      problem: one that names a start.
-    """
+    """Constant controls (m,) under which all states from a start are finite, and the plans that they make."""
     space, nominal, start = problem.control_coordinates, problem.nominal_control, problem.start
     assert start is not None
     m, steps = len(nominal), problem.steps
@@ -206,18 +202,19 @@ def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
 def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
     """Plans in which one control at a time is away from its nominal value, for a part of the time: names, controls.
 
-    Args:
-      problem: one that names a start.
+    There are none without a start.
     """
     space, start, steps = problem.applied_coordinates, problem.start, problem.steps
+    if start is None:
+        return
     low, high = space.limits
     nominal = np.broadcast_to(problem.nominal_controls, (steps, len(low)))
-    gain = np.zeros((steps, len(low), len(nominal[0]) if start is None else len(start)))
+    gain = np.zeros((steps, len(low), len(start)))
     for i, side, fraction, duration in itertools.product(range(len(low)), (high, low), PUSHED, PARTS):
         change = fraction * np.where(np.isfinite(side[i]), side[i] - nominal[:, i], 1.0 if side is high else -1.0)
         controls = nominal.copy()
         controls[:, i] += np.where(np.arange(steps) < duration * steps, change, 0.0)
-        if start is not None and change.any():
+        if change.any():
             plan = compiled.rollout(problem, gain, controls, start.copy())
             if np.isfinite(plan.states).all():
                 yield f"a push by {space.names[i]}", controls, plan

@@ -198,13 +198,13 @@ class Stages:
     def values(self, plan: Motion) -> Array:
         """The rows' values (T+1, R); undefined for rows that do not act."""
         numbers = np.empty(self.live.shape)
-        self.call("read_rows", self.about, _ordered(plan), numbers.reshape(-1))
+        self.call("read_rows", self.about, Motion(*map(in_c_order, plan)), numbers.reshape(-1))
         return numbers
 
     def trial(self, plan: Motion) -> tuple[float, Array]:
         """The cost of a plan, and the states at the ends of its steps, (T, n)."""
         arrived = np.empty((self.steps, self.n))
-        return self.call("evaluate_plan", self.about, _ordered(plan), arrived), arrived
+        return self.call("evaluate_plan", self.about, Motion(*map(in_c_order, plan)), arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
         """Compute the models about a plan, with costates (T+1, n) and multipliers (T+1, R).
@@ -231,7 +231,7 @@ class Stages:
 
         Determines which rows act, and which variables each depends on, from slopes at the plan and near it.
         """
-        return self.sized(self.call("determine_scales", self.about, _ordered(plan)))
+        return self.sized(self.call("determine_scales", self.about, Motion(*map(in_c_order, plan))))
 
     def sized(self, cost: float) -> Sizes:
         """The sizes that a kernel has just written, with the cost that it returned."""
@@ -299,8 +299,3 @@ def _shape(problem: Problem) -> _Shape:
     space, counts = problem.control_coordinates, tuple(term.rows for term in problem.constraint_terms)
     lower, upper = (tuple(np.flatnonzero(np.isfinite(side)).tolist()) for side in (space.low, space.high))
     return len(problem.dynamics.state_coordinates), len(space), problem.steps, counts, lower, upper
-
-
-def _ordered(plan: Motion) -> Motion:
-    """A plan in the order that kernels need."""
-    return Motion(*map(in_c_order, plan))

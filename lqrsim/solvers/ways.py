@@ -62,11 +62,7 @@ class Headings(NamedTuple):
 
 
 def ways(problem: Problem, stages: Stages) -> Iterator[Way]:
-    """Ways from start to goal, the straight line first; none without a start and a goal, or if they are the same.
-
-    Args:
-      problem: a problem of fixed duration. stages: its stages.
-    """
+    """Ways from start to goal in a fixed duration, the straight line first; none without two different ends."""
     start, goal, space = problem.start, problem.weighed_goal, problem.dynamics.state_coordinates
     if start is None or goal is None:
         return
