@@ -171,7 +171,7 @@ def test_the_second_search_may_begin_within_an_obstacle(differential_drive) -> N
     x, y, _ = pillar.position
     of = differential_drive.problem.from_state((x + 0.1, y, np.pi / 2))
     with pytest.raises(ls.InputError, match="pillar_1"):
-        replace(of)
+        replace(of, initial=ls.FixedState(of.initial.numbers))
     harder, (weight,), (final,) = reweighted(of, 10.0), of.obstacle_costs, [of.final_cost]
     assert [one.weight for one in harder.obstacle_costs] == [10 * weight.weight]
     np.testing.assert_array_equal(harder.final_cost.terms[0].weight, 10 * final.weight)  # pyright: ignore[reportAttributeAccessIssue]
