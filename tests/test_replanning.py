@@ -148,7 +148,7 @@ class TestPreparedSolver:
         changed = problem(weight=1.0, limit=limit)
         policy = solver.solve(solution.trajectory.states[0], solution, problem=changed).policy
         assert policy.control_coordinates == changed.applied_coordinates
-        assert np.abs(policy(stated.start + 100.0, 0.0)).max() <= limit
+        assert np.abs(policy(solution.trajectory.states[0] + 100.0, 0.0)).max() <= limit
 
     def test_an_obstacle_that_comes_into_the_way_is_gone_round(self) -> None:
         """A car on a plan 6 m long meets a ball whose centre is on it; there is a way round each of them.
