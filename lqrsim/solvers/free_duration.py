@@ -297,10 +297,8 @@ class DurationSearch:
 
     def _finished(self, ordinary: Problem, result: InteriorResult) -> Solution:
         """What becomes of a plan with its duration held. The log begins with that of the search for it."""
-        m, n = result.plan.controls.shape[1], result.plan.states.shape[1]
-        summary = f"a plan of {ordinary.steps * ordinary.dt:.6g} s"
-        gain, log = np.zeros((ordinary.steps, m, n)), tuple(self._log)
-        guess = InitialGuess(gain, result.plan.controls, summary, interior=result, log=log)
+        summary, gain = f"a plan of {ordinary.steps * ordinary.dt:.6g} s", np.zeros_like(result.gain)
+        guess = InitialGuess(gain, result.plan.controls, summary, interior=result, log=tuple(self._log))
         return self._solved(ordinary, replace(self._settings, starts=None, start=guess))
 
     def _described(self, solution: Solution) -> Solution:

@@ -20,7 +20,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Motion
+from lqrsim.kernels.records import CostToCome, Motion
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.results.solution_parts import Trajectory
@@ -88,9 +88,8 @@ def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Sto
     start, goal = ends
     planner, draws = LocalPlanner(problem, start, goal, LONGEST[seed % len(LONGEST)]), np.random.default_rng(seed)
     turn = np.zeros(len(goal))
-    turn[list({i for constraint in problem.constraints for i in constraint._turning_states(problem.dynamics)})] = (
-        2 * np.pi
-    )
+    for constraint in problem.constraints:
+        turn[list(constraint._turning_states(problem.dynamics))] = 2 * np.pi
     goals = np.unique([goal, goal + turn, goal - turn], axis=0)
     trees = Tree(planner, start[None], 1, extensions), Tree(planner, goals, -1, extensions)
     for count in range(0, extensions, 2):
@@ -155,10 +154,9 @@ class LocalPlanner:
             constraint for constraint, term in pairs if not (term.final_only or term.uses_control or term.equality)
         ]
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
-        for i, (least, most) in (
-            pair for constraint in still for pair in constraint.state_bounds(problem.dynamics).items()
-        ):
-            low[i], high[i] = max(low[i], np.max(least)), min(high[i], np.min(most))
+        for constraint in still:
+            for i, (least, most) in constraint.state_bounds(problem.dynamics).items():
+                low[i], high[i] = max(low[i], np.max(least)), min(high[i], np.min(most))
         half = (np.array(controls.high) - controls.low) / 2
         effort = ControlCost(1 / np.where(np.isfinite(half), half, 1.0) ** 2, about=problem.nominal_control)
         free = problem._with(
@@ -221,11 +219,9 @@ class LocalPlanner:
         bad = ~(values >= -TOLERANCE).all(axis=1)
         return (int(np.argmax(bad)) + 1) // 2 if bad.any() else len(states)
 
-    def _come(self, state: Array, sign: int) -> tuple[Array, Array, Array]:
-        """The cost-to-come about the nominal control: covariances (K+1, n, n), means (K+1, n) and constants (K+1,)."""
-        run = self._smoothed(state, sign, int(self.arrivals[-1]), 1, None)
-        covariance, mean, constant = run.work.arrays.to_come
-        return covariance, mean, constant
+    def _come(self, state: Array, sign: int) -> CostToCome:
+        """The cost-to-come about the nominal control, at up to as many steps as an extension may take."""
+        return self._smoothed(state, sign, int(self.arrivals[-1]), 1, None).work.arrays.to_come
 
     def _smoothed(self, state: Array, sign: int, steps: int, iterations: int, target: Array | None) -> SolveRun:
         """A run after so many iterations, whose memory the next one overwrites."""
