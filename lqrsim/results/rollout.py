@@ -201,10 +201,8 @@ class Rollout:
         if self.tube is not None:
             size = len(self.state_coordinates.position)
             if self.tube.shape[1] != size or not size:
-                wanted = (
-                    f"{size} by {size} matrices, as the position has entries" if size else "None without a position"
-                )
-                raise InputError(f"Rollout: tube: got shape {self.tube.shape}, want {wanted}")
+                want = f"{size} by {size} matrices, as the position has entries" if size else "None without a position"
+                raise InputError(f"Rollout: tube: got shape {self.tube.shape}, want {want}")
             check_symmetric("Rollout: tube", self.tube)
             negative = np.linalg.eigvalsh(self.tube)[:, 0] < -1e-9 * np.abs(self.tube).max(axis=(1, 2))
             if negative.any():

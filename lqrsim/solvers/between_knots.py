@@ -193,7 +193,7 @@ def solve_between_knots(
             if solution.violation <= tolerance and failed % 2:  # it is only not at its best
                 solution = again(solution)
             else:  # another way than the last plan's
-                rows = [constraint_rows.everywhere() for constraint_rows in rows]
+                rows = [added.everywhere() for added in rows]
                 solution = solve(_with_rows_within(problem, replace(at_knots, dt=problem.dt), rows), settings)
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
@@ -220,10 +220,8 @@ def solve_between_knots(
             finer = at_knots.dynamics.with_substeps(_substeps(at_knots, errors.step_error / problem.accuracy))
             at_knots = replace(at_knots, dynamics=finer)
         if missed:
-            rows = [
-                constraint_rows.against(worst, tolerance)
-                for constraint_rows, worst in zip(rows, errors.worst, strict=True)
-            ]
+            pairs = zip(rows, errors.worst, strict=True)
+            rows = [added.against(worst, tolerance) for added, worst in pairs]
         solution = again(solution)
         rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
     ordinary = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)
@@ -238,11 +236,7 @@ def solve_between_knots(
 def _with_rows_within(problem: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
     """The problem with rows within its periods beside the constraints that are asked."""
     pairs = zip(problem.constraints, rows, strict=True)
-    within = [
-        WithinPeriods(constraint, *constraint_rows)
-        for constraint, constraint_rows in pairs
-        if constraint_rows.acts.any()
-    ]
+    within = [WithinPeriods(constraint, *added) for constraint, added in pairs if added.acts.any()]
     return at_knots.with_constraints([*problem.constraints, *within])
 
 

@@ -193,9 +193,8 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
             value = Quadratic(hessian, check_array("start: cost_to_go.gradient", value.gradient, (steps + 1, n)),
                               check_array("start: cost_to_go.constant", value.constant, (steps + 1,)))  # fmt: skip
         multipliers = start.multipliers
-        if [known.values.shape for known in multipliers] != [
-            (steps + 1, term.rows) for term in problem.constraint_terms
-        ]:
+        shapes = [(steps + 1, term.rows) for term in problem.constraint_terms]
+        if [known.values.shape for known in multipliers] != shapes:
             multipliers = ()  # they belong to other constraints
         summary = _summary(start, policy.gain, policy.offset)
         return InitialGuess(policy.gain, policy.offset, summary, value, multipliers=multipliers)

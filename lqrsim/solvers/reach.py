@@ -99,9 +99,9 @@ def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterat
 
     The goals of the body itself are left out of the constraints, as it does not move there.
     """
-    for words, dynamics, about in problem.dynamics.approaches(
-        result.states, missing(problem, result.states[-1], places)
-    ):
+    constraints = [part for part in problem.constraints if not part.final_states(problem.dynamics)]
+    shortfall = missing(problem, result.states[-1], places)
+    for words, dynamics, about in problem.dynamics.approaches(result.states, shortfall):
         drawn = ~np.isnan(about)
         ways = np.where(drawn, about, -np.inf).max(axis=0) - np.where(drawn, about, np.inf).min(axis=0)
         ways = np.maximum(ways, LEAST_WAY * ways.max())
@@ -109,9 +109,6 @@ def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterat
         stage = problem.stage_cost + QuadraticCost(
             drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
         )
-        constraints = [
-            constraint for constraint in problem.constraints if not constraint.final_states(problem.dynamics)
-        ]
         yield words, replace(problem, dynamics=dynamics, constraints=constraints).with_costs(stage_cost=stage)
 
 

@@ -458,10 +458,8 @@ class Search:
         A manoeuvre, such as to drive on and back, is found more often where nothing is in the way of its first plans.
         """
         problem = self._problem
-        constraints = [
-            constraint for constraint, passed in zip(problem.constraints, passable(problem), strict=True) if not passed
-        ]
-        _, best = self._searched(problem.with_constraints(constraints))
+        pairs = zip(problem.constraints, passable(problem), strict=True)
+        _, best = self._searched(problem.with_constraints([constraint for constraint, passed in pairs if not passed]))
         if best.success and not self._budget.stop.due:
             self._known.from_start = False
             name = "a plan without what is in the way"

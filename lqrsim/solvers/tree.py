@@ -150,9 +150,7 @@ class LocalPlanner:
         self.arrivals = np.unique(np.ceil(np.linspace(0, min(longest, problem.steps), ARRIVALS + 1)[1:]).astype(int))
         self.controls = len(controls)
         pairs = zip(problem.constraints, problem.constraint_terms, strict=True)
-        still = [
-            constraint for constraint, term in pairs if not (term.final_only or term.uses_control or term.equality)
-        ]
+        still = [part for part, term in pairs if not (term.final_only or term.uses_control or term.equality)]
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
         for constraint in still:
             for i, (least, most) in constraint.state_bounds(problem.dynamics).items():
