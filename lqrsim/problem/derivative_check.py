@@ -162,7 +162,8 @@ def check_derivatives(
     checks_by_name: dict[str, list[DerivativeCheck]] = {}
     checks = [_of_dynamics(dynamics, points, tolerance)]
     if isinstance(subject, Problem):
-        checks += [_of_costs(subject, points, tolerance), _of_constraints(subject, points, tolerance)]
+        names = *dynamics.state_coordinates.names, *dynamics.control_coordinates.names
+        checks += [_of_costs(subject, names, points, tolerance), _of_constraints(subject, names, points, tolerance)]
     with np.errstate(all="ignore"):
         for check in itertools.chain(*checks):
             checks_by_name.setdefault(check.what, []).append(check)
@@ -184,19 +185,15 @@ def _of_dynamics(dynamics: Dynamics, points: _Points, tolerance: float) -> Itera
             ("df/dx", states, fx, np.s_[:n]),
             ("df/du", controls, fu, np.s_[n:]),
         ):
-            differences = joint[:, columns], noise[:, columns]
-            yield _worst_entry(
-                f"{derivative} of {dynamics.name}", states, names, slopes, differences, (x, u), tolerance
-            )
+            what, differences = f"{derivative} of {dynamics.name}", (joint[:, columns], noise[:, columns])
+            yield _worst_entry(what, states, names, slopes, differences, (x, u), tolerance)
 
 
-def _of_costs(problem: Problem, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
-    states, controls = problem.dynamics.state_coordinates.names, problem.dynamics.control_coordinates.names
-    names = (*states, *controls)
+def _of_costs(problem: Problem, names: Sequence[str], points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
     for cost, term in _terms(problem):
         if len(term.functions) == 1 and term.exact_hessian:
             continue  # a function without derivatives uses central differences already
-        plain = PlainTerm(term, len(states), len(controls))
+        plain = PlainTerm(term, *map(len, points[0]))
         for x, u in points:
             z = np.concatenate([x, u])
             _, gradient, hessian = plain.cost(z)
@@ -207,11 +204,11 @@ def _of_costs(problem: Problem, points: _Points, tolerance: float) -> Iterator[D
                 yield _worst_entry(f"Hessian of {cost}", names, names, hessian, curvature, (x, u), tolerance)
 
 
-def _of_constraints(problem: Problem, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
-    states, controls = problem.dynamics.state_coordinates.names, problem.dynamics.control_coordinates.names
-    names = (*states, *controls)
+def _of_constraints(
+    problem: Problem, names: Sequence[str], points: _Points, tolerance: float
+) -> Iterator[DerivativeCheck]:
     for term in problem.constraint_terms:
-        plain = PlainTerm(term, len(states), len(controls))
+        plain = PlainTerm(term, *map(len, points[0]))
         for row, (x, u) in itertools.product(range(term.rows), points):
             z = np.concatenate([x, u])
             differences = _differences(lambda z, of=plain, row=row: np.array([of.value(z, row)]), z)
