@@ -520,6 +520,25 @@ def test_help_of_a_narrow_terminal_ends(
     assert os.environ["COLUMNS"] == str(columns)
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        *((f"view quadrotor {option}", option) for option in ("--trial 1", "--no-loop")),
+        *((f"view run.npz {option}", option) for option in ("--disturbances 1", "--seed 3", "--push 1", "--replan 30")),
+        ("verify run.npz --run other.npz", "--run"),
+        *(
+            (f"bridge a.npz --odometry /o --commands /c --robot {option}", option)
+            for option in ("--safe 0 0", "--lockstep", "--seconds 1", "--lost-after 1")
+        ),
+        ("bridge a.npz --odometry /o --commands /c --safe 0 --scenario quadrotor", "--scenario"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(words: str, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before anything is read or solved."""
+    assert main(words.split()) == 2
+    assert capsys.readouterr().err.startswith(f"lqrsim: error: {option.split()[0].replace('no-', '')}: got ")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder in which a process works")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_working_folder_that_was_removed_is_one_line(

@@ -5,7 +5,7 @@ import importlib.util
 import keyword
 import shlex
 import shutil
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import Json, optional, options_of, stated
+from lqrsim.commands.options import Json, optional, options_of, refuse, stated
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
@@ -111,12 +111,7 @@ class Export:
         if (self.c is None) == (self.minari is None):
             raise ls.InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
         unused, target = (OF_C, "--c") if self.c is None else (OF_MINARI, "--minari")
-        if misplaced := [
-            field.name for field in fields(self) if field.name in unused and getattr(self, field.name) != field.default
-        ]:
-            raise ls.InputError(
-                f"--{misplaced[0]}: got {getattr(self, misplaced[0])} without {target}, want it with that"
-            )
+        refuse(self, unused, f"without {target}, want it with that")
         if self.c is not None:
             self._to_c(self.c)
         if self.minari is not None:

@@ -3,8 +3,8 @@
 import ast
 import inspect
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from types import NoneType
@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+import lqrsim as ls
 
 NO_DEFAULT: Any = {"help_behavior_hint": ""}
 Command = TypeVar("Command")
@@ -148,6 +150,20 @@ def stated(command: Any, function: Callable[..., Any], **others: Any) -> dict[st
     """The options of a command that a function or a record takes, by name; and others, in place of those."""
     names = inspect.signature(function).parameters
     return {name: getattr(command, name) for name in names if hasattr(command, name)} | others
+
+
+def changed(command: Any) -> dict[str, Any]:
+    """The options of a command that are not at their defaults, by the names of its fields, and their values."""
+    values = {field.name: (getattr(command, field.name), field.default) for field in fields(command)}
+    return {name: value for name, (value, default) in values.items() if value != default}
+
+
+def refuse(command: Any, names: Collection[str], why: str) -> None:
+    """Raise InputError if one of these options was given, which would be ignored; `why` ends the message."""
+    for name, value in changed(command).items():
+        if name in names:
+            got = f"{value:g}" if type(value) is float else value
+            raise ls.InputError(f"--{name.replace('_', '-')}: got {got} {why}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,17 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import as_json, console
-from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, Strength, optional, options_of, stated
+from lqrsim.commands.options import (
+    ControllerName,
+    DesignSet,
+    Folder,
+    Json,
+    Strength,
+    optional,
+    options_of,
+    refuse,
+    stated,
+)
 
 if TYPE_CHECKING:
     from lqrsim.solvers.initial_guess import StartLike
@@ -300,7 +310,9 @@ class Bridge:
             raise ls.InputError(f"--names: got {' '.join(self.names)}, want pairs such as theta=heading")
         names = {state: name for state, _, name in pairs}
         if self.robot:
+            refuse(self, ("safe", "lockstep", "seconds", "lost_after"), "with --robot, want it without")
             return self._be_robot(names)
+        refuse(self, ("scenario",), "without --robot, want it with that")
         if not self.safe:
             raise ls.InputError("--safe: got none, want the command for a robot that nobody controls, such as 0 0 0 0")
         policy: Any = ls.load(self.policy)

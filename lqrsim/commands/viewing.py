@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,7 +11,17 @@ from tyro.conf import Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional, options_of, stated
+from lqrsim.commands.options import (
+    ControllerName,
+    DesignSet,
+    Json,
+    SolutionFile,
+    changed,
+    optional,
+    options_of,
+    refuse,
+    stated,
+)
 from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -104,7 +114,7 @@ class Render:
         # Whoever opens such a file chooses the camera and the time.
         is_page = kind == ".html"
         accepted = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if is_page else [])]
-        others = [f"--{f.name}" for f in fields(self) if f.name not in accepted and getattr(self, f.name) != f.default]
+        others = [f"--{name}" for name in changed(self) if name not in accepted]
         several = max(len(self.rollouts), len(self.solution), len(self.funnel)) > 1
         if others or several or not (is_page or self.trial is None or len(self.trial) == 1):
             kinds = "runs, solutions or funnels" if is_page else "runs, trials or funnels, or none"
@@ -118,6 +128,10 @@ class Render:
 def _one_or_all(items: Sequence[Any]) -> Any:
     """A single item itself; None for no items."""
     return items[0] if len(items) == 1 else items or None
+
+
+OF_LIVE_RUNS = "controller", "design_disturbances", "solution", "replan", "disturbances", "seed", "push"
+OF_RECORDED_RUNS = "trial", "loop"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,16 +190,14 @@ class View:
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
-            for name in ("controller", "design_disturbances", "solution", "replan"):
-                if (value := getattr(self, name)) not in (None, "feedback"):
-                    option, got = name.replace("_", "-"), f"{value:g}" if isinstance(value, float) else value
-                    raise ls.InputError(f"--{option}: got {got} with {self.what}, want it with a SCENARIO")
+            refuse(self, OF_LIVE_RUNS, f"with {self.what}, want it with a SCENARIO")
             rollout = ls.load(self.what, ls.Rollout)
             arguments = viewer.arguments_for_rollout(rollout, self.trial)
 
             def go(screen: "Viewer") -> None:
                 viewer.play(rollout, screen, trial=self.trial, loop=self.loop)
         else:
+            refuse(self, OF_RECORDED_RUNS, f"with {self.what}, want it with a RUN.npz")
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
             solution = (
@@ -280,6 +292,8 @@ class Verify:
         from lqrsim.verify.checks import ran_policy_of, run_beside
 
         is_run = self.file.suffix.lower() == ".npz"
+        if is_run and self.run_file is not None:
+            raise ls.InputError(f"--run: got {self.run_file} with {self.file}, want it with a VIDEO.mp4")
         path = self.file if is_run else self.run_file or run_beside(self.file)
         rollout, beside = ls.load(path, ls.Rollout), path.with_name("solution.npz")
         solution = None
