@@ -1,5 +1,6 @@
 """A URDF as a robot: its equations of motion, its motors, its meshes, and what is said of what it lacks."""
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,13 @@ def test_pinocchio_has_the_same_equations(tmp_path_factory: pytest.TempPathFacto
     upper = np.triu(pinocchio.crba(other, data, q))
     mass, bias = upper + np.triu(upper, 1).T, pinocchio.nonLinearEffects(other, data, q, v)
     close(forces_of(robot, qpos, qvel), (mass[np.ix_(columns, columns)], bias[columns]))
+
+
+def test_any_path_of_a_file_will_do(arm: Path) -> None:
+    """As for an MJCF; those of `os.scandir` are no `Path`."""
+    (entry,) = os.scandir(arm.parent)
+    for path in (entry, arm, str(arm)):
+        assert ls.MjcfRobot(path).actuators == ("shoulder", "elbow", "grip")
 
 
 def test_joints_with_an_effort_have_a_motor_and_links_keep_their_names(arm: Path) -> None:

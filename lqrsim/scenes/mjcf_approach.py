@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_kinematics import colliding
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_obstacles import touching_pairs
 from lqrsim.scenes.mujoco_log import unlogged
@@ -37,7 +38,7 @@ class Approaches:
     Positions are in the form of states, NaN where the robot is free to move otherwise.
 
     Args:
-      states: (T+1, n) of a plan in which nothing touches the body. moves: (nv,) by how much the positions of the body
+      states: (T+1, n) of a plan in which nothing touches the body. change: (nv,) by how much the positions of the body
         are to change until the end.
 
     Attributes:
@@ -53,8 +54,7 @@ class Approaches:
         carried: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)  # what the body carries, with it
         for body in range(model.nbody):  # parents come first
             carried[body] = body == root or (body > 0 and carried[model.body_parentid[body]])
-        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        self.body_geoms = np.flatnonzero(carried[model.geom_bodyid] & collides).tolist()
+        self.body_geoms = np.flatnonzero(carried[model.geom_bodyid] & colliding(model)).tolist()
         self._place(self._positions[0])
         driven = np.unique(model.dof_treeid[self._data.moment_colind[: self._data.moment_rownnz.sum()]])
         self._dofs = np.isin(model.dof_treeid, driven) & ~carried[model.dof_bodyid]

@@ -48,6 +48,11 @@ def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
     return [(model.body(first).name, model.body(second).name) for first, second in pairs]
 
 
+def colliding(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
+    """Flags (ngeom,) of the geoms that can collide, by contype or conaffinity."""
+    return (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+
+
 def leaders_of(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
     """Which degrees of freedom (nv,) are those of joints that others follow by an equality, and that follow none."""
     joints = np.flatnonzero(model.eq_active0 & (model.eq_type == mujoco.mjtEq.mjEQ_JOINT.value))
@@ -166,6 +171,13 @@ def axes_of(quaternion: Array) -> Array:
     return axes.reshape(3, 3)
 
 
+def quaternion_of(rotation: Array) -> Array:
+    """The quaternion (4,) of a rotation (3, 3) or (9,), scalar first."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    return quaternion
+
+
 def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
     """The body of a tree's geom that is farthest out at rest, the geom's place (3,) on it and bounding radius in m."""
     data = placed(model)
@@ -182,8 +194,7 @@ def reach_of(model: mujoco.MjModel, body: int) -> float:
 
     If no geom collides, the visual geoms count instead.
     """
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    collides &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+    collides = colliding(model) & (model.body_rootid[model.geom_bodyid] == model.body_rootid[body])
     reach = 0.0
     for geom in np.flatnonzero(collides).tolist() if collides.any() else range(model.ngeom):
         if (path := path_to(model, geom, body)) is not None:

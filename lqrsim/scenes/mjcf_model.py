@@ -16,6 +16,7 @@ import numpy.typing as npt
 from lqrsim import rotations
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_name, check_number
+from lqrsim.scenes.mjcf_kinematics import axes_of, colliding, quaternion_of
 from lqrsim.scenes.mjcf_text import SPEED_LIMIT, UNNAMED, model_from_xml, read_mjcf, spec_of
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.urdf import is_urdf, read_urdf
@@ -204,15 +205,15 @@ class MjcfModel:
             size, center = model.geom_size[geom], model.geom_pos[geom] - start
             if np.linalg.norm(np.cross(center, axis)) > _ROUND * size[0]:
                 return False
-            kind, turned = mujoco.mjtGeom(model.geom_type[geom]), np.empty(9)
+            kind = mujoco.mjtGeom(model.geom_type[geom])
             if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
                 return True
             if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID and size[0] != size[1]:
                 return False
-            mujoco.mju_quat2Mat(turned, model.geom_quat[geom])
-            return kind in _OF_REVOLUTION and abs(float(turned[2::3] @ axis)) > 1 - _ROUND
+            turned = axes_of(model.geom_quat[geom])[:, 2]
+            return kind in _OF_REVOLUTION and abs(float(turned @ axis)) > 1 - _ROUND
 
-        geoms = np.flatnonzero((model.geom_bodyid == body) & ((model.geom_contype | model.geom_conaffinity) != 0))
+        geoms = np.flatnonzero((model.geom_bodyid == body) & colliding(model))
         return len(geoms) > 0 and all(is_round(geom) for geom in geoms.tolist())
 
     @cached_property
@@ -330,12 +331,10 @@ class MjcfModel:
             numbers += [Number("mass", "", sum(masses.values()))] if masses else []
             numbers += [Number("mass", name, mass) for name, mass in masses.items()]
         for number in range(model.njnt):
-            name, dof = model.joint(number).name, int(model.jnt_dofadr[number])
-            if name in elements["joint"]:
-                values = {key: getattr(model, f"dof_{key}")[dof] for key in _NUMBERS if key != "stiffness"}
-                values["stiffness"] = model.jnt_stiffness[number]
-                numbers += [Number(key, name, float(values[key])) for key in _NUMBERS]
-        for number in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
+            joint = model.joint(number)
+            if joint.name in elements["joint"]:
+                numbers += [Number(key, joint.name, float(getattr(joint, key)[0])) for key in _NUMBERS]
+        for number in np.flatnonzero(colliding(model)):
             if (name := model.geom(number).name) in elements["geom"]:
                 numbers.append(Number("friction", name, float(model.geom_friction[number, 0])))
         for number, gear in enumerate(model.actuator_gear[model.actuator_outadr]):
@@ -500,12 +499,10 @@ class MjcfModel:
                 raise InputError(f"moving: got {obstacle.name}, a {obstacle.kind}, want one of: {', '.join(drawn)}")
             if obstacle.name in geom_names:
                 raise InputError(f"moving: got {obstacle.name}, which is a geom of the robot's MJCF, want another name")
-            turn = np.zeros(4)
-            mujoco.mju_mat2Quat(turn, obstacle.rotation.ravel())
             size = np.minimum([0.0, 0.0, 1.0] if obstacle.kind == "plane" else obstacle.size, _LONG)
             attributes = {"name": obstacle.name, "type": obstacle.kind, "contype": "0", "conaffinity": "0"}
             geom = ElementTree.SubElement(section, "geom", attributes)
-            for key, values in (("size", size), ("pos", obstacle.position), ("quat", turn)):
+            for key, values in (("size", size), ("pos", obstacle.position), ("quat", quaternion_of(obstacle.rotation))):
                 _set(geom, key, values)
         return self._of(root)
 

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Finite, checked
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_kinematics import placed, posed
+from lqrsim.scenes.mjcf_kinematics import colliding, placed, posed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -152,8 +152,8 @@ def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int6
 def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
     """Ids of the moving geoms that can collide; of all moving geoms if none can."""
     moves = model.body_weldid[model.geom_bodyid] != 0
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    return np.flatnonzero(moves & collides) if (moves & collides).any() else np.flatnonzero(moves)
+    solid = moves & colliding(model)
+    return np.flatnonzero(solid if solid.any() else moves)
 
 
 def levers(model: mujoco.MjModel) -> Array:

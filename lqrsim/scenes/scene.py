@@ -25,7 +25,7 @@ import numpy as np
 
 from lqrsim.annotations import Want, checked
 from lqrsim.errors import Array, InputError, check_count, check_items, check_name, excerpt, free_name
-from lqrsim.scenes.mjcf_kinematics import placed
+from lqrsim.scenes.mjcf_kinematics import colliding, placed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco
 from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
@@ -157,9 +157,7 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     """Ids of the geoms that are obstacles by the module's rule, in the order of `Scene.world`."""
     if model.opt.disableflags & (_FLAGS.mjDSBL_CONTACT | _FLAGS.mjDSBL_CONSTRAINT):
         return []
-    fixed = model.body_weldid[model.geom_bodyid] == 0
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    return np.flatnonzero(fixed & collides).tolist()
+    return np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & colliding(model)).tolist()
 
 
 def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str] = (*KINDS, *OTHER_KINDS)) -> Scene:

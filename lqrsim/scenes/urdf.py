@@ -79,7 +79,10 @@ def read_urdf(
 
 def is_urdf(path: object) -> bool:
     """Whether it is the path of a URDF."""
-    return os.fspath(path).lower().endswith(SUFFIX) if isinstance(path, str | Path) else False
+    try:
+        return check_path("URDF", path).suffix.lower() == SUFFIX
+    except InputError:
+        return False
 
 
 def _parsed(path: Path) -> ElementTree.Element:

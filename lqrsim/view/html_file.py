@@ -25,6 +25,7 @@ from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.scenes.mjcf_kinematics import quaternion_of
 from lqrsim.view.cameras import camera_view
 from lqrsim.view.options import OVERLAYS
 from lqrsim.view.overlays import (
@@ -39,7 +40,7 @@ from lqrsim.view.overlays import (
     error_colours,
     legend_entries,
 )
-from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms, in_bytes, quaternion_of, rows_of
+from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms, in_bytes, rows_of
 
 ASPECTS = 1.6, 0.6  # of a screen and of a telephone; the page begins with the overview for the nearer one
 LEVELS = np.iinfo(np.uint16).max

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Index, checked
 from lqrsim.errors import Array, InputError, check_items
 from lqrsim.results.rollout import BallRecord, Rollout
-from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
+from lqrsim.scenes.mjcf_kinematics import axes_of, colliding, in_axes_of_bodies
 from lqrsim.scenes.mjcf_text import model_from_xml
 
 ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
@@ -216,7 +216,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> Array:
 def hide_hulls(model: mujoco.MjModel) -> None:
     """Do not draw colliding meshes of bodies that have other meshes, only for drawing, in the same place."""
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    collides = colliding(model)
     drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < SHOWN_GROUPS)].tolist())
     for geom in np.flatnonzero(is_mesh & collides).tolist():
         if int(model.geom_bodyid[geom]) in drawn:
@@ -237,10 +237,9 @@ def drawn_size(model: mujoco.MjModel, rollout: Rollout, robot: int) -> float:
     The radius of a robot with arms is their reach. If it is more than ARMS times the half width of the robot's own
     body, along the axes in which it is seen, the half width is taken.
     """
-    axes, reach, rotation = (2 if rollout.state_coordinates.from_above else 3), 0.0, np.zeros(9)
+    axes, reach = (2 if rollout.state_coordinates.from_above else 3), 0.0
     for geom in np.flatnonzero(model.geom_bodyid == robot) if rollout.state_coordinates.position else ():
-        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        turn, (middle, half) = rotation.reshape(3, 3), model.geom_aabb[geom].reshape(2, 3)
+        turn, (middle, half) = axes_of(model.geom_quat[geom]), model.geom_aabb[geom].reshape(2, 3)
         extent = np.abs(model.geom_pos[geom] + turn @ middle) + np.abs(turn) @ half
         reach = max(reach, float(extent[:axes].max()))
     return reach if 0 < ARMS * reach < rollout.radius else rollout.radius
@@ -264,13 +263,6 @@ def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float
     centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
     hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
     return float(centre[2] - max(hit, 0.0))
-
-
-def quaternion_of(rotation: Array) -> Array:
-    """The quaternion (4,) of a rotation (3, 3) or (9,), scalar first."""
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
-    return quaternion
 
 
 def in_bytes(colours: npt.ArrayLike) -> list[Any]:

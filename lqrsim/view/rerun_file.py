@@ -15,10 +15,11 @@ from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
+from lqrsim.scenes.mjcf_kinematics import quaternion_of
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.options import Overlay
 from lqrsim.view.overlays import Arrow, Dots, Drawable, DrawnTube, Line, MovingBody, Overlays, colour_of, common_scale
-from lqrsim.view.recorded_trial import RecordedTrial, Triangles, drawn_geoms, in_bytes, quaternion_of
+from lqrsim.view.recorded_trial import RecordedTrial, Triangles, drawn_geoms, in_bytes
 
 TIMELINE = "time"
 GHOST_OPACITY = 0.6  # of a ball without shading
