@@ -242,13 +242,12 @@ class FunnelCommand(StudyOptions):
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
         level_test(space, steps, **stated(self, level_test))  # checked before the solve
         disturbances = []
-        for disturbance in (
-            disturbance for name in self.disturbances for disturbance in disturbance_set(name, scenario)
-        ):
-            if isinstance(disturbance, ls.disturbances.InitialStateError):
-                console.say("without the InitialStateError of the set: runs begin in states of the funnel")
-                disturbance = disturbance.scaled(0.0)  # keeps the other disturbances' random numbers
-            disturbances.append(disturbance.scaled(self.strength))
+        for name in self.disturbances:
+            for disturbance in disturbance_set(name, scenario):
+                if isinstance(disturbance, ls.disturbances.InitialStateError):
+                    console.say("without the InitialStateError of the set: runs begin in states of the funnel")
+                    disturbance = disturbance.scaled(0.0)  # keeps the other disturbances' random numbers
+                disturbances.append(disturbance.scaled(self.strength))
         options = stated(self, ls.funnel, **study.closed_loop, disturbances=disturbances)
 
         def write(result: "Funnel") -> int:

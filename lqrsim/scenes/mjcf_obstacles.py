@@ -46,20 +46,11 @@ def touchable(model: mujoco.MjModel, candidates: list[int], body: int) -> list[i
     Ground is a floor that the robot can sink to, by a free joint or a slide that is not level, and what it stands on
     and can move over.
     """
-    data, touched = placed(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
-    pairs = touching_pairs(model, candidates)
+    data, pairs = placed(model), touching_pairs(model, candidates)
+    touched = set(pairs[~_always_touch(model, pairs), 1].tolist())
     of_robot = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
     ground = (_ground(model, data) if _sinks(model, data, body) else set[int]()) | _supports(model, pairs[of_robot])
     return [geom for geom in candidates if geom in touched and geom not in ground]
-
-
-def avoidable_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs that MuJoCo lets collide, except those that touch in every position of the joints.
-
-    A link that turns on a pedestal touches it always: no plan can avoid that, and it is no collision.
-    """
-    pairs = touching_pairs(model, obstacles)
-    return pairs[~_always_touch(model, pairs)]
 
 
 def mounting_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
@@ -120,11 +111,13 @@ def _are_stated(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
 
 
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs whose distances matter: `avoidable_pairs`, and all pairs with an obstacle that has none of these.
+    """The pairs whose distances matter: those that MuJoCo lets collide and that do not always touch.
 
-    The user has chosen such an obstacle by name or by a rule.
+    A link that turns on a pedestal touches it always: no plan can avoid that, and it is no collision. Of an obstacle
+    without such pairs, which the user has chosen by name or by a rule, all pairs matter.
     """
-    pairs = avoidable_pairs(model, obstacles)
+    pairs = touching_pairs(model, obstacles)
+    pairs = pairs[~_always_touch(model, pairs)]
     untouched = sorted(set(obstacles) - set(pairs[:, 1].tolist()))
     if untouched:
         moving = solid_geoms(model)

@@ -88,7 +88,7 @@ class Legend:
     def draw(self, image: Pixels) -> None:
         if self.tile is not None:
             image[-self.height :] = 255
-            blend(image, self.tile, left=0, bottom=0)
+            blend(image[-self.tile.shape[0] :], self.tile, left=0, top=0)
 
 
 def _letter_height(width: int, height: int) -> int:
@@ -147,10 +147,9 @@ def wrap(words: str, height: int, width: int) -> list[str]:
     return lines
 
 
-def blend(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
-    """Blend a tile into the image, in place, at these distances in pixels from the left and the top or bottom."""
-    start = max(top if top is not None else image.shape[0] - tile.shape[0] - (bottom or 0), 0)
-    area = image[start : start + tile.shape[0], left : left + tile.shape[1]]
+def blend(image: Pixels, tile: Pixels, *, left: int, top: int) -> None:
+    """Blend a tile into the image, in place, at these distances in pixels from the left and the top."""
+    area = image[top : top + tile.shape[0], left : left + tile.shape[1]]
     tile = tile[: area.shape[0], : area.shape[1]]
     alpha = tile[..., 3:].astype(np.uint16)
     area[...] = ((255 - alpha) * area + alpha * tile[..., :3] + 127) // 255

@@ -191,8 +191,7 @@ class Overlays:
         tube = None
         if "tube" in show and run.tube is not None and run.tube.max() >= 1e-12:
             ellipsoids = Ellipsoids.predicted(run.plan.states[:, position], run.tube)
-            every = np.arange(len(ellipsoids.centres))
-            tube = self._overlapping("tube", colour_of("tube"), ellipsoids.label, ellipsoids, every, height=0.6)
+            tube = self._overlapping("tube", colour_of("tube"), ellipsoids.label, ellipsoids, height=0.6)
         width = 0.0035 * recorded.model.stat.extent * (1.0 if tube is None else SLIM)
 
         def profile(relative: float) -> tuple[float, float]:  # on a floor, lines are flat
@@ -213,8 +212,7 @@ class Overlays:
             yield tube
         if "cost_tube" in show:
             ellipsoids, colour = self._of_cost(solution), colour_of("cost_tube")
-            every = np.arange(len(ellipsoids.centres))
-            yield self._overlapping("cost_tube", colour, OF_COST, ellipsoids, every, height=0.3)
+            yield self._overlapping("cost_tube", colour, OF_COST, ellipsoids, height=0.3)
         if "funnel" in show:
             yield from self._draw_funnel(funnel)
         if "trace" in show:
@@ -278,14 +276,15 @@ class Overlays:
         if len(between):
             label, opacity = "funnel, interpolated", INTERPOLATED_OPACITY
             yield self._overlapping(
-                "interpolated", INTERPOLATED, label, ellipsoids, between, height=0.1, opacity=opacity
+                "interpolated", INTERPOLATED, label, ellipsoids, height=0.1, knots=between, opacity=opacity
             )
 
     def _overlapping(
-        self, name: str, colour: Colour, label: str, ellipsoids: Ellipsoids, knots: npt.NDArray[np.int64], *,
-        height: float, opacity: Mapping[bool, float] = TUBE_OPACITY,
+        self, name: str, colour: Colour, label: str, ellipsoids: Ellipsoids, *, height: float,
+        knots: npt.NDArray[np.int64] | None = None, opacity: Mapping[bool, float] = TUBE_OPACITY,
     ) -> DrawnTube:  # fmt: skip
-        """The ellipsoids at some of the knots. Where they overlap, their joint opacity is about this."""
+        """Some of the ellipsoids, at these knots or all. Where they overlap, their joint opacity is about this."""
+        knots = np.arange(len(ellipsoids.centres)) if knots is None else knots
         knots = ellipsoids.overlapping(knots, MOST_ELLIPSOIDS)
         apart = np.linalg.norm(np.diff(ellipsoids.centres[knots], axis=0), axis=1).sum() / max(len(knots) - 1, 1)
         overlap = 2 * float(ellipsoids.axes()[0][knots].mean()) / apart if apart > 0 else 1.0

@@ -457,6 +457,5 @@ def _levels(axes: Axes, funnel: Funnel) -> None:
         axes.annotate(counts, (time, level), xytext=(0, 8), textcoords="offset points", ha="center", fontsize=8)
     axes.set_xlim(-0.06 * funnel.plan.horizon, 1.02 * funnel.plan.horizon)
     axes.set_ylim(0, 1.2 * max(float(funnel.levels.max()), 1e-9))
-    axes.set_xlabel("time (s)")
-    axes.set_ylabel("level")
-    axes.set_title(f"levels: {funnel.rate:g} succeed, confidence {funnel.confidence:g}")
+    title = f"levels: {funnel.rate:g} succeed, confidence {funnel.confidence:g}"
+    axes.set(xlabel="time (s)", ylabel="level", title=title)
