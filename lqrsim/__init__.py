@@ -28,8 +28,7 @@ def __getattr__(name: str) -> Any:
     except Exception as error:
         if "MUJOCO_GL" not in os.environ or name not in __all__:
             raise
-        from lqrsim.errors import opengl_error
+        from lqrsim.errors import check_opengl
 
-        if (other := opengl_error(error)) is not None:
-            raise other from None
+        check_opengl(error)
         raise

@@ -102,7 +102,7 @@ def _run(arguments: list[str]) -> int:
         return 2
 
     from lqrsim.commands import NAMES, console
-    from lqrsim.errors import InputError, opengl_error
+    from lqrsim.errors import InputError, check_opengl
 
     notices = logging.StreamHandler()  # on stderr: notices of slow work, such as compiling for a new kind of problem
     logger = logging.getLogger("lqrsim")
@@ -123,8 +123,7 @@ def _run(arguments: list[str]) -> int:
                 why = f" ({' '.join(str(error).split())[:200]})" if str(error) else ""
                 raise InputError(f"memory: got too little for this{why}, want more, or a smaller task") from None
             except Exception as error:
-                if (other := opengl_error(error)) is not None:
-                    raise other from None
+                check_opengl(error)
                 raise
     except InputError as error:
         if "--json" in arguments:

@@ -47,19 +47,18 @@ class InputError(ValueError):
         super().__init__(line if len(line) <= LONGEST else f"{line[:700]} ... {line[-300:]}")
 
 
-def opengl_error(error: BaseException) -> InputError | None:
-    """The InputError for an import of MuJoCo that failed because of MUJOCO_GL; None for other exceptions.
+def check_opengl(error: BaseException) -> None:
+    """Raises InputError if an import of MuJoCo failed with this exception because of MUJOCO_GL.
 
     MuJoCo chooses its OpenGL while it is imported; without the chosen one it may raise any exception. Its submodules
     that were imported then stay in `sys.modules`, and `mujoco` itself does not.
     """
     failed = "mujoco" not in sys.modules and any(name.startswith("mujoco.") for name in sys.modules)
-    if not failed or "MUJOCO_GL" not in os.environ or isinstance(error, InputError):
-        return None
-    return InputError(
-        f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
-        f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
-    )
+    if failed and "MUJOCO_GL" in os.environ and not isinstance(error, InputError):
+        raise InputError(
+            f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
+            f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
+        ) from None
 
 
 def keep(record: object, **values: object) -> None:

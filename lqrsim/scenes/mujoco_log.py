@@ -4,13 +4,12 @@ import contextlib
 import threading
 from collections.abc import Iterator
 
-from lqrsim.errors import opengl_error
+from lqrsim.errors import check_opengl
 
 try:
     import mujoco
 except Exception as error:
-    if (other := opengl_error(error)) is not None:
-        raise other from None
+    check_opengl(error)
     raise
 
 _quiet, _count, _before = threading.Lock(), 0, None
