@@ -47,8 +47,8 @@ def outdated(extra: str = "") -> str:
         needs = requires("lqrsim") or []
     except PackageNotFoundError:  # a copy of the source that is not installed
         return ""
-    of = f"; extra == [\"']{extra}[\"']" if extra else ""
-    bounds = [re.fullmatch(rf"([\w.-]+)>=([\d.]+){of}", need) for need in needs]
+    condition = f"; extra == [\"']{extra}[\"']" if extra else ""
+    bounds = [re.fullmatch(rf"([\w.-]+)>=([\d.]+){condition}", need) for need in needs]
     least = {bound[1]: bound[2] for bound in bounds if bound}
     older = {
         name: present for name, present in versions_of(*least).items()

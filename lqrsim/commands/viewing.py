@@ -99,8 +99,8 @@ class Render:
                 rerun_file.write(drawn, out, trial=rows, funnel=funnel)
             case _:
                 with console.progress("rendering", "frame") as progress:
-                    look = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
-                    ls.render(drawn, out, **stated(self, ls.render, **look, progress=progress))
+                    options = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
+                    ls.render(drawn, out, **stated(self, ls.render, **options, progress=progress))
         console.wrote(out)
         return 0
 
@@ -271,7 +271,8 @@ class Verify:
     """Check a run against its rendered frames.
 
     A run is rendered in calibrated fixed views. A video is decoded, and the robot's mark is located in its panes `top`
-    and `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
+    and `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md. Exits
+    with 1 if a test failed.
 
       lqrsim verify runs/quadrotor/rollout.npz
       lqrsim verify videos/quadrotor/video.mp4
@@ -288,7 +289,6 @@ class Verify:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code: 1 if a test failed."""
         from lqrsim.verify.checks import ran_policy_of, run_beside
 
         is_run = self.file.suffix.lower() == ".npz"

@@ -321,7 +321,6 @@ def _add_actuators(
 
 
 def _gains(name: str, joint: str, servo: object) -> list[float]:
-    """The stiffness and the damping of a servo."""
     field, want = f"{name}: servos of {joint}", "two numbers, the stiffness and the damping"
     if len(gains := check_items(field, servo, object, want)) != 2:
         raise InputError(f"{field}: got {excerpt(servo)}, want {want}")

@@ -91,7 +91,6 @@ class Obstacle:
         return obstacle
 
     def _equals(self, other: "Obstacle", *fields: str) -> bool:
-        """Whether these fields of two obstacles are the same."""
         return self is other or all(np.array_equal(getattr(self, field), getattr(other, field)) for field in fields)
 
     @property
@@ -236,7 +235,7 @@ class World:
 
         A point (2,) is for a world that is seen by a robot in the plane, in its coordinates.
         """
-        x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
+        x, y, z = (*_places("point", point, single=True).tolist(), 0.0)[:3]
         return np.array([
             hull_distance(self.table, ROW * i, np.array([x, y, z]), 0, 1, np.empty(3)) if obstacle.kind == "mesh"
             else signed_distance(self.table, ROW * i, x, y, z)
@@ -258,11 +257,11 @@ class World:
         return np.array(indices, dtype=np.int64).reshape(points.shape[:-1])
 
 
-def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
+def _places(field: str, points: npt.ArrayLike, *, single: bool = False) -> Array:
     """Points (..., 2 or 3), or a single point, as an array. Raises InputError for anything else."""
     array = real(field, points)
-    if array.shape[-1:] not in ((2,), (3,)) or (one and array.ndim > 1):
-        raise InputError(f"{field}: got shape {array.shape}, want {'' if one else '..., '}2 or 3 coordinates")
+    if array.shape[-1:] not in ((2,), (3,)) or (single and array.ndim > 1):
+        raise InputError(f"{field}: got shape {array.shape}, want {'' if single else '..., '}2 or 3 coordinates")
     return array
 
 

@@ -63,8 +63,6 @@ class _KeyPress(messages.Event):
 
 
 class _ViewerSide(plugin.ViewerPlugin):
-    """The plugin on the viewer's side."""
-
     studio: app.App
 
     def __init__(self, owner: Viewer, title: str) -> None:

@@ -143,22 +143,22 @@ def camera_view(
     model = recorded.model
     of_model = [model.camera(number).name for number in range(model.ncam) if model.camera(number).name]
     check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
-    alike = [trial for trial in beside if trial.rollout.model == recorded.rollout.model] or [recorded]
+    same_model = [trial for trial in beside if trial.rollout.model == recorded.rollout.model] or [recorded]
     if name in CALIBRATED:
-        runs = {id(trial.rollout): trial.rollout for trial in alike}
+        runs = {id(trial.rollout): trial.rollout for trial in same_model}
         corners = np.vstack([corner for run in runs.values() for corner in _bounds(run)])
         camera = calibrated(name, recorded.rollout, aspect, around=corners)
         return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
     if name == "chase":
         return _chase(recorded)
     if name == "overview" and (aspect < OVERVIEW_ASPECT or name not in of_model):
-        return _overview(recorded, model.camera(name).id if name in of_model else None, aspect, alike)
+        return _overview(recorded, model.camera(name).id if name in of_model else None, aspect, same_model)
     view = mujoco.MjvCamera()
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(name).id
     return CameraView(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
 
 
-def _overview(recorded: RecordedTrial, like: int | None, aspect: float, alike: Sequence[RecordedTrial]) -> CameraView:
+def _overview(recorded: RecordedTrial, like: int | None, aspect: float, trials: Sequence[RecordedTrial]) -> CameraView:
     """A view that contains these runs and their surroundings, in the direction of a camera of the model."""
     model, data = recorded.model, mujoco.MjData(recorded.model)
     recorded.pose(data, 0.0)
@@ -168,7 +168,7 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float, alike: S
         axes, field_of_view = data.cam_xmat[like].reshape(3, 3), float(model.cam_fovy[like])
         right, forward = axes[:, 0], -axes[:, 2]
     right = right / np.linalg.norm(right)
-    up, points = np.cross(right, forward), np.vstack([_extent_points(trial) for trial in alike])
+    up, points = np.cross(right, forward), np.vstack([_extent_points(trial) for trial in trials])
     # Far enough back to have every point within both angles of view.
     rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)

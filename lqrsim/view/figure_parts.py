@@ -99,8 +99,8 @@ class Views:
         """The panels of the views: wide ones if they are long."""
         low, high = self.corners
         shapes = [slenderness((high - low)[list(plane)]) for plane in self.planes]
-        wide, look = max(shapes) < LONG_VIEW, LAYOUTS[style]
-        width = look.width / (1 if wide else look.columns) - AROUND[1] * look.text / 72
+        wide, layout = max(shapes) < LONG_VIEW, LAYOUTS[style]
+        width = layout.width / (1 if wide else layout.columns) - AROUND[1] * layout.text / 72
         return [Panel(width * min(shape, 1.0), wide) for shape in shapes]
 
     def draw(self, figure: Figure, places: Sequence[SubplotSpec]) -> list[Axes]:
@@ -126,11 +126,11 @@ class Views:
                 draw_tube(axes, ellipsoids.projected(onto), label, face=face, edge=edge)
             if self.certified is not None:
                 outlines = list(self.certified.projected(onto).outlines())
-                looks = {"facecolors": "none", "edgecolors": CERTIFIED, "linewidths": 1.6, "zorder": 2.8}
-                axes.add_collection(PolyCollection(outlines, label="certified", **looks))
+                properties = {"facecolors": "none", "edgecolors": CERTIFIED, "linewidths": 1.6, "zorder": 2.8}
+                axes.add_collection(PolyCollection(outlines, label="certified", **properties))
             for path in self.paths:
-                looks = {"color": path.colour, "linewidth": path.width, "zorder": path.zorder}
-                axes.plot(*path.points[:, along].T, path.line, label=path.label, **looks)
+                properties = {"color": path.colour, "linewidth": path.width, "zorder": path.zorder}
+                axes.plot(*path.points[:, along].T, path.line, label=path.label, **properties)
             start, end = self.paths[-1].points[[0, -1]][:, along]
             axes.plot(*start, "o", color=PLAN, markersize=6, zorder=3, label="start")
             axes.plot(*end, "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
@@ -307,9 +307,9 @@ def draw_objects(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -
     for moved in objects:
         low, high = moved.path.min(axis=0), moved.path.max(axis=0)
         for geoms, line, face in ((moved.first, ":", "none"), (moved.last, "-", (MOVED_COLOUR, 0.3))):
-            looks = {"facecolor": face, "edgecolor": MOVED_COLOUR, "linestyle": line, "zorder": 2.4}
+            properties = {"facecolor": face, "edgecolor": MOVED_COLOUR, "linestyle": line, "zorder": 2.4}
             for geom in geoms:
-                axes.fill(*_outline(geom, low, high, plane).T, **looks)
+                axes.fill(*_outline(geom, low, high, plane).T, **properties)
         label = f"{moved.name.replace('_', ' ')}, moved"
         axes.plot(*moved.path[:, plane].T, color=MOVED_COLOUR, linewidth=1.0, zorder=2.5, label=label)
 

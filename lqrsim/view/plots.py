@@ -137,7 +137,6 @@ def _driven(rollouts: Mapping[str, Rollout], trial: int, zorder: float = 2.0) ->
 
 
 def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> Views:
-    """The views of a robot with a position."""
     first, space = next(iter(rollouts.values())), solution.policy.state_coordinates
     driven = _driven(rollouts, trial)
     plan = DrawnPath(solution.trajectory.states[:, list(space.position)], "planned")
@@ -194,8 +193,8 @@ def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> 
     worst = np.array([np.nanmax(error) for error in errors.values()])
     # Runs that differ by decades need a logarithmic axis, from which zeros and rounding errors are left out.
     decades = bool(worst.max() > 30 * worst.min())
-    of = next(iter(rollouts.values())).tracking_unit
-    factor, unit = (1e3, "mm") if of == "m" and worst.max() < 1 and not decades else (1.0, of)
+    unit_of_error = next(iter(rollouts.values())).tracking_unit
+    factor, unit = (1e3, "mm") if unit_of_error == "m" and worst.max() < 1 and not decades else (1.0, unit_of_error)
     for (name, error), color in zip(errors.items(), RUNS, strict=False):
         shown = np.where(error > ROUNDING * worst.max(), error, np.nan) if decades else error
         axes.plot(rollouts[name].times, factor * shown, color=color)
@@ -329,10 +328,10 @@ def draw_policy(
         of_time = parts[len(views.planes) :]
         drawn = views.draw(figure, parts[: len(views.planes)])
     else:
-        together = _drawn_together(solution)
-        states, *of_time = arrange(figure, [_strip_panel(len(together), style), *curves], style)
+        groups = _grouped_states(solution)
+        states, *of_time = arrange(figure, [_strip_panel(len(groups), style), *curves], style)
         drawn = []
-        _states(_grid(figure, states, len(together), 1), together, solution)
+        _states(_grid(figure, states, len(groups), 1), groups, solution)
     _cost_to_go(figure.add_subplot(of_time[0]), solution)
     if tube is not None and chances:
         axes = figure.add_subplot(of_time[1])
@@ -343,7 +342,7 @@ def draw_policy(
     legend_below(figure, _entries(*drawn[:1], *strips))
 
 
-def _drawn_together(solution: Solution) -> list[list[int]]:
+def _grouped_states(solution: Solution) -> list[list[int]]:
     """The states of each strip: of one unit, and with ranges along the plan that can be seen beside one another."""
     space, strips = solution.policy.state_coordinates, list[list[int]]()
     sizes = np.ptp(solution.trajectory.states, axis=0)
@@ -358,9 +357,9 @@ def _drawn_together(solution: Solution) -> list[list[int]]:
     return sorted(strips)
 
 
-def _states(strips: list[Axes], together: list[list[int]], solution: Solution) -> None:
+def _states(strips: list[Axes], groups: list[list[int]], solution: Solution) -> None:
     space, plan = solution.policy.state_coordinates, solution.trajectory
-    for axes, drawn in zip(strips, together, strict=True):
+    for axes, drawn in zip(strips, groups, strict=True):
         for i in drawn:
             axes.plot(plan.times, plan.states[:, i], label=space.names[i].replace("_", " "))
         unit = space.units[drawn[0]]
@@ -395,8 +394,8 @@ def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolic
                 norm = strength(policy, number, deviation)
                 # Twenty pairs of a colour and a line; the first four differ in both.
                 line, colour = LINES[(number + 2 * (number // len(RUNS))) % len(LINES)], RUNS[number % len(RUNS)]
-                looks = {"baseline": None, "color": colour, "linestyle": line, "linewidth": 1.2}
-                axes.stairs(norm, times, label=name.replace("_", " "), **looks)
+                properties = {"baseline": None, "color": colour, "linestyle": line, "linewidth": 1.2}
+                axes.stairs(norm, times, label=name.replace("_", " "), **properties)
         axes.set_ylabel(f"{answer or '1'}\nper {deviation or '1'}")
         axes.set_ylim(bottom=0)
         axes.margins(x=0.01)

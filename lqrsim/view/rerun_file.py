@@ -58,8 +58,6 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
 
 
 class _Recording:
-    """A recording of one trial."""
-
     def __init__(self, rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
         self.rerun, self.stream, self.recorded = rerun, stream, recorded
 

@@ -80,13 +80,13 @@ def figure(
     when the block ends: layout engines do not do that. By default `style` gives the width and `arrange` the height.
     """
     places = [check_path("path", path, suffixes=METADATA) for path in paths]
-    look = LAYOUTS[style]
-    text = {"font.size": look.text, "axes.titlesize": look.text * STYLE["axes.titlesize"] / STYLE["font.size"]}
+    layout = LAYOUTS[style]
+    text = {"font.size": layout.text, "axes.titlesize": layout.text * STYLE["axes.titlesize"] / STYLE["font.size"]}
     with contextlib.ExitStack() as stack:
         unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
         stack.enter_context(matplotlib.style.context(["default", STYLE | text]))
         drawn = Figure(
-            figsize=size or (look.width, look.width),
+            figsize=size or (layout.width, layout.width),
             layout=None if size else ConstrainedLayoutEngine(h_pad=PAD, w_pad=PAD),
         )
         FigureCanvasAgg(drawn)
@@ -121,8 +121,8 @@ def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") ->
 
     Where the columns are equally high, as below two views side by side, other columns begin.
     """
-    look = LAYOUTS[style]
-    columns = look.columns
+    layout = LAYOUTS[style]
+    columns = layout.columns
 
     def heights_of(section: list[list[int]]) -> list[float]:
         return [sum(panels[i].height for i in column) for column in section]
@@ -138,7 +138,7 @@ def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") ->
                 tops = [0.0] * columns
             sections[-1][tops.index(min(tops))].append(number)
     sections = [[column for column in section if column] for section in sections]
-    texts = AROUND[0] * look.text / 72  # the layout counts these with the heights of sections, which are grids
+    texts = AROUND[0] * layout.text / 72  # the layout counts these with the heights of sections, which are grids
     heights = [max(sum(panels[i].height + texts for i in column) for column in section) for section in sections]
     figure.set_figheight(sum(heights))
     places: dict[int, SubplotSpec] = {}
