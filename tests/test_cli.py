@@ -526,6 +526,8 @@ def test_help_of_a_narrow_terminal_ends(
         *((f"view quadrotor {option}", option) for option in ("--trial 1", "--no-loop")),
         *((f"view run.npz {option}", option) for option in ("--disturbances 1", "--seed 3", "--push 1", "--replan 30")),
         ("verify run.npz --run other.npz", "--run"),
+        ("report folder --out rates.csv --videos 2", "--videos"),
+        ("simulate a.npz --strength 2 --force-noise 0.1", "--strength"),
         *(
             (f"bridge a.npz --odometry /o --commands /c --robot {option}", option)
             for option in ("--safe 0 0", "--lockstep", "--seconds 1", "--lost-after 1")

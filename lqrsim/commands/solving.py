@@ -210,6 +210,8 @@ class Simulate:
 
         if self.open_loop and self.controller != "feedback":
             raise ls.InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
+        if not self.disturbances:
+            refuse(self, ("strength",), "without --disturbances, whose sets it scales, want it with these")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
         solution, scenario = console.load_with_scenario(self.solution, self.scenario)

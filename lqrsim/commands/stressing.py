@@ -17,6 +17,7 @@ from lqrsim.commands.options import (
     SetupOptions,
     optional,
     options_of,
+    refuse,
     stated,
 )
 
@@ -142,6 +143,8 @@ class Report:
         path = self.out or self.folder / "report.html"
         if path.suffix not in (".html", *ENDINGS):
             raise ls.InputError(f"--out: got {path}, want a name that ends in .html, {', '.join(ENDINGS)}")
+        if path.suffix in ENDINGS:
+            refuse(self, ("videos",), f"with {path}, want it with a page, .html")
         console.check_output("--out", path.parent, path.name)
         results = ls.stress.Results(self.folder, scenario=self.scenario)
         if path.suffix in ENDINGS:
