@@ -384,6 +384,8 @@ def test_commands_run_a_plan_in_the_duration_that_it_found(tmp_path: Path, monke
         assert rollout.outcome == ("reached",)
         assert rollout.times[-1] == pytest.approx(solution.trajectory.horizon)
         assert rollout.tube is not None
+    assert cli.main(["demo", "--robots", "hurried.py:hurried", "--no-video", "--out", "videos"]) == 0
+    assert ls.load("videos/hurried/disturbed.npz", ls.Rollout).tube is not None
     policies = ["--policies", "smooth", "track", "offset_free", "replan"]
     few = ["--trials", "2", "--strengths", "1", "--sweep", "scenario", "--workers", "0"]
     assert cli.main(["stress", "hurried.py:hurried", *policies, *few]) == 0

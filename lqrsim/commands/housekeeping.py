@@ -58,6 +58,7 @@ class Demo:
             console.say(f"\n== {reference}: {scenario.summary}")
             solution = replace(console.solve_and_print(scenario), scenario=from_anywhere(reference))
             console.save(solution, folder / "solution.npz")
+            scenario = scenario.with_duration_of(solution)
             tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
             if remark:
                 console.say(remark)
