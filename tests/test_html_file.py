@@ -280,7 +280,7 @@ def test_a_funnel_and_the_cost(folder: Path, rollout: ls.Rollout, tmp_path: Path
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--camera", "top"], "--out: got run.html with --camera, want it with one run"),
+        (["--camera", "top"], "--camera: got top with run.html, want it with a video or a still"),
         (["--trial", "99"], "trial: got 99, want one of 0 to"),
         (["--trial"], "trial: got none, want 1 to"),
         (["--overlays", "cost_tube"], "solution: got None with the overlay cost_tube"),

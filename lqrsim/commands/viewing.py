@@ -112,17 +112,12 @@ class Render:
         if kind not in (".html", ".rrd"):
             raise ls.InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
         # Whoever opens such a file chooses the camera and the time.
-        is_page = kind == ".html"
-        accepted = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if is_page else [])]
-        others = [f"--{name}" for name in changed(self) if name not in accepted]
-        several = max(len(self.rollouts), len(self.solution), len(self.funnel)) > 1
-        if others or several or not (is_page or self.trial is None or len(self.trial) == 1):
-            kinds = "runs, solutions or funnels" if is_page else "runs, trials or funnels, or none"
-            got = ", ".join(others) or f"several {kinds}"
-            want = "one run, one --trial, at most one --funnel, and no other options"
-            if is_page:
-                want = "one run, at most one --solution and --funnel, and of other options --trial and --overlays"
-            raise ls.InputError(f"--out: got {out.name} with {got}, want it with {want}")
+        accepted = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if kind == ".html" else [])]
+        refuse(self, changed(self).keys() - accepted, f"with {out.name}, want it with a video or a still")
+        single = ["rollouts", "solution", "funnel"] if kind == ".html" else ["rollouts", "funnel", "trial"]
+        for name in single:
+            if name in changed(self) and (count := len(getattr(self, name))) != 1:
+                raise ls.InputError(f"{name}: got {count} with {out.name}, want one")
 
 
 def _one_or_all(items: Sequence[Any]) -> Any:
