@@ -232,17 +232,14 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
         ],
     }
     designs, designed = results.designs(), [policy for policy in policies(table) if policy in DESIGNED]
-    per_cell = [f"{policy}: {designs[policy]}." for policy in policies(table) if policy in designs.keys() - designed]
-    if per_cell:
-        facts["Design disturbances"] = per_cell
+    lines = [f"{policy}: {designs[policy]}." for policy in policies(table) if policy in designs.keys() - designed]
     if designed:
         disturbances = design_disturbances(scenario, campaign.design_disturbances)
         unknown = uncertainty_of(scenario.plant(), disturbances).left_out
-        facts["Design disturbances"] = [
-            *per_cell,
-            f"{' and '.join(designed)}: designed for {_describe(disturbances, scenario)}.",
-            *([f"Left out of the design: {'; '.join(unknown)}."] if unknown else []),
-        ]
+        lines.append(f"{' and '.join(designed)}: designed for {_describe(disturbances, scenario)}.")
+        lines += [f"Left out of the design: {'; '.join(unknown)}."] if unknown else []
+    if lines:
+        facts["Design disturbances"] = lines
     facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]
     facts["Machine"] = [manifest["machine"]]
     return facts
@@ -268,18 +265,13 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
         texts = {name: [f"{curve[at][1]:{spec}}{unit} at {at:g}" for at in curve] for name, curve in curves.items()}
         return "; ".join(f"{name}: {', '.join(middles)}" for name, middles in texts.items())
 
+    percent = {"ylim": (-3, 103), "yticks": np.linspace(0, 100, 6)}
     return {
         "name": name,
         "words": _describe(campaign.sweeps[name], scenario),
         "figures": [
             _picture(
-                plot_curves(
-                    rates,
-                    folder / "success.png",
-                    "trials that reached their goal (%)",
-                    ylim=(-3, 103),
-                    yticks=np.linspace(0, 100, 6),
-                ),
+                plot_curves(rates, folder / "success.png", "trials that reached their goal (%)", **percent),
                 caption="Trials that reached their goal over the strength of the disturbances, 95 % bands.",
                 alt=f"Success over strength. {in_words(rates, '.0f', ' %')}.",
             ),

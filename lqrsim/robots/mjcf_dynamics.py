@@ -350,11 +350,9 @@ class MjcfDynamics(Dynamics):
     @unlogged()
     def untouched_body(self, states: Array, state: int) -> str:
         model = self.physics.model
-        dof = state % model.nv if state < 2 * model.nv else -1
-        if dof < 0:
+        if state >= 2 * model.nv:  # of an actuator
             return ""
-        body = int(model.dof_bodyid[dof])
-        welds = model.body_weldid
+        body, welds = int(model.dof_bodyid[state % model.nv]), model.body_weldid
         for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
             for pair in data.contact.geom:
                 first, second = (int(welds[model.geom_bodyid[geom]]) for geom in pair)

@@ -232,8 +232,10 @@ class Overlays:
     def _moving(self) -> Iterator[MovingBody]:
         """The obstacles that move, except planes, which have no thickness; infinite ones reach far beyond the scene."""
         moving, times = self.recorded.rollout.moving, np.array([0.0, self.recorded.end])
-        for i, kind in enumerate(() if moving is None else moving.kinds):
-            if moving is not None and kind != "plane":
+        if moving is None:
+            return
+        for i, kind in enumerate(moving.kinds):
+            if kind != "plane":
                 size = np.minimum(moving.sizes[i], 10 * self.recorded.model.stat.extent)
                 places = moving.positions[i] + times[:, None] * moving.velocities[i]
                 name, shape = f"moving {moving.names[i]}", "box" if kind == "mesh" else kind  # the box about a hull
