@@ -529,6 +529,7 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
         ({"speed": 0}, "speed: got 0, want"),
         ({"trial": 1}, "trial: got 1, want one of 0 to 0"),
         ({"fps": 0}, "fps: got 0, want"),
+        *(({"path": "a.gif", "fps": fps}, "fps: got .*, want at most 50 for a GIF") for fps in (50.1, 60, 240)),
         ({"path": "run.avi"}, "path: got .*run.avi', want a name that ends in .mp4, .gif, .png"),
         ({"path": "file/run.mp4"}, "want a file that can be written"),
     ],

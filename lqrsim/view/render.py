@@ -94,6 +94,7 @@ def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pix
 
 FADE_SECONDS = 0.25
 MOST_FRAMES = 1_000_000  # largest number of frames of a video
+FASTEST_GIF = 50  # frames per second; shorter frames than two hundredths of a second are shown for a tenth
 SMALLEST_GIF = 480, 270  # pixels, smallest default size, so that captions can be read
 PALETTE_SAMPLES = 12  # number of frames from which the palette of a GIF is made
 LARGEST_SHOWN = 30_000_000  # bytes of a file that is embedded in a notebook; larger files make it slow
@@ -151,7 +152,8 @@ def render(
       funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and compression of the video.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
-      fps: frames per second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
+      fps: frames per second, independent of the rate of `rollout.frame_times`; by default 30, for a GIF 15 of at
+        most 50.
       speed: seconds of the run per second of the video.
       time: of a still, seconds after the start; by default the end.
       every: of a still, seconds; the robot is also drawn at each multiple of it, as in the paper's figures.
@@ -165,6 +167,8 @@ def render(
     if not still and (time is not None or every is not None):
         raise InputError(f"time, every: got {excerpt(path.name)}, want FILE.png: they belong to stills")
     rate = Fraction((15 if animated else 30) if fps is None else fps).limit_denominator(1001)
+    if animated and rate > FASTEST_GIF:
+        raise InputError(f"fps: got {float(rate):g}, want at most {FASTEST_GIF} for a GIF, which plays slowly beyond")
     if animated and size is None:
         width, height = (side // 2 for side in QUALITIES[quality].size)
         size = max(width, SMALLEST_GIF[0]), max(height, SMALLEST_GIF[1])
