@@ -174,6 +174,6 @@ class InteriorPoint:
             pressing[:, i] -= sign * stages.force[:-1, row]
         return InteriorResult(
             plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain,
-            measures=Measures.of(self._memory), multipliers=known, pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS),
-            sizes=self._sizes, scale=float(self._memory["scale"][0]),
+            measures=Measures.of(self._memory), multipliers=known, pressing=pressing, solved=solved,
+            flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self._sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip
