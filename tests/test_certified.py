@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy
 from oracle import planar_quadrotor
 from whole_problems.claims import contradictions
 
@@ -273,3 +274,21 @@ def test_a_cost_of_the_end_alone_is_certified(weight: float) -> None:
     assert solution.status is Status.CONVERGED
     assert solution.cost == pytest.approx(-0.0480556 * weight, rel=2e-5)
     assert solution.certificate.optimality < 1e-8
+
+
+@pytest.mark.parametrize("sharpness", [8.0, 13.0, 20.0, 50.0])
+def test_a_plan_at_rest_on_a_plateau_is_certified(sharpness: float) -> None:
+    """The slope of 600 (1 - exp(-s d^2)) is rounding there, and so are controls of 1e-14: they are no size of one."""
+    wanted = ls.SymbolicCost(
+        lambda x, u, p: 600 * (1 - sympy.exp(-p.sharpness * (x.q - 1.8) ** 2)), parameters={"sharpness": sharpness}
+    )
+    dynamics = ls.Dynamics(lambda x, u, p: [x[1], u[0]], states={"q": "m", "v": "m/s"}, controls={"f": "N"})
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.05, steps=20, initial=ls.FixedState([0.0, 0.0]),
+        stage_cost=ls.ControlCost([0.015]), final_cost=wanted,
+    )  # fmt: skip
+    assert 1e-8 > 2 * sharpness * 1.8 * np.exp(-sharpness * 1.8**2)  # the final slope, relative to the cost
+    for size in (0.0, 1e-16, 1e-14, 1e-12, 1e-10):
+        start = size * np.random.default_rng(0).standard_normal((20, 1))
+        solution = ls.smooth(problem, start=start, starts=1, safeguard=False)
+        assert solution.status is Status.CONVERGED, f"{size}: {solution.detail}"

@@ -28,6 +28,8 @@ SQUARES = 1e-28
 # A control block that is definite by less than this part of its own largest curvature gets as much more. If its own is
 # less than this part of the largest along the plan, this part of the typical cost takes the place of a curvature.
 OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-9, 1e-2
+# A control that is smaller than this part of 1 or of its limit is at rest: what is left is rounding, and no size of it.
+AT_REST = 1e-9
 
 
 def certify(settings, of_policy, plan, policy, to_go, model, row):
@@ -67,8 +69,9 @@ def certify(settings, of_policy, plan, policy, to_go, model, row):
         sizes[N + i] = 0.0
         for t in range(steps):
             sizes[N + i] = max(sizes[N + i], abs(plan.controls[t, i]))
-        if sizes[N + i] == 0:
-            sizes[N + i] = min(1.0, max(model.limits.high[i], -model.limits.low[i]))
+        full = min(1.0, max(model.limits.high[i], -model.limits.low[i]))
+        if sizes[N + i] <= AT_REST * full:
+            sizes[N + i] = full
     # Constraint terms are never part of the sum: a large penalty would leave its rounding errors.
     cost = cost_alone(states[steps], none, steps, model.final, 0.0, stage.hessian, stage.gradient)
     typical = largest = cost_of_change(stage, sizes)
