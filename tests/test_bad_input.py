@@ -1,6 +1,7 @@
 """Bad input gets one line that names it; where a file, a run or a robot is needed, with the tests of these."""
 
 import itertools
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -264,6 +265,12 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: lq_continuous().inverse_policy([INF], 0.0), "^x: got .*inf.*, want finite numbers"),
     # Scenes.
     (lambda: resolve("nowhere.xml"), "scene: got 'nowhere.xml', want a file that exists"),
+    *[(lambda name=name: resolve(f"{name}:there"), f"^scenario: got module {re.escape(repr(name))}, want the name of one")
+      for name in ("", ".", ".mine", "mine.", "a..b", "a b", "9")],
+    *[(lambda text=text: resolve(f"quadrotor,query={text}"), "^query: got '")
+      for text in ("{[]: 1}", "{{}}", 20_000 * "-" + "1", 300 * "(", 5000 * "[", "1 +", "\0")],
+    (lambda: resolve("quadrotor,query=3,seed=1,query=4"), "^setting of quadrotor: got query twice, want it once"),
+    (lambda: resolve("json:loads"), "^scenario: got json:loads without s, want json:loads,s=VALUE"),
     (lambda: ls.load_scene("aren"), "^scene: got 'aren', want one of: arena, cage .*or the path of an .xml"),
     (lambda: ls.load_scene("somewhere/nowhere.xml"),
      "^scene: got '.*nowhere.xml', want a file that exists, or one of: arena"),

@@ -27,7 +27,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import TYPE_CHECKING
 
-from lqrsim.errors import InputError, check_name
+from lqrsim.errors import InputError, check_name, excerpt
 
 if TYPE_CHECKING:
     from lqrsim.scenarios.packaged import Scenario
@@ -159,6 +159,8 @@ def _load_file(path: Path) -> ModuleType:
 
 
 def _import(name: str) -> ModuleType:
+    if not all(part.isidentifier() for part in name.split(".")):  # a relative name, or none
+        raise InputError(f"scenario: got module {excerpt(name)}, want the name of one, as in package.module:function")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())  # `python -m` does this, an installed command does not
 
@@ -170,13 +172,17 @@ def _import(name: str) -> ModuleType:
 
 def _keywords(target: str, make: Callable[..., object], settings: list[str]) -> dict[str, object]:
     parameters = inspect.signature(make).parameters.items()
-    valid = [name for name, p in parameters if p.kind is not p.VAR_KEYWORD and name != "path"]
+    valid = [name for name, p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and name != "path"]
     keywords: dict[str, object] = {}
     for setting in settings:
         name, _, text = setting.strip().partition("=")
         check_name(f"setting of {target}", name, valid)
+        if name in keywords:
+            raise InputError(f"setting of {target}: got {name} twice, want it once")
         try:
             keywords[name] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
+        except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):  # the last three of odd brackets
             keywords[name] = text
+    if missing := [name for name, p in parameters if p.default is p.empty and name in valid and name not in keywords]:
+        raise InputError(f"scenario: got {target} without {', '.join(missing)}, want {target},{missing[0]}=VALUE")
     return keywords
