@@ -274,8 +274,16 @@ def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
 def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str, ...]:
     message_names = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
     if unknown := set(message_names) - set(states.names):
-        raise InputError(f"names: got {excerpt(sorted(unknown))}, want some of {', '.join(states.names)}")
-    return tuple(message_names.get(name, name) for name in states.names)
+        raise InputError(f"names: got {excerpt(sorted(unknown, key=str))}, want some of {', '.join(states.names)}")
+    renamed = tuple(message_names.get(name, name) for name in states.names)
+    for place, name in enumerate(renamed):
+        state = states.names[place]
+        if not isinstance(name, str):
+            raise InputError(f"names: got {excerpt(name)} for {state}, want its name in messages")
+        if name in renamed[:place]:
+            other = states.names[renamed.index(name)]
+            raise InputError(f"names: got {excerpt(name)} for {other} and for {state}, want another name for each")
+    return renamed
 
 
 def _turns_about(states: Coordinates, names: Sequence[str]) -> str | None:
