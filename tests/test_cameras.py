@@ -145,6 +145,15 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(ls.InputError, match="want one that can be read"):
         read(tmp_path / "text.mp4")
+    good = metadata(rollout)
+    with encoder(tmp_path / "latin.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast", metadata=good) as encode:
+        encode(np.zeros((64, 64, 3), dtype=np.uint8))
+    content = (tmp_path / "latin.mp4").read_bytes()
+    (tmp_path / "latin.mp4").write_bytes(content.replace(b'{"format', b"Mus\xe9es "))  # of another program, in Latin-1
+    with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
+        read(tmp_path / "latin.mp4")
+    with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
+        VideoMetadata.from_json(100_000 * "[")
     with encoder(tmp_path / "other.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast") as encode:
         encode(np.zeros((64, 64, 3), dtype=np.uint8))
     with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
@@ -153,7 +162,24 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
     for change, message in [
         ({"version": 99}, "got version 99"),
         ({"frames": 0}, "metadata: VideoMetadata: frames: got 0"),
-        ({"rate": "30/0"}, "damaged"),
+        *[
+            ({"rate": bad}, "damaged")
+            for bad in (
+                "30/0",
+                "1e99999",
+                10**400,
+                float("inf"),
+                float("nan"),
+                "inf",
+                "-1",
+                "",
+                " 1",
+                "1/",
+                None,
+                [1],
+                3.5,
+            )
+        ],
         ({"markers": []}, "whose parts do not fit together"),
         ({"panes": [{"left": 0}]}, r"metadata\.panes\.0\.top: got nothing, want this field"),
     ]:

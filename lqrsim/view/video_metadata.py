@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -11,7 +12,7 @@ from av.error import FFmpegError
 
 from lqrsim.annotations import Count, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_path, excerpt
-from lqrsim.results.archive import excerpt_of, sha256
+from lqrsim.results.archive import excerpt_of, parse, sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import record_from, tree_of
 from lqrsim.view.cameras import Camera
@@ -55,7 +56,7 @@ class VideoMetadata:
     def from_json(cls, text: str) -> "VideoMetadata":
         """The metadata of `as_json`. Raises InputError for anything else, and for another version."""
         try:
-            parts = json.loads(text)
+            parts = parse(text)
         except ValueError:
             parts = None
         if not isinstance(parts, dict) or parts.get("format") != FORMAT:
@@ -63,12 +64,13 @@ class VideoMetadata:
         if parts.get("version") != VERSION:
             got = parts.get("version")
             raise InputError(f"video metadata: got version {got}, want version {VERSION}: render the video again")
-        try:
-            rate = Fraction(parts["rate"])
-        except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError(f"video metadata: got {excerpt(text)}, which is damaged ({error})") from None
+        rate = re.fullmatch(r"([0-9]{1,9})(?:/([1-9][0-9]{0,8}))?", str(parts.get("rate")))  # as `Fraction` prints it
+        if rate is None:
+            raise InputError(
+                f"video metadata: got {excerpt(parts.get('rate'))} as its rate, which is damaged, want 30/1"
+            )
         tree = {name: part for name, part in parts.items() if name not in ("format", "version")}
-        return record_from(cls, tree | {"rate": rate}, "metadata", {})
+        return record_from(cls, tree | {"rate": Fraction(int(rate[1]), int(rate[2] or 1))}, "metadata", {})
 
     def times(self) -> np.ndarray:
         """Times of the frames in seconds after the start of a run, (frames,)."""
@@ -81,7 +83,7 @@ def read(path: str | os.PathLike[str]) -> VideoMetadata:
     if not os.path.isfile(path):  # not the method of Path, which raises if a folder cannot be read
         raise InputError(f"video: got {excerpt_of(path)}, want a file that exists")
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             text = container.metadata.get("comment", "")
     except (FFmpegError, OSError) as error:
         raise InputError(f"video: got {path}, want one that can be read ({error})") from None
