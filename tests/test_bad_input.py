@@ -265,7 +265,7 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: lq_continuous().inverse_policy([INF], 0.0), "^x: got .*inf.*, want finite numbers"),
     # Scenes.
     (lambda: resolve("nowhere.xml"), "scene: got 'nowhere.xml', want a file that exists"),
-    *[(lambda name=name: resolve(f"{name}:there"), f"^scenario: got module {re.escape(repr(name))}, want the name of one")
+    *[(lambda name=name: resolve(f"{name}:there"), f"^scenario: got module {re.escape(repr(name))}, want the name of")
       for name in ("", ".", ".mine", "mine.", "a..b", "a b", "9")],
     *[(lambda text=text: resolve(f"quadrotor,query={text}"), "^query: got '")
       for text in ("{[]: 1}", "{{}}", 20_000 * "-" + "1", 300 * "(", 5000 * "[", "1 +", "\0")],
