@@ -1,5 +1,6 @@
 """Environments of Gymnasium: its own checks, and that they are the closed loop of `simulate`, to the last bit."""
 
+import contextlib
 import subprocess
 import sys
 import warnings
@@ -198,6 +199,9 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
         (lambda env: env.reset(options={"preset": "mild"}), "disturbances: got 'mild', want one of: scenario, calm"),
         (lambda env: env.reset(options={"strength": 2}), "options: got strength alone"),
         (lambda env: env.reset(options={"preset": "calm", "disturbances": ()}), "options: got disturbances and preset"),
+        (lambda env: lqrsim.gym.Expert(env)(np.zeros((0, 13))), "observation: got shape (0, 13), want (13,) or (K, 13)"),
+        (lambda env: lqrsim.gym.Expert(env)(np.zeros((2, 3, 13))), "observation: got shape (2, 3, 13), want (13,)"),
+        (lambda env: lqrsim.gym.Expert(env)(np.zeros(12)), "observation: got shape (12,)"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_refused(call: Any, line: str, quadrotor_solution: ls.Solution) -> None:
@@ -275,6 +279,25 @@ def test_pictures_are_those_of_still(quadrotor: ls.Scenario, quadrotor_solution:
             rollout, tmp_path / "still.png", time=step / 30, camera="top", overlays=("plan",), quality="draft",
         )  # fmt: skip
         np.testing.assert_array_equal(picture, np.asarray(Image.open(path)))
+
+
+@pytest.mark.skipif(not gl.available(), reason="needs OpenGL")
+def test_pictures_have_the_obstacles_of_their_episode(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Each episode has its obstacles elsewhere, or none of them has; a picture does not depend on those before."""
+
+    def picture(env: Any, trial: int, size: float) -> np.ndarray:
+        moved = {"disturbances": (ls.disturbances.DisplacedObstacles(size),)}
+        env.reset(seed=3, options={"trial": trial, **moved})
+        return env.render().copy()
+
+    options: dict[str, Any] = {"solution": quadrotor_solution, "render_mode": "rgb_array", "size": (320, 180)}
+    with contextlib.closing(lqrsim.gym.Environment(quadrotor, **options)) as env:
+        cases = [(trial, size) for size in (0.3, 0.0) for trial in (0, 1, 1, 2)]
+        seen = [picture(env, *case) for case in cases]
+    assert len({image.tobytes() for image in seen}) == 4
+    for image, case in zip(seen, cases, strict=True):
+        with contextlib.closing(lqrsim.gym.Environment(quadrotor, **options)) as alone:
+            np.testing.assert_array_equal(image, picture(alone, *case))
 
 
 def test_observations_are_bounded_as_mujoco_bounds_them() -> None:

@@ -81,7 +81,9 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
     def reset(self, *, seed: Seed | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin an episode; see the class."""
         super().reset(seed=seed)
-        episode = self._begin(seed, self.np_random, options)
+        before, episode = self._episode, self._begin(seed, self.np_random, options)
+        if before is not None and not np.array_equal(before.loop.effects.displaced, episode.loop.effects.displaced):
+            self._picture.close()  # its obstacles are where they were in the episode before
         return episode.observations[0], self._info(episode)
 
     def step(self, action: npt.ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -137,6 +139,8 @@ class Expert:
         """The action for an observation. Raises InputError unless the environment can have made it."""
         size = len(self._task.plant.robot.dynamics.state_coordinates) + 1
         seen = vectors_of("observation", observation, size)
+        if seen.ndim > 2 or not seen.size:
+            raise InputError(f"observation: got shape {seen.shape}, want ({size},) or (K, {size})")
         rows = np.atleast_2d(seen)
         if not ((rows[:, -1] >= 0) & (rows[:, -1] <= 1)).all():
             raise InputError(f"observation: got {excerpt(rows[:, -1])} as its time, want fractions of the horizon")
