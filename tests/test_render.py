@@ -244,6 +244,39 @@ def test_many_disturbances_do_not_fill_a_small_picture(
         assert image.size == (480, 270)
 
 
+POINT = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body name="point">
+    <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>{}</body></worldbody>
+  <actuator><motor joint="x" ctrlrange="-2 2"/><motor joint="y" ctrlrange="-2 2"/></actuator></mujoco>"""
+
+
+@draws
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<geom size=".1" mass="1"/>',
+        '<geom size=".1" pos="0 0 .3" mass="1" contype="0" conaffinity="0"/>',
+        '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>',
+    ],
+)
+@pytest.mark.parametrize("camera", ["overview", "chase", "top", "side"])
+@pytest.mark.filterwarnings("error")
+def test_a_robot_without_a_radius_is_drawn_and_measured(body: str, camera: str, tmp_path: Path) -> None:
+    """A point for the plan, it is as wide in pictures as its body, or as a point that can be seen."""
+    (tmp_path / "point.xml").write_text(POINT.format(body))
+    robot = ls.MjcfRobot(str(tmp_path / "point.xml"), body="point", radius=0.0)
+    solution = track(robot, np.zeros(4), np.full((20, 2), 1.0), 0.02)
+    push = Push((0.1, 0.0, 0.0), at=0.1)
+    run = ls.simulate(ls.Plant(robot, robot.scene), solution, disturbances=[push], goal_radius=0.1)
+    assert run.radius == 0
+    video = render(run, tmp_path / "run.mp4", size=SMALL, fps=10, camera=camera)
+    assert video_metadata.read(video).markers[0] > 0
+    shown, hidden = (
+        pixels(render(run, tmp_path / "still.png", size=SMALL, camera=camera, overlays=overlays))
+        for overlays in (("plan", "ghost", "forces"), ())
+    )
+    assert (shown != hidden).any()
+
+
 @draws
 def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> None:
     """A GIF loops, in real time, and its colours are near those of the video."""

@@ -228,6 +228,16 @@ def test_a_hand_is_only_so_strong(quadrotor: ls.Scenario, quadrotor_solution: ls
     assert np.linalg.norm(screen.pop_wrench(0.1)[3:]) == pytest.approx(2 * weight * quadrotor.robot.radius)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1e4])
+def test_a_hand_on_a_robot_without_a_radius(size: float, rollout: ls.Rollout) -> None:
+    """No lever, no torque."""
+    screen = Recorder(1, **{**viewer.arguments_for_rollout(rollout, 0), "radius": 0.0})
+    screen.drag(np.full((screen.model.nbody, 6), size))
+    wrench = screen.pop_wrench(0.1)
+    assert (np.linalg.norm(wrench[:3]) > 0) == (size > 0)
+    assert not wrench[3:].any()
+
+
 def test_who_is_lost_starts_again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """A push to 1 km/s."""
     screen = Recorder(90, push=1000.0, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))

@@ -264,6 +264,17 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
     assert without.hold(without.other()) == without.robot
 
 
+def test_the_goal_of_a_robot_without_a_radius_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "point.xml").write_text(
+        """<mujoco><worldbody><body name="point"><joint name="x" type="slide"/><joint name="y" type="slide"
+        axis="0 1 0"/><geom size=".1"/></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
+    )
+    robot = ls.MjcfRobot(str(tmp_path / "point.xml"), radius=0.0)
+    goal = MovableGoal(robot.problem(np.zeros(4), np.ones(4), steps=5))
+    model, name = model_with_goal(ls.Plant(robot, robot.scene), goal)
+    assert model.geom_size[model.body(name).geomadr[0], 0] > 0
+
+
 def test_the_goal_in_the_model(quadrotor: ls.Scenario, differential_drive: ls.Scenario) -> None:
     """All else keeps its numbers; MuJoCo's own mouse moves it, and it touches nothing."""
     for scenario in (quadrotor, differential_drive):

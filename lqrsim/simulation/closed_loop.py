@@ -435,7 +435,8 @@ class ClosedLoop:
             return None
         which = plan.policy.digest, plan.trajectory.states.tobytes()
         if plant.ran is None or plant.ran[:2] != which:
-            alone = ClosedLoop(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1)
+            near_enough = {"goal_radius": self.goal_radius, "goal_tolerance": self.goal_tolerance}
+            alone = ClosedLoop(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1, **near_enough)
             plant.ran = (*which, alone.run().undisturbed)
         return plant.ran[2]
 

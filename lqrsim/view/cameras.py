@@ -223,7 +223,7 @@ def _chase(recorded: RecordedTrial) -> CameraView:
     direction = _smooth(motion, times, TURN_SECONDS)
     azimuth = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
     middle = _smooth(driven, times, 0.25 * TURN_SECONDS)
-    radius = recorded.rollout.radius
+    radius = recorded.rollout.radius or recorded.size
 
     def place(scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         angle = np.interp(time, times, azimuth)

@@ -17,6 +17,7 @@ from lqrsim.scenes.mjcf_kinematics import axes_of, colliding, in_axes_of_bodies
 from lqrsim.scenes.mjcf_text import model_from_xml
 
 ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
+POINT = 0.02  # radius of a robot without a size, relative to the extent of the scene
 UNCOLOURED = 0.5, 0.5, 0.5, 1.0  # the colour of a geom whose MJCF gives none
 SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker
@@ -235,13 +236,15 @@ def drawn_size(model: mujoco.MjModel, rollout: Rollout, robot: int) -> float:
     """The radius in metres of what stands for a robot at its position in a picture, so that it does not hide the robot.
 
     The radius of a robot with arms is their reach. If it is more than ARMS times the half width of the robot's own
-    body, along the axes in which it is seen, the half width is taken.
+    body, along the axes in which it is seen, the half width is taken. A robot without a radius is as large as its body.
     """
     axes, reach = (2 if rollout.state_coordinates.from_above else 3), 0.0
     for geom in np.flatnonzero(model.geom_bodyid == robot) if rollout.state_coordinates.position else ():
         turn, (middle, half) = axes_of(model.geom_quat[geom]), model.geom_aabb[geom].reshape(2, 3)
         extent = np.abs(model.geom_pos[geom] + turn @ middle) + np.abs(turn) @ half
         reach = max(reach, float(extent[:axes].max()))
+    if not rollout.radius:
+        return reach or POINT * float(model.stat.extent)
     return reach if 0 < ARMS * reach < rollout.radius else rollout.radius
 
 

@@ -31,7 +31,7 @@ from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
 from lqrsim.view.geoms import appending_to
-from lqrsim.view.recorded_trial import model_of
+from lqrsim.view.recorded_trial import POINT, model_of
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
 LONGEST_RUN = 600.0  # s, after which a run restarts, because the whole run is kept in memory
@@ -71,7 +71,8 @@ class MovableGoal:
 def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:
     """The plant's model with a body for the goal, which a mouse can drag and nothing collides with; and its name."""
     spec = plant.scene.mjcf.spec()
-    space, radius = plant.robot.dynamics.state_coordinates, GOAL_SIZE * plant.robot.radius
+    space = plant.robot.dynamics.state_coordinates
+    radius = GOAL_SIZE * (plant.robot.radius or POINT * float(plant.model.stat.extent))
     name = free_name("goal", [body.name for body in spec.bodies])
     body = spec.worldbody.add_body(name=name, mocap=True, pos=space.in_world(goal.place))
     flat = space.from_above

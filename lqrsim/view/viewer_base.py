@@ -170,7 +170,8 @@ class Viewer(abc.ABC):
         """Drag the robot with the sum of forces and torques (nbody, 6), up to the strongest drag."""
         wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), STRONGEST_DRAG * 9.81 * self._mass
         for entries, largest in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
-            wrench[entries] *= largest / max(float(np.linalg.norm(wrench[entries])), largest)
+            if (size := float(np.linalg.norm(wrench[entries]))) > largest:
+                wrench[entries] *= largest / size
         self.wrench = wrench
 
     def request_restart(self) -> None:
