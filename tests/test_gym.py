@@ -199,7 +199,7 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
         (lambda env: env.reset(options={"preset": "mild"}), "disturbances: got 'mild', want one of: scenario, calm"),
         (lambda env: env.reset(options={"strength": 2}), "options: got strength alone"),
         (lambda env: env.reset(options={"preset": "calm", "disturbances": ()}), "options: got disturbances and preset"),
-        (lambda env: lqrsim.gym.Expert(env)(np.zeros((0, 13))), "observation: got shape (0, 13), want (13,) or (K, 13)"),
+        (lambda env: lqrsim.gym.Expert(env)(np.zeros((0, 13))), "observation: got shape (0, 13), want (13,) or"),
         (lambda env: lqrsim.gym.Expert(env)(np.zeros((2, 3, 13))), "observation: got shape (2, 3, 13), want (13,)"),
         (lambda env: lqrsim.gym.Expert(env)(np.zeros(12)), "observation: got shape (12,)"),
     ],

@@ -266,7 +266,7 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
 
 def test_the_goal_of_a_robot_without_a_radius_is_seen(tmp_path: Path) -> None:
     (tmp_path / "point.xml").write_text(
-        """<mujoco><worldbody><body name="point"><joint name="x" type="slide"/><joint name="y" type="slide"
+        """<mujoco><worldbody><body name="point"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide"
         axis="0 1 0"/><geom size=".1"/></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
     )
     robot = ls.MjcfRobot(str(tmp_path / "point.xml"), radius=0.0)
