@@ -4,16 +4,21 @@ import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from funnels_by_hand import funnel_by_hand
+from tracking import hover
 
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.scenes.mjcf_text import model_from_xml
+from lqrsim.simulation.disturbances import Push
 from lqrsim.view import rerun_file
+from lqrsim.view.recorded_trial import RecordedTrial
 
 Columns = dict[str, np.ndarray]
 
@@ -99,6 +104,35 @@ def test_numbers_plan_and_tube_are_those_of_the_run(run: Path, tmp_path: Path) -
     np.testing.assert_allclose(axes, np.maximum(wanted, 1e-4), rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("at", range(0, 10, 3))
+@pytest.mark.parametrize("how", ["diverged", "error"])
+def test_the_command_that_ended_a_trial_is_recorded(how: str, at: int, quadrotor: ls.Scenario) -> None:
+    """Of a trial that ends within its plan the numbers end with the last of each, by the knot that it belongs to."""
+    solution = hover(10)
+    dt = solution.trajectory.dt
+
+    def failing(state: np.ndarray, t: float) -> np.ndarray:
+        return np.full(4, 1.0 if t < (at - 0.5) * dt else np.nan)
+
+    options: Any = {"controller": failing} if how == "error" else {"disturbances": [Push((1e9, 0.0, 0.0), at=at * dt)]}
+    rollout, sent = ls.simulate(quadrotor.plant(), solution, **options), dict[str, tuple[list[float], np.ndarray]]()
+    assert rollout.outcome == (how,)
+    stub = SimpleNamespace(
+        Scalars=SimpleNamespace(columns=lambda scalars: scalars), new_entity_path="/".join,
+        TimeColumn=lambda name, duration: duration,
+        send_columns=lambda path, index, columns, recording: sent.update({path: (index[0], columns)}),
+    )  # fmt: skip
+    rerun_file._Recording(stub, None, RecordedTrial(rollout, 0)).draw_numbers()
+    for name, values in (
+        ("states/z (m)", rollout.states[0, :, 2]),
+        ("commanded/rotor_1 (N)", rollout.commanded[0, :, 0]),
+    ):
+        known = np.flatnonzero(np.isfinite(values))
+        times, shown = sent.get(f"numbers/{name}", ([], np.zeros(0)))
+        np.testing.assert_array_equal(shown, values[known])
+        np.testing.assert_array_equal(times, rollout.times[known])
+
+
 def test_a_funnel(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Balls of a quarter of a metre about the plan, of half of it at the second knot, and what is in between."""
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
@@ -165,7 +199,7 @@ def test_without_the_package_it_says_what_to_install(
     ("options", "named"),
     [
         (["--fps", "5"], "--fps: got 5 with run.rrd, want it with a video or a still"),
-        (["--overlays", "plan"], "--overlays: got ('plan',) with run.rrd, want it with a video or a still"),
+        (["--overlays", "plan"], "--overlays: got plan with run.rrd, want it with a video or a still"),
         (["--trial", "0", "1"], "trial: got 2 with run.rrd, want one"),
         (["--trial"], "trial: got 0 with run.rrd, want one"),
     ],

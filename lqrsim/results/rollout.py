@@ -120,7 +120,7 @@ class Rollout:
       diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement was not finite, or
         the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot on.
       failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
-        from that knot on.
+        after that knot.
       reasons: (K) why the controller failed or its filter diverged; empty otherwise.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each disturbance, and whether the goal moved.

@@ -151,8 +151,8 @@ class _Recording:
             numbers["states", label] = recorded.states[:, i]
             numbers["plan", label] = run.plan.states[:known, i]
         for i, label in enumerate(run.control_coordinates.labels):
-            numbers["commanded", label] = run.commanded[trial, : known - 1, i]
-            numbers["applied", label] = run.applied[trial, : known - 1, i]
+            numbers["commanded", label] = run.commanded[trial, :known, i]  # the last one ended the trial, if it ended
+            numbers["applied", label] = run.applied[trial, :known, i]
         for entity, values in numbers.items():
             finite = np.isfinite(values)
             if finite.any():
