@@ -78,6 +78,14 @@ def test_other_results_are_kept_on_request(scripts: Path, tmp_path: Path, capsys
     assert "written without --quick, want the same option" in capsys.readouterr().err
     before = json.loads((out / "results.json").read_text())
     (out / "results.json").write_text(json.dumps(before | {"machine": "another machine"}))
+    whole = json.loads((out / "results.json").read_text())
+    spoilt = [{name: part for name, part in whole.items() if name != left_out} for left_out in whole]
+    spoilt += [whole | {"results": bad} for bad in ({}, [], None, {"table_1": {}}, {"table_1": 3})]
+    for bad in (*spoilt, [], 3, "text", "[" * 100_000):
+        (out / "results.json").write_text(bad if isinstance(bad, str) else json.dumps(bad))
+        assert main(["reproduce", "figure_2", "--keep", "--out", str(out)]) == 2
+        assert "want a file that `lqrsim reproduce` wrote" in capsys.readouterr().err
+    (out / "results.json").write_text(json.dumps(whole))
     assert main(["reproduce", "figure_2", "--keep", "--out", str(out)]) == 0
     page = (out / "results.md").read_text()
     assert "Computed with lqrsim of figure_2 on another machine." in page

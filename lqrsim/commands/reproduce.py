@@ -111,7 +111,8 @@ def _saved(file: Path, *, quick: bool) -> dict[str, Any]:
     try:
         saved = json.loads(file.read_text(encoding="utf-8"))
         other = saved["quick"] is not quick
-    except (OSError, ValueError, KeyError, TypeError):
+        results_page(saved)  # which needs all that the file should have
+    except Exception:  # what it has instead may raise anything
         raise ls.InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
     if other:
         raise ls.InputError(
