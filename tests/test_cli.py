@@ -303,6 +303,20 @@ def test_own_scenario_in_a_module(own: Path, tmp_path: Path, monkeypatch: pytest
         ("solve quadrotor,query=x", ["query: got 'x'"]),
         ("solve nowhere.py:make", ["nowhere.py", "a Python file that exists"]),
         ("solve no_such_module:make", ["no_such_module", "can be imported"]),
+        ("render .", ["ROLLOUT: got ., a folder, want a file that"]),
+        ("render /", ["ROLLOUT: got /, a folder, want a file that"]),
+        (
+            "demo --robots quadrotor,query=1 quadrotor,query=2",
+            ["--robots: got quadrotor,query=1 and quadrotor,query=2"],
+        ),
+        (
+            "solve quadrotor --figure policy.bmp",
+            ["--figure: got 'policy.bmp', want a name that ends in .png, .pdf, .svg"],
+        ),
+        (
+            "solve quadrotor --figure /proc/nowhere/a.png",
+            ["--figure: got /proc/nowhere/a.png, want a file that can be"],
+        ),
         ("solve {own}:larger", ["got 'larger'", "shorter, not_a_scenario, endless"]),
         ("solve {own}:not_a_scenario", ["got a int", "want a lqrsim Scenario"]),
         ("solve {own}:shorter,steps=0", ["steps: got 0"]),
@@ -528,6 +542,28 @@ def test_help_of_a_narrow_terminal_ends(
         ("verify run.npz --run other.npz", "--run"),
         ("report folder --out rates.csv --videos 2", "--videos"),
         ("simulate a.npz --strength 2 --force-noise 0.1", "--strength"),
+        *(
+            (f"render run.npz {option} {out}", option)
+            for option in ("--solution a.npz", "--funnel a.npz", "--title one --overlays plan trace")
+            for out in ("", "--out run.png", "--out run.gif")
+        ),
+        *((f"render run.npz {option} --out run.html", option) for option in ("--solution a.npz", "--funnel a.npz")),
+        *(
+            (f"stress quadrotor --resume {option}", option)
+            for option in (
+                "--sweep severe",
+                "--policies smooth",
+                "--trials 9",
+                "--replan-every 0.1",
+                "--shard 7",
+                "--time-limit 9",
+                "--strengths 1 2",
+                "--goal-radius 0.1",
+                "--goal-tolerance 0.1",
+                "--seed 3",
+                "--design-disturbances severe",
+            )
+        ),
         *(
             (f"bridge a.npz --odometry /o --commands /c --robot {option}", option)
             for option in ("--safe 0 0", "--lockstep", "--seconds 1", "--lost-after 1")

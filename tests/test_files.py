@@ -578,7 +578,7 @@ LONG = "x" * 300
 @pytest.mark.parametrize(
     "command",
     [
-        "render {bad}", "render {good} --solution {bad} --out {out}.mp4",
+        "render {bad}", "render {good} --overlays cost_tube --solution {bad} --out {out}.mp4",
         "verify {bad}", "verify {good} --solution {bad}", "simulate {bad}",
         "view {bad}", "report {bad}", "replay {bad} --cell 0 --trial 0",
         "stress differential_drive --resume --out {bad}",

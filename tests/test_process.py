@@ -141,7 +141,9 @@ def test_a_signal_while_it_films_leaves_nothing(flown: Path, number: int, suffix
     if not gl.available():
         pytest.skip("no OpenGL here")
     out = tmp_path / f"a.{suffix}"
-    with start(*COMMAND, "render", flown, "--out", out, "--fps", "240", "--size", "1280", "720") as process:
+    with start(
+        *COMMAND, "render", flown, "--out", out, "--fps", "50", "--speed", "0.2", "--size", "1280", "720"
+    ) as process:
         wait_for(tmp_path, ".unfinished-*", process)
         time.sleep(random.Random(f"{number} {suffix}").uniform(0, 1))
         process.send_signal(number)

@@ -279,7 +279,9 @@ def test_a_robot_without_a_radius_is_drawn_and_measured(body: str, camera: str, 
 
 @draws
 def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> None:
-    """A GIF loops, in real time, and its colours are near those of the video."""
+    """A GIF loops, in real time, at any rate, and its colours are near those of the video."""
+    with Image.open(render(flight, tmp_path / "fast.gif", size=(64, 64), fps=50, speed=5, overlays=())) as image:
+        assert {frame.info["duration"] for frame in ImageSequence.Iterator(image)} == {20}
     path = render(flight, tmp_path / "run.gif", quality="draft", fps=3)
     with Image.open(path) as image:
         assert image.size == (480, 270)
@@ -582,6 +584,12 @@ def test_bad_input_gets_one_line(options: dict, message: str, drive: ls.Rollout,
     [
         ({"time": 26.0}, "time: got 26.0, want a finite number >= 0 and <= 25"),
         ({"every": 0}, "every: got 0, want a finite number >= 0.5"),
+        *[
+            ({"path": path, **options}, f"fps, speed: got '{path}', want FILE.mp4 or FILE.gif: they belong to videos")
+            for options in ({"fps": 30}, {"speed": 2}, {"fps": 0.5, "speed": 0.1})
+            for path in ("a.png", "b.PNG")
+        ],
+        *[({"path": "fast.gif", "fps": fps}, f"fps: got {fps} for a GIF, want at most 50") for fps in (51, 100, 240)],
         ({"path": "still.gif", "time": 1.0}, "time, every: got 'still.gif', want FILE.png: they belong to stills"),
     ],
 )

@@ -51,6 +51,11 @@ class Demo:
             except ls.InputError as error:
                 console.say(f"No videos, everything else works: {error}")
                 video = False
+        folders = dict[Path, str]()
+        for reference, scenario in scenarios.items():
+            if (other := folders.setdefault(self.out / folder_name(scenario), reference)) != reference:
+                wanted = f"want one of them: {self.out / folder_name(scenario)} is the folder of both"
+                raise ls.InputError(f"--robots: got {other} and {reference}, {wanted}")
         rows, failures, misses = [TABLE], list[str](), list[str]()
         results = list[as_json.Object]()
         for reference, scenario in scenarios.items():

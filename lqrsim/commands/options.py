@@ -163,6 +163,7 @@ def refuse(command: Any, names: Collection[str], why: str) -> None:
     for name, value in changed(command).items():
         if name in names:
             got = f"{value:g}" if type(value) is float else value
+            got = " ".join(map(str, value)) if isinstance(value, tuple) else got
             raise ls.InputError(f"--{name.replace('_', '-')}: got {got} {why}")
 
 

@@ -100,6 +100,12 @@ class Solve:
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs") / folder_name(scenario)
         console.check_output("--out", folder)
+        if self.figure is not None:
+            from lqrsim.errors import check_path
+            from lqrsim.view.style import METADATA
+
+            check_path("--figure", self.figure, suffixes=METADATA)
+            console.check_output("--figure", self.figure.parent, self.figure.name)
         problem = scenario.problem
         if self.clearance is not None:
             clearance = ls.Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)

@@ -15,6 +15,7 @@ from lqrsim.commands.options import (
     Json,
     OwnScenario,
     SetupOptions,
+    changed,
     optional,
     options_of,
     refuse,
@@ -49,11 +50,16 @@ class Stress(SetupOptions):
     out: Folder = None
     """Folder of the campaign. By default runs/stress/ and the name of the scenario."""
     resume: bool = False
-    """Resume the campaign in the folder with its own settings instead of the options above."""
+    """Resume the campaign in the folder with its own settings, without the options that state others."""
 
     def run(self) -> int:
         from lqrsim.scenarios.references import folder_name, names_code
 
+        if self.resume:
+            accepted = {"scenario", "solution", "out", "resume", "json", "workers", "batch", "scheduler"}
+            refuse(
+                self, changed(self).keys() - accepted, "with --resume, which has the campaign's own, want it without"
+            )
         setup = ls.stress.Setup(**stated(self, ls.stress.Setup))
         folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
         console.check_output("--out", folder)

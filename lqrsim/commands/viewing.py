@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from lqrsim.view.viewer_base import Viewer
 
 
+# Options, and the overlays that draw what they say; a recording has its funnel whatever the overlays.
+DRAWN_BY = {"solution": "cost_tube", "funnel": "funnel", "title": "caption"}
+
+
 @dataclass(frozen=True, kw_only=True)
 @options_of(
     "view/render.py", "render", camera="NAME", size="WIDTH HEIGHT", fps="RATE", speed="FLOAT", time="SECONDS",
@@ -81,6 +85,8 @@ class Render:
 
         if not self.rollouts:
             raise ls.InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
+        if not self.rollouts[0].name:  # "." and "/" are no files, and have none beside them
+            raise ls.InputError(f"ROLLOUT: got {self.rollouts[0]}, a folder, want a file that `lqrsim simulate` wrote")
         out = self.out or self.rollouts[0].with_suffix(".mp4")
         self._check_options(out)
         console.check_output("--out", out.parent, out.name)
@@ -107,6 +113,9 @@ class Render:
     def _check_options(self, out: Path) -> None:
         """Raise InputError for another kind of file, or for options that do not belong to its kind."""
         kind = out.suffix.lower()
+        for name, overlay in DRAWN_BY.items() if kind != ".rrd" else ():
+            if overlay not in self.overlays:
+                refuse(self, (name,), f"without {overlay} in --overlays, want it with that")
         if kind in (".mp4", ".gif", ".png"):
             return
         if kind not in (".html", ".rrd"):

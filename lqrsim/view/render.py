@@ -152,8 +152,8 @@ def render(
       funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and compression of the video.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
-      fps: frames per second, independent of the rate of `rollout.frame_times`; by default 30, for a GIF 15 of at
-        most 50.
+      fps: frames per second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF, which
+        has at most 50.
       speed: seconds of the run per second of the video.
       time: of a still, seconds after the start; by default the end.
       every: of a still, seconds; the robot is also drawn at each multiple of it, as in the paper's figures.
@@ -166,6 +166,8 @@ def render(
     still, animated = kind == ".png", kind == ".gif"
     if not still and (time is not None or every is not None):
         raise InputError(f"time, every: got {excerpt(path.name)}, want FILE.png: they belong to stills")
+    if still and (fps is not None or speed != 1.0):
+        raise InputError(f"fps, speed: got {excerpt(path.name)}, want FILE.mp4 or FILE.gif: they belong to videos")
     rate = Fraction((15 if animated else 30) if fps is None else fps).limit_denominator(1001)
     if animated and rate > FASTEST_GIF:
         raise InputError(f"fps: got {float(rate):g}, want at most {FASTEST_GIF} for a GIF, which plays slowly beyond")

@@ -316,7 +316,7 @@ def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
     shown = ls.verify_run(rollout)
     return made | {
         "render": (options | {
-            "path": place.folder / "still.png", "fps": 5.0, "speed": 1.0, "time": 0.1, "every": 0.2,
+            "path": place.folder / "still.png", "fps": None, "speed": 1.0, "time": 0.1, "every": 0.2,
             "progress": print_nothing,
         }, 0.15),
         "render_html": ({
