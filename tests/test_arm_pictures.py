@@ -120,6 +120,21 @@ def test_the_figure_has_the_balls_at_several_times(
     assert ls.view.plot_policy(plan, tmp_path / "p.png", world=plant.scene.world, radius=0.1).stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("moments", [1, 2, 3, MOMENTS])
+def test_the_balls_of_the_last_moment_have_the_full_colour(
+    moments: int, plan: ls.Solution, run: ls.Rollout, plant: ls.Plant
+) -> None:
+    """However few moments there are, as of a run of one period, or one that ended at once."""
+    assert run.balls is not None
+    driven = run.balls.driven.copy()
+    driven[:, moments:] = np.nan
+    short = dataclasses.replace(run, balls=dataclasses.replace(run.balls, driven=driven))
+    views = _of_balls(plan, {"run": short}, plant.scene.world, 0)
+    colours = list(dict.fromkeys(colour for *_, colour in views.balls))
+    assert len(colours) == moments
+    assert colours[-1] == style.RUNS[0]
+
+
 class Closing(Viewer):
     """A viewer that no one looks at, which closes after so many frames."""
 

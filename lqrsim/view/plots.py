@@ -164,7 +164,7 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
     span = np.ptp(alive, axis=(0, 1))
     across, up = sorted(np.argsort(span, kind="stable")[1:].tolist())
     moments = np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))
-    colours = [_paler(RUNS[0], 0.75 * (1 - i / (MOMENTS - 1))) for i in range(len(moments))]
+    colours = [_paler(RUNS[0], white) for white in np.linspace(0, 0.75, len(moments))[::-1].tolist()]
     return Views(
         title="balls, paler the earlier, and the path of the last",
         space=first.state_coordinates,
