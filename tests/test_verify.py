@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples, rarely
+from tracking import weave
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -270,6 +271,17 @@ def test_a_covered_robot_is_counted_not_guessed(case: Case, tmp_path: Path) -> N
     found = ls.verify_video(path, case.run)
     assert "seen" in failed(found)
     assert "not in the pictures" in found.likely
+
+
+@pytest.mark.parametrize("shown", [(0, 1), (1, 0), (1, 1), (0, 0, 1)])
+def test_any_trial_of_a_run_that_is_shown_several_times(shown: tuple[int, ...], tmp_path: Path) -> None:
+    """As by `lqrsim render RUN.npz RUN.npz --trial 0 1`, which loads the run twice."""
+    plant, noise = ls.scenarios.differential_drive().plant(), ls.disturbances.ControlNoise(0.1)
+    one, other = (ls.simulate(plant, weave(12), disturbances=[noise], trials=2) for _ in range(2))
+    runs = [one, other, one][: len(shown)]
+    video = ls.render(runs, tmp_path / "run.mp4", trial=shown, camera="top", quality="draft", size=(960, 360), fps=10)
+    for trial in {*shown, None}:
+        assert (found := ls.verify_video(video, other, trial=trial)).passed, str(found)
 
 
 def test_what_can_not_be_verified_is_refused(case: Case, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from lqrsim.verify.verdict import Criterion, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.geoms import RIM
-from lqrsim.view.recorded_trial import model_of, place_of, robot_body, tracked_balls
+from lqrsim.view.recorded_trial import drawn_size, model_of, place_of, robot_body, tracked_balls
 from lqrsim.view.video_metadata import Pane
 
 
@@ -34,6 +34,11 @@ def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
     if len(rollout.frame_times) < 2:
         raise InputError(f"rollout.frames: got shape {rollout.frames.shape}, want what simulate(frames=True) records")
     return model
+
+
+def _size(rollout: Rollout, model: mujoco.MjModel) -> float:
+    """The radius of the robot in metres, to which errors are relative; without one, its size in pictures."""
+    return rollout.radius or drawn_size(model, rollout, robot_body(model, rollout.body))
 
 
 def describe(rollout: Rollout, trial: int) -> str:
@@ -131,7 +136,7 @@ def verify_run(
     measured: list[Array] = []
     offsets: list[Array] = []
     thickness, curved = _thickness(model, geom, rollout.frames[trial, rows], views)
-    bound, wanted = DRAWN_BOUND * rollout.radius, 1.0 if thickness >= THIN else FILLED / thickness
+    bound, wanted = DRAWN_BOUND * _size(rollout, model), 1.0 if thickness >= THIN else FILLED / thickness
     pixel = max(view.height for view in views) / SIZE[1]
     # The edge of a thin geom, or a straight edge, may lie along the pixels, and be drawn half of one too far.
     coarse = thickness < THIN or not curved
@@ -352,13 +357,14 @@ def verify_video(
     """
     metadata, plane = video_metadata.read(path), rollout.plane
     digest = video_metadata.digest(rollout)
-    run = metadata.runs.index(digest) if digest in metadata.runs else 0
-    panes = [pane for pane in metadata.panes if pane.run == run and pane.camera is not None]
+    runs = [run for run, shown in enumerate(metadata.runs) if shown == digest]  # it may be shown several times
+    panes = [pane for pane in metadata.panes if pane.run in (runs or [0]) and pane.camera is not None]
     trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
-    panes = [pane for pane in panes if pane.trial == trial] if digest in metadata.runs else panes
+    panes = [pane for pane in panes if pane.trial == trial] if runs else panes
+    panes = [pane for pane in panes if pane.run == panes[0].run]
     views = [pane.camera for pane in panes if pane.camera is not None]
     triangulate(views, np.zeros((0, len(views), 2)), plane)  # reports missing views before the slow part
-    model, radius = drawable_model(rollout, trial), metadata.markers[run]
+    model, radius = drawable_model(rollout, trial), metadata.markers[panes[0].run]
     measured: list[list[Array]] = []
     off = 0.0  # s, largest difference between the actual and the intended time of a frame
     for time, image in _decoded(path):
@@ -372,7 +378,7 @@ def verify_video(
     areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
     drawn_times, _ = frames_at_states(rollout, trial)
     differences = frame_positions(rollout, trial, model, drawn_times) - state_positions(rollout, trial, drawn_times)
-    worst, most = np.linalg.norm(differences, axis=1).max(), RECORD_BOUND * rollout.radius
+    worst, most = np.linalg.norm(differences, axis=1).max(), RECORD_BOUND * _size(rollout, model)
     shows = f"the video shows {', '.join(metadata.runs)}, this run is {digest}"
     timed = len(measured) == metadata.frames and off < 1 / float(metadata.rate) / 4
     counted = f"got {len(measured)}, want the {metadata.frames} that were written"
@@ -394,7 +400,7 @@ def verify_video(
         actual=frame_positions(rollout, trial, model, times),
         planned=positions_at(rollout.times, rollout.planned_places, times),
         apart=apart,
-        bound=VIDEO_BOUND * rollout.radius,
+        bound=VIDEO_BOUND * _size(rollout, model),
         interval=metadata.speed * (1 / float(metadata.rate)),
         others=others,
     )
