@@ -270,6 +270,9 @@ def test_a_robot_without_a_radius_is_drawn_and_measured(body: str, camera: str, 
     assert run.radius == 0
     video = render(run, tmp_path / "run.mp4", size=SMALL, fps=10, camera=camera)
     assert video_metadata.read(video).markers[0] > 0
+    if camera == "top" and "geom" in body:
+        assert (found := ls.verify_video(video, run)).passed, str(found)
+        assert (found := ls.verify_run(run)).passed, str(found)
     shown, hidden = (
         pixels(render(run, tmp_path / "still.png", size=SMALL, camera=camera, overlays=overlays))
         for overlays in (("plan", "ghost", "forces"), ())

@@ -145,8 +145,12 @@ def camera_view(
     check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
     same_model = [trial for trial in beside if trial.rollout.model == recorded.rollout.model] or [recorded]
     if name in CALIBRATED:
-        runs = {id(trial.rollout): trial.rollout for trial in same_model}
-        corners = np.vstack([corner for run in runs.values() for corner in _bounds(run)])
+        runs = {id(trial.rollout): trial for trial in same_model}.values()
+        sizes = [
+            0.0 if trial.rollout.radius else trial.size for trial in runs
+        ]  # bounds have the radius, if there is one
+        bounds = zip((_bounds(trial.rollout) for trial in runs), sizes, strict=True)
+        corners = np.vstack([corner for (low, high), size in bounds for corner in (low - size, high + size)])
         camera = calibrated(name, recorded.rollout, aspect, around=corners)
         return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
     if name == "chase":
