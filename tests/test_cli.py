@@ -302,6 +302,10 @@ def test_own_scenario_in_a_module(own: Path, tmp_path: Path, monkeypatch: pytest
         ("solve quadrotor,query=-1", ["query: got -1", ">= 0"]),
         ("solve quadrotor,query=x", ["query: got 'x'"]),
         ("solve nowhere.py:make", ["nowhere.py", "a Python file that exists"]),
+        (
+            "bridge a.npz --odometry /o --commands /c --names x=a y=b x=c",
+            ["--names: got x=a y=b x=c, want each state at most once"],
+        ),
         ("solve no_such_module:make", ["no_such_module", "can be imported"]),
         ("render .", ["ROLLOUT: got ., a folder, want a file that"]),
         ("render /", ["ROLLOUT: got /, a folder, want a file that"]),

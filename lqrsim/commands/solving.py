@@ -317,6 +317,8 @@ class Bridge:
         if any(not (state and equals and name) for state, equals, name in pairs):
             raise ls.InputError(f"--names: got {' '.join(self.names)}, want pairs such as theta=heading")
         names = {state: name for state, _, name in pairs}
+        if len(names) < len(pairs):
+            raise ls.InputError(f"--names: got {' '.join(self.names)}, want each state at most once")
         if self.robot:
             refuse(self, ("safe", "lockstep", "seconds", "lost_after"), "with --robot, want it without")
             return self._be_robot(names)
