@@ -219,6 +219,10 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
         ({"scenario": "quadrotor", "actions": "torques"}, "actions: got 'torques', want one of: normalized, controls"),
         ({"scenario": "quadrotor", "render_mode": "human"}, "render_mode: got 'human', want one of: rgb_array"),
         ({"scenario": "quadrotor", "camera": "chase"}, "camera: got 'chase'"),
+        *[
+            ({"scenario": "quadrotor", "strength": size}, f"strength: got {size} without disturbances")
+            for size in (0, 2.5)
+        ],
     ):
         with pytest.raises(InputError) as caught:
             wrong(**options)

@@ -73,6 +73,10 @@ class Task:
             if not np.isfinite(high - low):
                 raise InputError(f"scenario: got control {name} within {low:g} to {high:g}, want finite limits")
         self._disturbances = self.disturbances_of(disturbances, strength)
+        if strength != 1 and not self._disturbances:
+            raise InputError(
+                f"strength: got {strength:g} without disturbances, want it with these, or in reset's options"
+            )
         if scenario.problem.duration is not None:  # the control period is part of the solution
             self.scenario = scenario.with_duration_of(self.solution)
             self.plant = self.scenario.plant()
