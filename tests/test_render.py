@@ -273,9 +273,10 @@ def test_a_robot_without_a_radius_is_drawn_and_measured(body: str, camera: str, 
     if camera == "top" and "geom" in body:
         assert (found := ls.verify_video(video, run)).passed, str(found)
         assert (found := ls.verify_run(run)).passed, str(found)
+    choices: list[tuple[Overlay, ...]] = [("plan", "ghost", "forces"), ()]
     shown, hidden = (
         pixels(render(run, tmp_path / "still.png", size=SMALL, camera=camera, overlays=overlays))
-        for overlays in (("plan", "ghost", "forces"), ())
+        for overlays in choices
     )
     assert (shown != hidden).any()
 

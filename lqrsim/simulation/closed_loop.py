@@ -435,8 +435,10 @@ class ClosedLoop:
             return None
         which = plan.policy.digest, plan.trajectory.states.tobytes()
         if plant.ran is None or plant.ran[:2] != which:
-            near_enough = {"goal_radius": self.goal_radius, "goal_tolerance": self.goal_tolerance}
-            alone = ClosedLoop(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1, **near_enough)
+            alone = ClosedLoop(
+                plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1,
+                goal_radius=self.goal_radius, goal_tolerance=self.goal_tolerance,
+            )  # fmt: skip
             plant.ran = (*which, alone.run().undisturbed)
         return plant.ran[2]
 
