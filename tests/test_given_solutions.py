@@ -201,8 +201,8 @@ def test_the_folder_has_all_that_it_takes_to_replay_and_to_go_on(
     assert main(["stress", DRIVE, *words]) == 2
     assert f"solution: got none, want {folder / 'solution.npz'}, as {folder} was begun with" in one_line(capsys)
     other = ls.save(dataclasses.replace(left, policy=left.open_loop().policy), tmp_path / "other.npz")
-    for resume in ([], ["--resume"]):
-        assert main(["stress", DRIVE, *words, *resume, "--solution", str(other)]) == 2
+    for asked in (words, ["--resume", "--out", str(folder)]):
+        assert main(["stress", DRIVE, *asked, "--solution", str(other)]) == 2
         assert "solution: got another, want " in one_line(capsys)
     assert shards(folder) == whole
 
