@@ -13,8 +13,9 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim.codegen.distances import hull_distances
+from lqrsim.codegen.distances import hull_distances, signed_distance
 from lqrsim.errors import Array
+from lqrsim.kernels.hull_distance import hull_distance
 from lqrsim.problem.derivative_check import evaluate
 
 CAR, TRAILER = ls.types.Box(0.5, 0.25), ls.types.Box(0.3, 0.25)
@@ -146,6 +147,42 @@ def test_a_distance_belongs_to_the_place_of_both_alone(seed: int) -> None:
     assert distance(other, ls.World([ls.Obstacle.of_corners("rock", own)])) == pytest.approx(found, abs=1e-12)
     ahead = distance(own + step, ls.World([ls.Obstacle.of_corners("rock", other)]))
     assert abs(ahead - found) <= np.linalg.norm(step) + 1e-12
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_specks_in_the_faces_of_others(seed: int) -> None:
+    """Nearly flat ones of some 1e-6 m: the least tetrahedron around the origin is then so flat that its mean is not at
+    the origin. By the kernel in plain Python, which has no memory beyond its arrays.
+    """
+    rng = np.random.default_rng(seed)
+    for _ in range(600):
+        own = rng.normal(size=(rng.integers(2, 6), 3)) * 10.0 ** rng.uniform(-8, -5)
+        own[:, rng.integers(3)] *= 10.0 ** rng.uniform(-8, -5)
+        other = rng.integers(-2, 3, size=(5, 3)) @ Rotation.random(rng=rng).as_matrix()
+        place = rng.normal(size=3)
+        world = ls.World([ls.Obstacle.of_corners("rock", other + place)])
+        corners = (own + place).ravel()
+        found = hull_distance(world.table, 0, corners, 0, len(own), np.zeros(corners.size))
+        assert found == pytest.approx(distance(own + place, world), abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["plane", "sphere", "capsule", "cylinder", "box", "mesh"])
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_distance_of_a_corner_that_is_nowhere_is_not_a_number(kind: str, count: int) -> None:
+    """Whichever corner it is; also of a point to the nearest of several obstacles."""
+    rock = ls.Obstacle.of_corners("rock", np.eye(3))
+    one = rock if kind == "mesh" else ls.Obstacle("one", kind, np.zeros(3), np.eye(3), np.full(3, 0.3))
+    corners = np.random.default_rng(count).normal(size=(count, 3))
+    for k in range(count):
+        lost = corners.copy()
+        lost[k] = np.nan
+        found = hull_distances(ls.World([one, rock]), lost[None], [count])[0]
+        assert not np.isfinite(found).any()
+        assert np.isnan(found[..., 1]).all()
+        displaced = np.zeros((1, 3, 3))
+        displaced[0, k % 3] = np.nan
+        world = ls.World([rock, one, rock])
+        assert not np.isfinite(signed_distance(world, corners[:1], displaced)).any()
 
 
 SIZES = {

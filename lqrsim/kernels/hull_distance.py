@@ -8,7 +8,7 @@ overlap. Both know M by its *supports*, its farthest points in a direction.
 An infinite obstacle makes M a prism without ends, whose faces are edges of its projection. In a plane all are infinite.
 """
 
-from math import copysign, inf, sqrt
+from math import copysign, inf, isnan, nan, sqrt
 
 from lqrsim.kernels.declarations import compact, outline, stack, zeros
 from lqrsim.kernels.signed_distance import signed_distance_derivatives
@@ -24,7 +24,7 @@ CORNER = 3  # index in a point of M, after its coordinates: the number of the ro
 
 @outline
 def hull_distance(data, row, corners, first, count, gradient) -> float:
-    """The signed distance; write its derivatives in the robot's corners to gradient (3 count,).
+    """The signed distance, NaN if a corner is; write its derivatives in the robot's corners to gradient (3 count,).
 
     Args:
       corners: the robot's corners, from the one numbered `first` on, in any order.
@@ -35,6 +35,9 @@ def hull_distance(data, row, corners, first, count, gradient) -> float:
         return signed_distance_derivatives(data, row, x, y, z, gradient, curve)
     for k in range(3 * count):
         gradient[k] = 0.0
+    for k in range(3 * count):
+        if isnan(corners[3 * first + k]):
+            return nan
     if data[row] == 0:
         return distance_to_plane(data, row, corners, first, count, gradient)
     write_axis(data, row, axis)
@@ -79,7 +82,7 @@ def shortest(data, row, corners, first, count, axis, simplex, weights, normal):
         if left == 0:
             break
         size, square = left, dot(v, v)
-        if square <= TOUCHING * TOUCHING * reach:
+        if size == 4 or square <= TOUCHING * TOUCHING * reach:  # M has the origin within four points: to rounding
             return 0.0
     prism = dot(axis, axis) > 0
     if square <= SHORT * SHORT * reach and size == (2 if prism else 3):

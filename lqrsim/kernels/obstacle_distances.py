@@ -1,6 +1,6 @@
 """Distances of many robots to all obstacles. Written in the kernels' subset."""
 
-from math import inf
+from math import inf, isnan
 
 from lqrsim.kernels.declarations import ROW, outline, stack
 from lqrsim.kernels.hull_distance import MESH, hull_distance
@@ -56,6 +56,6 @@ def nearest_to(obstacles, data, point, displaced, first):
             distance = hull_distance(data, ROW * k, there, 0, 1, corner_slopes)
         else:
             distance = signed_distance(data, ROW * k, there[0], there[1], there[2])
-        if not distance >= least:  # a NaN stays
+        if distance < least or isnan(distance):
             least = distance
     return least
