@@ -105,6 +105,7 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.certify import no_value
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
@@ -797,6 +798,21 @@ class TestRareEnds:
             given = Q.copy(), np.array([0.1, 0.2, 0.3]), 1.5, X.copy(), to_go, to_come
             _, good = replay(dual, SIZES, "initial_cost_to_come", *given)
             assert good == (Q.min() >= 0)
+
+    @pytest.mark.parametrize("knot", [1, 2, 4])
+    @pytest.mark.parametrize("state", [0, 1, 2])
+    def test_a_certificate_says_that_a_number_is_none(self, knot: int, state: int) -> None:
+        """Whatever is finite before and after it, of other states, too."""
+        one = problem(steps=6)
+        run = SolveRun(one, settings_of(), resolve(None, one), np.zeros(3), Budget(10))
+        run.roll_out()
+        found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
+        out = np.zeros(1, CERTIFICATE)
+        arguments = run._check_arguments(declarations.EVALUATE, found, no_value(found.states), out)
+        found.plan.states[knot, state] = np.nan
+        replay(compiled.with_form("dual"), sizes_of(one), "smoother", *with_rows(arguments))
+        assert np.isnan(out[0]["dynamics_residual"])
+        assert np.isnan(out[0]["policy_residual"])
 
     def test_steps_of_linear_quadratic_problems_that_fail(self) -> None:
         """Backward, forward, and of their sum; what is returned tells which."""

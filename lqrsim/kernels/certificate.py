@@ -5,7 +5,7 @@ line searches that found the plan. The cost is the value that comes with the der
 `certify.py` compares the results with a solver's claims.
 """
 
-from math import inf, nan
+from math import inf, isnan, nan
 
 from lqrsim.kernels.cost_to_go import minimize_control
 from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
@@ -95,9 +95,7 @@ def certify(settings, of_policy, plan, policy, to_go, model, row):
         terms = scale_of(x, u, stage)
         scale += terms
         for i in range(N):
-            difference = abs(states[t + 1, i] - arrived[i])
-            if not difference <= residual[i]:  # a NaN stays
-                residual[i] = difference
+            residual[i] = larger(residual[i], abs(states[t + 1, i] - arrived[i]))
         for i in range(M):
             change_limits.low[i], change_limits.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
             limits = max(limits, change_limits.low[i], -change_limits.high[i])
@@ -120,8 +118,7 @@ def certify(settings, of_policy, plan, policy, to_go, model, row):
         decrease += start_decrease(stage, hessians[0], SQUARES * terms, costate)
     worst = 0.0
     for i in range(N):
-        if not residual[i] <= worst * size[i]:
-            worst = residual[i] / size[i]
+        worst = larger(worst, residual[i] / size[i])
     if uncurved > 0:  # where nothing is curved, as with a cost of the final state alone, the cost itself is typical
         decrease += uncurved / (2 * WEIGHT * max(typical, abs(cost), row.typical))
     row.cost, row.scale, row.typical, row.dynamics_residual = cost, scale, typical, worst
@@ -162,7 +159,7 @@ def policy_residual(x, u, gain, offset, limits, worst):
             total += gain[i, j] * x[j]
             terms += abs(gain[i, j] * x[j])
         difference = abs(min(max(total, limits.low[i]), limits.high[i]) - u[i])
-        if not difference <= worst * terms:
+        if not isnan(worst) and not difference <= worst * terms:
             worst = difference / max(terms, 1e-300)
     return worst
 
