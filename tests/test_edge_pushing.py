@@ -23,7 +23,10 @@ from sympy import Abs, Heaviside, Max, Min, Mod, Piecewise, atan2, cos, exp, flo
 
 import lqrsim as ls
 from lqrsim import rotations
-from lqrsim.codegen.edge_pushing import Operations, hessian_of
+from lqrsim.codegen.edge_pushing import Operations, hessian_of, jacobian_of
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.sources import text_source
+from lqrsim.codegen.symbolic import without_kinks, write_function
 from lqrsim.errors import Array
 
 # Each maps numbers of size 1 to numbers of size 1, so that rounding stays what it is. Some are undefined in a case of
@@ -119,6 +122,46 @@ def test_of_drawn_formulas(draw: st.DataObject, seed: int) -> None:
     found = compiled_hessian(dynamics, at[:2].copy(), at[2:3].copy(), weights)
     # Some hundred operations on numbers of size 1, whose derivatives grow.
     np.testing.assert_allclose(found, wanted, atol=1e-11 * max(1.0, np.abs(wanted).max()))
+
+
+def swept_jacobian(formulas: list[Any], symbols: list[Any], at: Array) -> Array:
+    """The first derivatives of formulas of x, u and p, by a sweep forward."""
+    operations, found = Operations(), np.zeros((len(formulas), len(symbols) - 1))
+    names = operations.of([without_kinks(one) for one in formulas])
+    slopes = jacobian_of(operations, names, symbols[:-1])
+    values = {f"out[{i}, {j}]": slope for (i, j), slope in slopes.items()}
+    if not values:
+        return found
+    text = write_function("slopes", "x, u, p, out", "p", values, of="f", steps=operations.steps)
+    slopes_at = plain_functions(text_source(text), {}, ["slopes"])["slopes"]
+    with np.errstate(all="ignore"):
+        slopes_at(at[:2], at[2:3], at[3:], found)
+    return found
+
+
+@settings(max_examples=examples(30))
+@given(draw=st.data(), seed=st.integers(0, 2**32 - 1))
+def test_slopes_of_drawn_formulas(draw: st.DataObject, seed: int) -> None:
+    """Against SymPy's derivatives of the whole formulas, which need no product of a case that does not apply."""
+    symbols = list(sympy.symbols("x0 x1 u0 p0", real=True))
+    formulas = drawn(lambda count: draw.draw(st.integers(0, count - 1)), symbols)
+    at = np.append(np.random.default_rng(seed).uniform(-1, 1, 3), 0.7)
+    with np.errstate(all="ignore"):
+        wanted = np.hstack(dynamics_of(formulas, symbols).rate_jacobian(at[:2], at[2:3]))
+    found = swept_jacobian(formulas, symbols, at)
+    np.testing.assert_allclose(found, wanted, atol=1e-12 * max(1.0, np.abs(wanted).max()))
+
+
+@pytest.mark.parametrize("of", NODES[14:17])
+@pytest.mark.parametrize("a", [-0.5, 0.0, 0.5])
+@pytest.mark.parametrize("b", [-0.3, 0.0, 0.7])
+def test_slopes_of_a_case_that_does_not_apply_may_be_undefined(of: Callable[..., Any], a: float, b: float) -> None:
+    """Also of a root at the end of where it is defined, which something larger hides."""
+    symbols, at = list(sympy.symbols("x0 x1 u0 p0", real=True)), np.array([a, b, 0.2, 0.7])
+    formulas = [of(*symbols[:3]) ** 2, Max(sqrt(Max(symbols[0], 0)), 0.9) + Min(log(1 + symbols[1] ** 2), symbols[2])]
+    with np.errstate(all="ignore"):
+        wanted = np.hstack(dynamics_of(formulas, symbols).rate_jacobian(at[:2], at[2:3]))
+    np.testing.assert_allclose(swept_jacobian(formulas, symbols, at), wanted, atol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -169,20 +169,46 @@ def hessian_of(
     return operations.steps, {pair: curve for pair, curve in curves.items() if curve != 0}
 
 
+def _cases_of(operation: Any) -> tuple[Any, ...]:
+    """The condition of an operation that chooses, and what it chooses from if it holds and if not; else None alone."""
+    import sympy
+
+    own = own_functions()
+    if isinstance(operation, own.choice):
+        return operation.args
+    if isinstance(operation, own.max | own.min):
+        one, other = operation.args
+        relation = sympy.Gt if isinstance(operation, own.max) else sympy.Lt
+        return relation(other, one, evaluate=False), other, one
+    return (None,)
+
+
 def jacobian_of(operations: Operations, results: Sequence[Any], variables: Sequence[Any]) -> dict[tuple[int, int], Any]:
     """The first derivatives of formulas that are operations, by one sweep forward; steps are added to the operations.
 
-    They are by (row, variable), where they are not always zero.
+    They are by (row, variable), where they are not always zero. Those of a choice are of the case that applies alone:
+    in others they may be infinite, and a product with zero would be NaN.
     """
     import sympy
 
     slopes: dict[Any, dict[int, Any]] = {symbol: {j: sympy.Integer(1)} for j, symbol in enumerate(variables)}
     for symbol, operation in list(operations.steps):
         terms: dict[int, list[Any]] = defaultdict(list)
-        for a in sorted(operation.free_symbols & slopes.keys(), key=str):
-            slope = operations.name(without_kinks(operation.diff(a)))
-            for j, inner in slopes[a].items():
-                terms[j].append(slope * inner)
+        condition, *cases = _cases_of(operation)
+        if cases:
+            used = [
+                (k, a) for k, case in enumerate(cases) for a in case.free_symbols & slopes.keys()
+            ]  # at most one each
+            for j in sorted({j for _, a in used for j in slopes[a]}):
+                parts = [sympy.Integer(0)] * 2
+                for k, a in used:
+                    parts[k] = operations.name(cases[k].diff(a) * slopes[a].get(j, 0))
+                terms[j].append(own_functions().choice(condition, *parts))
+        else:
+            for a in sorted(operation.free_symbols & slopes.keys(), key=str):
+                slope = operations.name(without_kinks(operation.diff(a)))
+                for j, inner in slopes[a].items():
+                    terms[j].append(slope * inner)
         derivatives = {j: operations.name(sympy.Add(*parts)) for j, parts in terms.items()}
         if derivatives:
             slopes[symbol] = {j: slope for j, slope in derivatives.items() if slope != 0}
