@@ -320,6 +320,19 @@ def test_functions_of_one_number(name: str) -> None:
     assert of_int == out[given == 1][0]
 
 
+@pytest.mark.parametrize("name", language.UNARY)
+def test_functions_of_one_number_in_plain_python(name: str) -> None:
+    """Infinite and NaN where the compiled ones are: at poles, beyond all floats, and where nothing is defined."""
+    text = f"def f(x, n, out):\n    for i in range(n):\n        out[i] = {name}(x[i])\n"
+    given = np.concatenate([POINTS, ODD, [-0.0, -2.0, 0.5, 171.0, 172.0, -200.5, 1e-310, -1e-310, 1e306, -1e300]])
+    found, wanted = np.empty(len(given)), np.empty(len(given))
+    run(text, "f", given, len(given), wanted)
+    with np.errstate(all="ignore"):
+        plain_functions(text_source(text), {}, ["f"])["f"](given, len(given), found)
+    np.testing.assert_array_equal(np.isfinite(found), np.isfinite(wanted))
+    np.testing.assert_array_equal(found[~np.isfinite(found)], wanted[~np.isfinite(wanted)])
+
+
 @pytest.mark.parametrize("name", language.BINARY)
 def test_functions_of_two_numbers(name: str) -> None:
     given = np.array([-2.5, -1.0, -0.0, 0.0, 0.5, 1.0, 3.0, 1e10, NAN, INF, -INF])

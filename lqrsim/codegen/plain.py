@@ -104,7 +104,7 @@ def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
     words |= {f"{side}{name}": getattr(np, f"arc{name}") for name in ("sin", "cos", "tan") for side in "a"}
     words |= {f"a{name}h": getattr(np, f"arc{name}h") for name in ("sin", "cos", "tan")}
     words |= {"atan2": np.arctan2, "pow": np.power}
-    words |= {name: _quietly(getattr(math, name)) for name in ("erf", "erfc", "gamma", "lgamma")}
+    words |= {"erf": math.erf, "erfc": math.erfc, "gamma": _gamma, "lgamma": _lgamma}
     return words | {
         "stack": lambda *shape: np.empty(shape), "zeros": lambda *shape: np.zeros(shape),
         "call": call, "call_for_value": call_for_value,
@@ -116,14 +116,22 @@ def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _quietly(function: Callable[[float], float]) -> Callable[[float], float]:
-    def run(number: float) -> float:
-        try:
-            return function(number)
-        except (ValueError, OverflowError):
-            return math.nan
+def _gamma(number: float) -> float:
+    """As the C library's: infinite beyond all floats and at zero, of its sign, and NaN at its other poles."""
+    try:
+        return math.gamma(number)
+    except OverflowError:
+        return math.copysign(math.inf, number)
+    except ValueError:
+        return math.copysign(math.inf, number) if number == 0 else math.nan
 
-    return run
+
+def _lgamma(number: float) -> float:
+    """As the C library's: infinite at poles and beyond all floats."""
+    try:
+        return math.lgamma(number)
+    except (ValueError, OverflowError):
+        return math.inf
 
 
 def _flattened(arguments: Sequence[Any]) -> list[Any]:
