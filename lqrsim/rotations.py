@@ -102,6 +102,9 @@ def rotation_vector(quaternion: npt.ArrayLike, *, turns_about: str | None = None
       InputError: the argument is not numbers of this shape, or there is no such axis.
     """
     rows = vectors_of("quaternion", quaternion, 4)
+    # Times a power of two, which is exact, so that squares neither underflow nor overflow.
+    _, exponents = np.frexp(np.abs(rows).max(axis=-1, keepdims=True))
+    rows = np.ldexp(rows, 1 - exponents)
     if turns_about is not None:
         along = _index(turns_about)
         sign = np.copysign(1.0, rows[..., 0])

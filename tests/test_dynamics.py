@@ -166,7 +166,7 @@ def test_quaternions_and_rotation_vectors_are_scipys() -> None:
     found = Rotation.random(50, rng=np.random.default_rng(5))
     there = rotations.quaternion(found.as_rotvec())
     np.testing.assert_allclose(np.abs(np.sum(there * found.as_quat(scalar_first=True), axis=1)), 1, rtol=0, atol=1e-12)
-    for factor in (1.0, -1.0, 3.0):
+    for factor in (1.0, -1.0, 3.0, 1e-13, 1e-200, -1e200):
         np.testing.assert_allclose(rotations.rotation_vector(factor * there), found.as_rotvec(), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(rotations.rotation_vector(there[3]), rotations.rotation_vector(there)[3])
     np.testing.assert_array_equal(rotations.rotation_vector([1, 0, 0, 0]), np.zeros(3))
@@ -192,7 +192,7 @@ def test_turns_after_tilts_are_scipys(axis: str, seed: int) -> None:
     found = Rotation.from_rotvec(turn * along) * Rotation.from_rotvec(tilt)
     there = rotations.quaternion(turn * along + tilt, turns_about=axis)
     np.testing.assert_allclose(np.abs(np.sum(there * found.as_quat(scalar_first=True), axis=1)), 1, rtol=0, atol=1e-12)
-    for factor in (1.0, -3.0):
+    for factor in (1.0, -3.0, 1e-13, -1e-200, 1e200):
         back = rotations.rotation_vector(factor * there, turns_about=axis)
         np.testing.assert_allclose(np.where(along, 0.0, back), tilt, rtol=0, atol=1e-12)
         turned = back @ along
