@@ -41,6 +41,14 @@ def test_a_large_penalty_does_not_spoil_the_certified_cost() -> None:
         assert contradictions(drawn.problem, solution, drawn.rate) == []
 
 
+def test_a_plan_that_needs_one_more_iteration_says_so() -> None:
+    """The interior point had ended with the last iteration that was allowed, inside the constraints: NOT_CERTIFIED."""
+    drawn = draws.draw("tracking", 1501)
+    solutions = draws.solve(drawn)
+    assert [contradictions(drawn.problem, solution, drawn.rate) for solution in solutions] == [[] for _ in solutions]
+    assert Status.MAX_ITERATIONS in {solution.status for solution in solutions}
+
+
 def test_every_kind_can_be_drawn() -> None:
     assert set(KINDS) < set(draws.KINDS)
     for kind in draws.KINDS:

@@ -196,17 +196,18 @@ class Budget:
     def joined_with_last(self, method: str) -> Iterator[None]:
         """Temporarily count a single further iteration, which only evaluates the plan, as part of the last iteration.
 
-        The callback is called at the end.
+        So is the last of several, if it is one more than are allowed. The callback is called at the end.
         """
         begin, callback, self._callback = len(self.log), self._callback, None
         try:
             yield
         finally:
             self._callback = callback
-            if begin and len(self.log) == begin + 1:
+            alone = len(self.log) == begin + 1
+            if begin and (alone or len(self.log) > max(begin, self._most)):
                 last, look = self.log[-2:]
-                self.log[begin - 1 :] = [replace(look, method=method, seconds=last.seconds + look.seconds)]
-            else:
+                self.log[-2:] = [replace(look, method=method, seconds=last.seconds + look.seconds)]
+            if not (begin and alone):
                 self._call(self.log[begin:])
 
 

@@ -504,6 +504,8 @@ class SolveRun:
             return result
         if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
             return replace(result, status=Status.NOT_POSITIVE_DEFINITE)
+        if result.status is Status.CONVERGED and not self.budget.left:  # where more iterations might have gone on
+            return replace(result, status=Status.MAX_ITERATIONS)
         return replace(result, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
     def _checked(self, task: int, result: RunResult, to_go: CostToGo, violation: float) -> tuple[Certificate, float]:
