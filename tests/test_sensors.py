@@ -28,6 +28,7 @@ from lqrsim.disturbances import (
     Unknown,
 )
 from lqrsim.errors import InputError
+from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress.study import disturbances_as_json, disturbances_from_json
 
@@ -127,6 +128,40 @@ def sensordata(plant, states, controls, forces):
     data.ctrl[:], data.xfrc_applied[plant.body] = controls, forces
     mujoco.mj_forward(model, data)
     return {model.sensor(i).name: data.sensor(i).data.copy() for i in range(model.nsensor)}
+
+
+# A puck between a floor and a wall, with rays along each axis and a camera with rays to both sides of the horizon.
+LOOKING = """<mujoco><worldbody><geom type="plane" size="0 0 1"/><geom type="box" size="0.1 1 2" pos="-2 0 0"/>
+  <body name="puck" pos="0 0 1"><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1"/>{sites}
+    <camera name="eye" pos="0.2 0 0" xyaxes="0 -1 0 0 0 1" resolution="2 4"/></body></worldbody>
+  <actuator><motor joint="x"/></actuator><sensor>{sensors}</sensor></mujoco>"""
+DIRECTIONS = {"down": "0 0 -1", "up": "0 0 1", "back": "-1 0 0", "ahead": "1 0 0", "aside": "0 1 0"}
+FIELDS = ("dist", "dir", "origin", "point", "normal", "depth")
+
+
+@pytest.mark.parametrize("fields", [*FIELDS, "dist dir", "dir normal", "origin depth", " ".join(FIELDS)])
+def test_a_ray_that_meets_nothing_has_no_reading_and_any_other_is_mujocos(fields):
+    """A direction of -1 is one, whatever a distance of -1 means."""
+    sites = "".join(f'<site name="{name}" zaxis="{way}"/>' for name, way in DIRECTIONS.items())
+    finders = [*((name, f'site="{name}"') for name in DIRECTIONS), ("eye", 'camera="eye"')]
+    elements = (f'<rangefinder name="{name}" {where} data="{fields}"/>' for name, where in finders)
+    robot = ls.MjcfRobot(scene_from_xml(LOOKING.format(sites=sites, sensors="".join(elements)), "puck"))
+    sensors = ls.Plant(robot, robot.scene).sensors([Sensor(name) for name, _ in finders])
+    model, columns = robot.scene.model, [field for field in FIELDS if field in fields.split()]
+    widths = [1 if field in ("dist", "depth") else 3 for field in columns]
+    tells = np.repeat([field != "origin" for field in columns], widths)
+    for x in (-0.3, 0.1, 1.0):
+        data = mujoco.MjData(model)
+        data.qpos[:] = x
+        mujoco.mj_forward(model, data)
+        expected = data.sensordata.reshape(-1, len(tells)).copy()
+        puck, hit = model.body("puck").id, np.zeros(1, np.int32)
+        ways = np.array([way.split() for way in DIRECTIONS.values()], dtype=np.float64)
+        met = [mujoco.mj_ray(model, data, [x, 0.0, 1.0], way, None, 1, puck, hit) >= 0 for way in ways]
+        met += [False] * 4 + [True] * 4  # the rows of pixels, the upper ones first
+        expected[np.ix_(~np.array(met), tells)] = np.nan
+        read = sensors.reader()(np.array([[x, 0.0]]), np.zeros((1, 1)), np.zeros((1, 6)))
+        np.testing.assert_allclose(read[0].reshape(expected.shape), expected, rtol=0, atol=1e-12)
 
 
 def test_what_is_read_is_mujocos_sensordata_at_its_time(cage, plan):

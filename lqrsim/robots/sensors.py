@@ -23,7 +23,9 @@ _REFUSED = {
     getattr(_TYPES, f"mjSENS_{name}")
     for name in ("TOUCH", "CONTACT", "TACTILE", "INSIDESITE", "CLOCK", "USER", "PLUGIN", "GEOMNORMAL", "GEOMFROMTO")
 }
-_NO_HIT = -1.0  # what a rangefinder reads if its ray meets nothing
+# What a rangefinder reads if its ray meets nothing, in MuJoCo's order: the distance, direction, origin, point, normal
+# and depth. The origin does not tell, and stays.
+_NO_HIT = [-1.0], [0.0] * 3, [np.nan] * 3, [0.0] * 3, [0.0] * 3, [-1.0]
 _QUATERNIONS = _TYPES.mjSENS_FRAMEQUAT, _TYPES.mjSENS_BALLQUAT  # a reading of these and its negative mean the same
 _ROUNDING = 1e-9  # fraction of a control period within which a time counts as that of a knot
 
@@ -85,7 +87,11 @@ class RobotSensors:
         self.columns = tuple(slice(first, end) for first, end in ends)
         places = zip(model.sensor_adr[numbers].tolist(), self._sizes, strict=True)
         self._places = np.concatenate([first + np.arange(size) for first, size in places])
-        self._rangefinders = np.repeat([kind == _TYPES.mjSENS_RANGEFINDER for kind in kinds], self._sizes)
+        self._rays = [
+            (columns, _no_hit_of(model, number))
+            for columns, number, kind in zip(self.columns, numbers, kinds, strict=True)
+            if kind == _TYPES.mjSENS_RANGEFINDER
+        ]
         pairs = zip(stated, self._sizes, strict=True)
         self.names = tuple(
             f"{sensor.name}[{i}]" if size > 1 else sensor.name for sensor, size in pairs for i in range(size)
@@ -123,7 +129,10 @@ class RobotSensors:
     def readings(self, sensordata: Array) -> Array:
         """The readings (K, Y) from MuJoCo's `sensordata` (K, any); NaN where a rangefinder's ray meets nothing."""
         readings = sensordata[:, self._places]
-        readings[(readings == _NO_HIT) & self._rangefinders] = np.nan
+        for columns, no_hit in self._rays:
+            rays, tells = readings[:, columns].reshape(len(readings), -1, len(no_hit)), ~np.isnan(no_hit)
+            missed = (rays == no_hit)[..., tells].all(axis=2, keepdims=True)
+            readings[:, columns] = np.where(missed & tells, np.nan, rays).reshape(len(readings), -1)
         return readings
 
     def reader(self) -> Reader:
@@ -150,6 +159,12 @@ class RobotSensors:
             return self.readings(sensordata)
 
         return read
+
+
+def _no_hit_of(model: mujoco.MjModel, number: int) -> Array:
+    """What each ray of a rangefinder reads if it meets nothing."""
+    fields = int(model.sensor_intprm[number, 0])
+    return np.concatenate([reading for bit, reading in enumerate(_NO_HIT) if fields >> bit & 1])
 
 
 def _completed(sensor: Sensor, model: mujoco.MjModel, number: int) -> Sensor:
