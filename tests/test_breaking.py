@@ -22,6 +22,20 @@ def test_beyond_a_plane_the_nearest_failure_and_its_estimate_are_exact(size: int
     assert found.first_order_probability == pytest.approx(stats.norm.sf(found.distance), rel=1e-9)
 
 
+@pytest.mark.parametrize("passing", [-1.0, -np.inf])
+@pytest.mark.parametrize("failing", [1.0, np.inf])
+@pytest.mark.parametrize("seed", range(3))
+def test_scores_without_a_slope_may_be_infinite(passing: float, failing: float, seed: int) -> None:
+    """As of a robot without obstacles that diverges, or a score that only says whether a trial fails."""
+    rng = np.random.default_rng(seed)
+    normal = rng.standard_normal(10)
+    normal /= np.linalg.norm(normal)
+    failures = 5 * normal + rng.standard_normal((20, 10))
+    found = smallest_failure(lambda z: np.where(z @ normal > 2.5, failing, passing), 10, failures=failures, seed=seed)
+    assert found.converged
+    assert 2.5 < found.distance < 2.53
+
+
 def test_many_numbers_take_longer_but_get_there() -> None:
     """Of 500 numbers, random failures are 22 away; what they have in common is 4."""
     normal = np.full(500, 1 / np.sqrt(500))

@@ -163,9 +163,10 @@ def _gradients(score: Score, best: Array, pairs: int, rng: np.random.Generator) 
     """Estimate the gradient of the score at the best failure from each half of the pairs, (2, d)."""
     steps = SPREAD * rng.standard_normal((pairs, len(best))) / np.sqrt(len(best))
     scores = score(np.concatenate([best + steps, best - steps]))
-    # Trials that diverge have an infinite score; it counts as slightly worse than the worst finite score.
-    highest = scores[np.isfinite(scores)].max(initial=0.0)
-    scores = np.minimum(scores, highest + 1.0)
+    # Trials that diverge have an infinite score; it counts as slightly worse than the worst finite score, and one of
+    # minus infinity, as without obstacles, as slightly better than the best.
+    finite = scores[np.isfinite(scores)]
+    scores = scores.clip(finite.min(initial=0.0) - 1.0, finite.max(initial=0.0) + 1.0)
     difference = scores[:pairs] - scores[pairs:]
     half = pairs // 2
     parts = [difference[:half] @ steps[:half], difference[half:] @ steps[half:]]
