@@ -17,6 +17,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.derivative_check import evaluate
+from lqrsim.scenes.mjcf_obstacles import levers
 from lqrsim.scenes.scene import scene_from_xml
 
 SHAPES = {
@@ -95,6 +96,41 @@ def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str
         assert (distance | kink[:3].any(axis=0) | (middle < 0)).all()
         np.testing.assert_allclose(np.where(kink | ~distance, slope.T, one), slope.T, rtol=0, atol=2e-4)
         np.testing.assert_allclose(np.linalg.norm(slope[:, :3], axis=1), 1.0, rtol=0, atol=1e-9)
+
+
+def chain(rng: np.random.Generator) -> str:
+    """An MJCF of links with joints beside their origins, whose rest may be far from their zero."""
+    xml, closing = "<mujoco><worldbody>", ""
+    for number in range(4):
+        pos, place, axis = (" ".join(map(str, size * rng.normal(size=3))) for size in (0.1, 0.1, 1.0))
+        kind, (low, high) = rng.choice(["slide", "hinge", "ball"]), np.sort(rng.uniform(-2, 2, 2))
+        stated = {
+            "slide": f'axis="{axis}" ref="{rng.uniform(-3, 3)}" range="{low} {high}" limited="true"',
+            "hinge": f'axis="{axis}" ref="{rng.uniform(-90, 90)}"', "ball": "",
+        }[kind]  # fmt: skip
+        xml += f'<body pos="{pos}"><joint name="j{number}" type="{kind}" pos="{place}" {stated}/>'
+        xml += f'<geom type="capsule" size="0.1 0.3" pos="{place}"/>'
+        closing += "</body>"
+    return f'{xml}{closing}</worldbody><actuator><motor joint="j0"/></actuator></mujoco>'
+
+
+@settings(max_examples=examples(20))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_joint_moves_a_point_by_more_than_its_lever(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(chain(rng))
+    data, moves, turns, bounds = mujoco.MjData(model), np.zeros((3, model.nv)), np.zeros((3, model.nv)), levers(model)
+    slides = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE))
+    for _ in range(50):
+        data.qpos[:] = rng.uniform(-4, 4, model.nq)
+        data.qpos[model.jnt_qposadr[slides]] = rng.uniform(*model.jnt_range[slides].T)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for geom in range(model.ngeom):
+            mujoco.mj_jacGeom(model, data, moves, turns, geom)
+            reach = np.linalg.norm(moves, axis=0) + model.geom_rbound[geom] * np.linalg.norm(turns, axis=0)
+            assert (reach <= bounds + 1e-9).all(), f"{reach} by {bounds}"
 
 
 @settings(max_examples=examples(10))

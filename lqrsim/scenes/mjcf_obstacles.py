@@ -152,15 +152,16 @@ def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
 def levers(model: mujoco.MjModel) -> Array:
     """The largest distance that any point of the robot moves per degree of freedom, (nv,): in m/rad, or 1 for slides.
 
-    It holds for any joint angles. Slides between a joint and the body that it turns count with their range, or 1 m
-    without a range.
+    It holds for any joint angles. Slides between a joint and the body that it turns count with the farthest that their
+    range lets them move from rest, or 1 m without a range.
     """
     reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
     arms = np.ones(model.nv)
     for joint in range(model.njnt):
         spans[model.jnt_bodyid[joint]] += 2 * np.linalg.norm(model.jnt_pos[joint])
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-            spans[model.jnt_bodyid[joint]] += np.abs(model.jnt_range[joint]).max() if model.jnt_limited[joint] else 1.0
+            moved = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]  # from rest, which is at `ref`
+            spans[model.jnt_bodyid[joint]] += np.abs(moved).max() if model.jnt_limited[joint] else 1.0
     for geom in solid_geoms(model).tolist():
         body = int(model.geom_bodyid[geom])
         reach[body] = max(reach[body], float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom]))
@@ -243,12 +244,12 @@ def _carried_by(model: mujoco.MjModel, pairs: Pairs, *kinds: int) -> npt.NDArray
 
 
 def _random_positions(model: mujoco.MjModel) -> Array:
-    """Random positions (_POSITIONS, nq) of all joints but free ones; slides without a range move up to 1 m."""
+    """Random positions (_POSITIONS, nq) of all joints but free ones; slides without a range are within 1 m of rest."""
     rng, positions = np.random.default_rng(0), np.tile(model.qpos0, (_POSITIONS, 1))
     slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
     single = slides | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
-    span = np.where(slides, 1.0, np.pi)
-    low, high = np.where(model.jnt_limited, model.jnt_range.T, [-span, span])[:, single]
+    span, rest = np.where(slides, 1.0, np.pi), model.qpos0[model.jnt_qposadr]
+    low, high = np.where(model.jnt_limited, model.jnt_range.T, [rest - span, rest + span])[:, single]
     positions[:, model.jnt_qposadr[single]] = rng.uniform(low, high, (_POSITIONS, len(low)))
     for first in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]:
         turns = rng.standard_normal((_POSITIONS, 4))
