@@ -100,6 +100,79 @@ def test_masses_however_they_came_about(compiler: str) -> None:
     np.testing.assert_allclose(after.body_iquat, before.body_iquat, atol=1e-15)
 
 
+# A free body that MuJoCo gives the axes of its inertia; geoms are where they are on it, whatever its mass is.
+ALIGNED = """<mujoco><compiler alignfree="{all}"/><worldbody>
+  <body name="stone" pos="0 0 1" euler="{turn}">{joint}
+    <geom type="capsule" size="0.05" fromto="0 0 0 1 0 0" mass="{a}"/>
+    <geom size="0.1" pos="{place}" mass="{b}"/></body></worldbody>
+  <actuator><motor name="pull" joint="free" gear="1 0 0 0 0 0"/></actuator></mujoco>"""
+ALIGNING = {
+    "its own": {"joint": '<freejoint name="free" align="true"/>'},
+    "of all": {"joint": '<freejoint name="free"/>', "all": "true"},
+    "of all joints": {"joint": '<joint type="free" name="free"/>', "all": "true"},
+    "none": {"joint": '<freejoint name="free"/>'},
+}
+
+
+@pytest.mark.parametrize("aligning", ALIGNING)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_free_body_of_another_mass_keeps_its_shape_where_mujoco_aligns_it(aligning: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, place = (" ".join(map(str, rng.uniform(-1, 1, 3))) for _ in range(2))
+    stated = {"all": "false", "turn": turn, "place": place, **ALIGNING[aligning]}
+    robot, expected = (
+        ls.MjcfRobot(scene_from_xml(ALIGNED.format(**stated, a=scale * 0.5, b=scale * 0.2), "stone"))
+        for scale in (1, 3)
+    )
+    model, wanted = robot.with_parameters(stone_mass=2.1).scene.model, expected.scene.model
+    assert (np.abs(wanted.body_ipos).max() < 1e-9) == (aligning != "none"), "it is not aligned"
+    for field in ("body_pos", "body_ipos", "body_mass", "body_inertia", "geom_pos"):
+        np.testing.assert_allclose(getattr(model, field), getattr(wanted, field), atol=1e-12, err_msg=field)
+
+
+# A spring of a frequency, and servos of a damping ratio, which MuJoCo computes from masses.
+DAMPED = """<mujoco><default>{of_class}</default><worldbody><body name="arm">
+  <joint name="hinge" axis="0 1 0" armature="0.1" {spring}/><geom type="capsule" size="0.05" fromto="0 0 0 1 0 0"/>
+  </body></worldbody><actuator><{servo} name="turn" joint="hinge" {damping}/></actuator></mujoco>"""
+DAMPERS = {
+    "spring": {"spring": 'springdamper="0.5 0.3"', "servo": "motor"},
+    "spring of a class": {"of_class": '<joint springdamper="0.5 0.3"/>', "servo": "motor"},
+    "position": {"servo": "position", "damping": 'kp="9" dampratio="0.7"'},
+    "position of a class": {"of_class": '<position dampratio="0.7"/>', "servo": "position", "damping": 'kp="9"'},
+    "integrated": {"servo": "intvelocity", "damping": 'kp="9" dampratio="0.7" actrange="-1 1"'},
+    "general": {"servo": "general", "damping": 'gainprm="9" biastype="affine" biasprm="0 -9 0.7"'},
+    "spring and servo": {"spring": 'springdamper="0.5 0.3"', "servo": "position", "damping": 'kp="9" dampratio="1"'},
+}
+CHANGES = [{"mass": 3.0}, {"arm_mass": 20.0}, {"hinge_stiffness": 2.0}, {"hinge_damping": 1.5}, {"hinge_armature": 0.3}]
+
+
+@pytest.mark.parametrize("damper", DAMPERS)
+@pytest.mark.parametrize("change", CHANGES, ids=str)
+def test_a_number_is_changed_and_no_other_where_mujoco_computes_them(damper: str, change: dict[str, float]) -> None:
+    stated = {"of_class": "", "spring": "", "damping": ""} | DAMPERS[damper]
+    robot = ls.MjcfRobot(scene_from_xml(DAMPED.format(**stated), "arm"))
+    changed = robot.with_parameters(**change)
+    expected = robot.dynamics.numbers | change
+    mass = change.get("mass", change.get("arm_mass", expected["mass"]))
+    assert changed.dynamics.numbers == pytest.approx(expected | {"mass": mass, "arm_mass": mass}, rel=1e-12)
+    for field in ("actuator_biasprm", "actuator_gainprm"):
+        before, after = (getattr(of.scene.model, field) for of in (robot, changed))
+        np.testing.assert_allclose(after, before, rtol=1e-12, err_msg=field)
+
+
+@pytest.mark.parametrize(
+    "others", ["", '<motor name="pull" joint="lift" gear="2"/>', '<position name="p" joint="lift"/>']
+)
+def test_all_numbers_of_a_robot_that_sticks_can_be_changed(others: str) -> None:
+    """Adhesion has a gear in the model, but none in the text."""
+    xml = f"""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 0.1"/><body name="foot" pos="0 0 0.1">
+      <joint name="lift" type="slide" axis="0 0 1"/><geom name="sole" size="0.1"/></body></worldbody>
+      <actuator><adhesion name="stick" body="foot" ctrlrange="0 1" gain="3"/>{others}</actuator></mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "foot"), position=())
+    for name, number in robot.dynamics.numbers.items():
+        assert robot.dynamics.with_parameters(**{name: number + 1.0}).numbers[name] == pytest.approx(number + 1.0)
+
+
 def test_changes_add_up_and_the_first_keeps_its_own() -> None:
     dynamics = robot_of().dynamics
     before, data = stepped(dynamics), dynamics.numbers

@@ -338,8 +338,9 @@ class MjcfModel:
             if (name := model.geom(number).name) in elements["geom"]:
                 numbers.append(Number("friction", name, float(model.geom_friction[number, 0])))
         for number, gear in enumerate(model.actuator_gear[model.actuator_outadr]):
-            if (name := model.actuator(number).name) in elements["actuator"] and gear.any():
-                numbers.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
+            element = elements["actuator"].get(model.actuator(number).name)
+            if element is not None and element.tag != "adhesion" and gear.any():  # adhesion has no gear in the text
+                numbers.append(Number("gear", element.attrib["name"], float(gear[np.abs(gear).argmax()])))
         numbers += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
         return {f"{number.part}_{number.what}" if number.part else number.what: number for number in numbers}
 
@@ -444,10 +445,13 @@ class MjcfModel:
     def with_numbers(self, values: Mapping[str, float], what: str) -> "MjcfModel":
         """The same with other `numbers`.
 
-        A body's inertia scales with its mass; `mass` scales all bodies. The numbers of a gear keep their ratios.
+        A body's inertia scales with its mass; `mass` scales all bodies. The numbers of a gear keep their ratios. What
+        MuJoCo computes from masses, by a `springdamper` or a `dampratio`, is as it was.
         """
         model, numbers, root = self.model, self.numbers, ElementTree.fromstring(self.xml)
         elements, scales = _elements(root), dict[str, float]()
+        if any(word in self.xml for word in ("springdamper", "dampratio", "biasprm")):
+            self._state_dampers(elements)
         for name, value in values.items():
             number = numbers[name]
             value = check_number(f"{what}: {name}", value, **_BOUNDS.get(number.what, {"at_least": 0.0}))
@@ -473,10 +477,11 @@ class MjcfModel:
                 _set(ElementTree.SubElement(root, "option"), number.what, [value])  # the last element takes precedence
         if not scales:
             return self._of(root)
+        unaligned = self._unaligned()
         for name, body in elements["body"].items():  # the compiled masses, in the place of what they came from
             for inertial in body.findall("inertial"):
                 body.remove(inertial)
-            compiled_body, scale = model.body(name), scales.get(name, 1.0)
+            compiled_body, scale = unaligned.body(name), scales.get(name, 1.0)
             if compiled_body.mass[0] > 0:
                 inertial = ElementTree.Element("inertial")
                 _set(inertial, "pos", compiled_body.ipos)
@@ -487,6 +492,37 @@ class MjcfModel:
         compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
         ElementTree.SubElement(root, "compiler", compiler)
         return self._of(root)
+
+    def _state_dampers(self, elements: dict[str, dict[str, ElementTree.Element]]) -> None:
+        """Write the numbers that MuJoCo computes by a `springdamper` of a joint or a `dampratio` of an actuator.
+
+        A `springdamper` takes precedence over stiffness and damping.
+        """
+        model, spec = self.model, self.spec()
+        for joint in spec.joints:
+            if (joint.springdamper > 0).all() and (element := elements["joint"].get(joint.name)) is not None:
+                number = model.joint(joint.name).id
+                _set(element, "springdamper", [0.0, 0.0])
+                _set(element, "stiffness", [model.jnt_stiffness[number], *model.jnt_stiffnesspoly[number]])
+                dof = model.jnt_dofadr[number]
+                _set(element, "damping", [model.dof_damping[dof], *model.dof_dampingpoly[dof]])
+        for actuator in spec.actuators:
+            element = elements["actuator"].get(actuator.name)
+            bias = model.actuator(actuator.name).biasprm
+            if element is not None and bias[2] < 0 < actuator.biasprm[2]:
+                element.attrib.pop("dampratio", None)
+                name, numbers = ("biasprm", bias) if element.tag == "general" else ("kv", [-bias[2]])
+                _set(element, name, numbers)
+
+    def _unaligned(self) -> mujoco.MjModel:
+        """The model with the axes of all bodies as in the text: MuJoCo may align those of free bodies with inertias."""
+        if "align" not in self.xml:
+            return self.model
+        root = ElementTree.fromstring(self.xml)
+        for joint in root.iter("freejoint"):
+            joint.set("align", "false")
+        ElementTree.SubElement(root, "compiler", {"alignfree": "false"})
+        return self._of(root).model
 
     def with_obstacles(self, world: World) -> "MjcfModel":
         """The same with these obstacles as further geoms, fixed to the world, which nothing touches."""
