@@ -55,6 +55,9 @@ def test_whole_numbers_and_choices_have_their_shares() -> None:
     assert stats.chisquare(np.bincount(draws.choice(3, 3000, p=(0.2, 0.5, 0.3))), (600, 1500, 900)).pvalue > 0.001
     assert sorted(draws.choice([4, 5, 6], 3, replace=False)) == [4, 5, 6]
     assert draws.used == 6003
+    pairs = draws.integers([2, 6], [4, 7], (1000, 2), endpoint=True)
+    assert stats.chisquare(np.bincount(pairs[:, 0])[2:]).pvalue > 0.001
+    assert stats.chisquare(np.bincount(pairs[:, 1])[6:]).pvalue > 0.001
 
 
 def test_sizes_are_those_of_numpy() -> None:
@@ -64,6 +67,8 @@ def test_sizes_are_those_of_numpy() -> None:
         ("standard_normal", {}), ("standard_normal", {"size": (2, 3)}), ("random", {}), ("random", {"size": 4}),
         ("normal", {"loc": [0.0, 1.0]}), ("normal", {"scale": 2.0}), ("uniform", {"low": [0.0, 1.0], "high": 2.0}),
         ("integers", {"low": 4}), ("integers", {"low": 1, "high": 3, "size": 5}), ("choice", {"a": 3}),
+        ("integers", {"low": [1, 2], "high": [5, 9]}), ("integers", {"low": [[1], [2]], "high": 4, "size": (2, 3)}),
+        ("integers", {"low": [3, 4, 5]}), ("integers", {"low": 2, "high": np.array([3, 4]), "endpoint": True}),
         ("choice", {"a": [1.5, 2.5], "size": (2, 2)}), ("choice", {"a": 4, "size": 2, "replace": False}),
     ):  # fmt: skip
         assert np.shape(getattr(draws, name)(**arguments)) == np.shape(getattr(numpy, name)(**arguments)), name

@@ -59,10 +59,13 @@ class PrescribedDraws:
     def exponential(self, scale: npt.ArrayLike = 1.0, size: Size = None) -> Any:
         return -np.asarray(scale) * np.log1p(-self.random(_shape(size, scale)))
 
-    def integers(self, low: int, high: int | None = None, size: Size = None, *, endpoint: bool = False) -> Any:
-        low, high = (0, low) if high is None else (low, high)
-        drawn = np.floor(self.random(size) * (high - low + endpoint)).astype(np.int64) + low
-        return int(drawn) if size is None else drawn
+    def integers(
+        self, low: npt.ArrayLike, high: npt.ArrayLike | None = None, size: Size = None, *, endpoint: bool = False
+    ) -> Any:
+        least, beyond = (np.asarray(side) for side in ((0, low) if high is None else (low, high)))
+        drawn = np.floor(self.random(_shape(size, least, beyond)) * (beyond - least + endpoint))
+        drawn = drawn.astype(np.int64) + least
+        return drawn if np.ndim(drawn) else int(drawn)
 
     def choice(
         self, a: int | npt.ArrayLike, size: Size = None, replace: bool = True, p: npt.ArrayLike | None = None
