@@ -227,6 +227,23 @@ def test_meshes_and_models_of_an_included_file_are_found_where_mujoco_finds_them
     np.testing.assert_array_equal(model.geom_size, wanted.geom_size)
 
 
+@pytest.mark.parametrize("own", ['meshdir="a"', 'assetdir="b"', 'meshdir="a" assetdir="b"', 'texturedir="b"', ""])
+@pytest.mark.parametrize("first", ['meshdir="a"', 'assetdir="b"', 'assetdir="a" meshdir="b"', ""])
+@pytest.mark.parametrize("second", ['assetdir="a"', 'meshdir="b"', ""])
+def test_meshes_are_in_the_folder_that_was_set_last(own, first, second, tmp_path):
+    """An assetdir also counts against an earlier meshdir, as when an included file has it."""
+    for number, folder in enumerate(("", "a", "b", "parts", "parts/a", "parts/b"), 1):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "claw.obj").write_text(TETRA.format(number / 10))
+    compilers = f"<compiler {first}/><compiler {second}/>"
+    arm = ARM.format(compilers, '<mesh name="claw" file="claw.obj"/>', 'mesh" mesh="claw')
+    (tmp_path / "parts" / "arm.xml").write_text(arm)
+    path, actuator = tmp_path / "scene.xml", '<actuator><motor joint="turn"/></actuator>'
+    path.write_text(f'<mujoco><compiler {own}/><include file="parts/arm.xml"/>{actuator}</mujoco>')
+    model, wanted = load_scene(path).model, mujoco.MjModel.from_xml_path(str(path))
+    np.testing.assert_array_equal(model.mesh_vert, wanted.mesh_vert)
+
+
 HAND = """<mujoco model="hand">{asset}<worldbody><body name="hand" pos=".5 0 0">
   <joint name="grip" range="-40 40"/><geom name="palm" size="{size}"/>{geom}<site name="tip" pos=".1 0 0"/>
 </body></worldbody><actuator><position name="grip" joint="grip" kp="3"/></actuator></mujoco>"""

@@ -114,9 +114,11 @@ def _flatten(path: Path) -> str:
     root = read(path)
     if root.tag != "mujoco":
         raise InputError(f"scene: got {path.name} with <{root.tag}> at its root, want <mujoco>")
-    settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
-    common, main = settings.get("assetdir", ""), folder.resolve()
-    folders = {kind: str(main / settings.get(kind, common)) for kind in ("meshdir", "texturedir")}
+    settings, main = {"meshdir": "", "texturedir": ""}, folder.resolve()
+    for compiler in root.iterfind("compiler"):  # an assetdir takes precedence over folders that were set before it
+        common = compiler.get("assetdir")
+        settings = {kind: compiler.get(kind, before if common is None else common) for kind, before in settings.items()}
+    folders = {kind: str(main / setting) for kind, setting in settings.items()}
     files = [(element, key) for element in root.iter() for key in element.attrib if key.startswith("file")]
     for element, key in files:  # the same rule, but from the folder of their kind, of which an <attach> has none
         kind, file_folder = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir"), folder_of[element]
