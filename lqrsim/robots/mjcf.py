@@ -90,8 +90,8 @@ class MjcfRobot(Robot):
         body that has mass, its own mass or the mass of bodies fixed to it.
       position: the 2 or 3 states that are the body's position in the world, in metres; by default found by MuJoCo's
         kinematics. () for none.
-      radius: radius of a ball about the body's origin that contains everything that may collide; by default the
-        smallest guaranteed one.
+      radius: radius of a ball about the body's origin that contains everything that may collide; by default that of one
+        which does so however joints turn about the origins of their bodies, with slides at rest.
       outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
         it has no position. A sphere gets one ball, a capsule a chain of balls, any other geom its bounding ball. The
         balls are cheap bounds of the colliding geoms, and pictures follow them.
