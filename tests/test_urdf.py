@@ -326,6 +326,32 @@ def test_masses_may_be_those_of_the_shapes(arm: Path) -> None:
     assert model.body("upper").mass[0] == pytest.approx(1000 * 0.2 * 0.04 * 0.04, rel=1e-12)  # water, as MuJoCo has it
 
 
+@pytest.mark.parametrize("base", ["fixed", "free"])
+@pytest.mark.parametrize("shaped", [("hand",), ("hand", "flange"), ("hand", "base"), ("hand", "flange", "base")])
+def test_a_mass_that_a_shape_gives_counts_once(arm: Path, base: Any, shaped: tuple[str, ...]) -> None:
+    """Of a link that is fixed to another, too, whatever its <inertial> says; links without a shape keep theirs."""
+    settings, box = '<mujoco><compiler inertiafromgeom="true"/></mujoco>', BOX.format("collision")
+    lower = f'<link name="lower">{INERTIAL.format(0.5)}'
+    links = {f'<link name="{link}">': f'<link name="{link}">{box}' for link in (*shaped, "left", "right")}
+    if links.pop('<link name="flange">', None):
+        links |= {'<link name="flange"/>': f'<link name="flange">{box}</link>'}
+    changed(arm, (lower + box, lower), *links.items(), ("</robot>", f"{settings}</robot>"))
+    model, water = ls.load_scene(arm, base=base).model, 1000 * 0.2 * 0.04 * 0.04
+    spec = mujoco.MjSpec.from_file(str(arm))
+    spec.compiler.fusestatic = False
+    if base == "free":
+        spec.worldbody.bodies[0].add_freejoint()
+    wanted, masses = spec.compile(), []
+    for candidate in (model, wanted):
+        data, matrix = mujoco.MjData(candidate), np.zeros((candidate.nv, candidate.nv))
+        data.qpos[-4:] = 0.1, 0.2, 0.01, 0.02
+        mujoco.mj_forward(candidate, data)
+        mujoco.mj_fullM(candidate, data, matrix)
+        masses.append(matrix)
+    np.testing.assert_allclose(masses[0], masses[1], rtol=0, atol=1e-9)
+    assert model.body("hand").mass[0] == pytest.approx(water, rel=1e-12)
+
+
 def test_links_that_overlap_at_zero_pass_through_each_other(arm: Path, caplog: pytest.LogCaptureFixture) -> None:
     """MuJoCo lets two collide that are two joints apart, and one with a fixed base."""
     block = '<collision><geometry><box size="2 0.2 0.9"/></geometry></collision>'

@@ -190,7 +190,8 @@ def _add_parts(mjcf: ElementTree.Element, spec: mujoco.MjSpec) -> None:
     for mesh in spec.meshes:
         # Meshes have no mass here, and a flat one has no volume.
         _add(assets, "mesh", {"name": mesh.name, "file": mesh.file, "inertia": "shell"}, scale=mesh.scale)
-    _add_body(_add(mjcf, "worldbody"), spec.worldbody)
+    dense = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    _add_body(_add(mjcf, "worldbody"), spec.worldbody, dense=dense)
     ties = _add(mjcf, "equality")
     for equality in spec.equalities:
         _add(ties, "joint", {"joint1": equality.name1, "joint2": equality.name2}, polycoef=equality.data[:5])
@@ -215,10 +216,13 @@ def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> 
         _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(unlimited, _LISTED))
 
 
-def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
-    """Add what a body has: its inertia, with those of the bodies fixed to it, if it moves; joints, geoms and bodies."""
-    if body.joints:
-        moments = _moments(body)
+def _add_body(element: ElementTree.Element, body: mujoco.MjsBody, *, dense: bool) -> None:
+    """Add what a body has: its inertia, with those of the bodies fixed to it, if it moves; joints, geoms and bodies.
+
+    If geoms are `dense`, they take precedence over inertias, link by link, and each body has its own.
+    """
+    if body.joints or dense:
+        moments = _moments(body, carrying=not dense)
         if (mass := moments[3, 3]) != 0:
             centre = moments[:3, 3] / mass
             second = moments[:3, :3] - mass * np.outer(centre, centre)
@@ -242,11 +246,11 @@ def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
         numbers = {"size": geom.size[: _SIZES[kind]]} if _SIZES[kind] else {}
         _add(element, "geom", attributes, **numbers, pos=geom.pos, quat=geom.quat, rgba=geom.rgba, density=geom.density)
     for child in body.bodies:
-        _add_body(_add(element, "body", {"name": child.name}, pos=child.pos, quat=child.quat), child)
+        _add_body(_add(element, "body", {"name": child.name}, pos=child.pos, quat=child.quat), child, dense=dense)
 
 
-def _moments(body: mujoco.MjsBody) -> Array:
-    """The second and first moments of mass and the mass, (4, 4), of a body and the bodies fixed to it, in its frame.
+def _moments(body: mujoco.MjsBody, *, carrying: bool = True) -> Array:
+    """The second and first moments of mass and the mass, (4, 4), of a body in its frame, with the bodies fixed to it.
 
     A URDF may give fixed links inertias that no body can have, as sensors do; only the sum matters.
     """
@@ -257,7 +261,7 @@ def _moments(body: mujoco.MjsBody) -> Array:
         inertia, frame = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), _frame(body.ipos, body.iquat)
         moments[:3, :3], moments[3, 3] = np.trace(inertia) / 2 * np.eye(3) - inertia, body.mass
         moments = frame @ moments @ frame.T
-    for child in body.bodies:
+    for child in body.bodies if carrying else ():
         if not child.joints:
             frame = _frame(child.pos, child.quat)
             moments += frame @ _moments(child) @ frame.T
