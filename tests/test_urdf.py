@@ -229,6 +229,33 @@ def test_a_base_that_floats(arm: Path) -> None:
         ls.load_scene(arm, base="free")
 
 
+@pytest.mark.parametrize("links", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_floats_may_be_stated_below_any_fixed_links(tmp_path: Path, links: int, seed: int) -> None:
+    """MuJoCo's free joints are of bodies in the world. It reads the file itself if it drops the fixed links."""
+    rng, parts = np.random.default_rng(seed), ['<link name="link0"/>']
+    for number in range(1, links + 2):
+        kind = "fixed" if number < links else "floating" if number == links else "continuous"
+        xyz, rpy = (" ".join(map(str, rng.normal(size=3))) for _ in range(2))
+        parts.append(
+            f'<link name="link{number}">{INERTIAL.format(number)}</link><joint name="joint{number}" type="{kind}">'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/><parent link="link{number - 1}"/><child link="link{number}"/></joint>'
+        )
+    path = tmp_path / "thrown.urdf"
+    path.write_text(f'<robot name="thrown">{"".join(parts)}</robot>', encoding="utf-8")
+    model, wanted = ls.load_scene(path).model, mujoco.MjModel.from_xml_path(str(path))
+    assert np.abs(model.qpos0[3:7] @ wanted.qpos0[3:7]) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(np.delete(model.qpos0 - wanted.qpos0, range(3, 7)), 0, atol=1e-12)
+    qpos, qvel, accelerations = rng.normal(size=model.nq), rng.normal(size=model.nv), []
+    for candidate in (model, wanted):
+        data = mujoco.MjData(candidate)
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_normalizeQuat(candidate, data.qpos)
+        mujoco.mj_forward(candidate, data)
+        accelerations.append(data.qacc.copy())
+    np.testing.assert_allclose(*accelerations, rtol=1e-9, atol=1e-9)
+
+
 TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_number, check_path, excerpt
-from lqrsim.scenes.mjcf_kinematics import axes_of, contacts_of
+from lqrsim.scenes.mjcf_kinematics import axes_of, contacts_of, quaternion_of
 from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, listed
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
@@ -191,7 +191,8 @@ def _add_parts(mjcf: ElementTree.Element, spec: mujoco.MjSpec) -> None:
         # Meshes have no mass here, and a flat one has no volume.
         _add(assets, "mesh", {"name": mesh.name, "file": mesh.file, "inertia": "shell"}, scale=mesh.scale)
     dense = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    _add_body(_add(mjcf, "worldbody"), spec.worldbody, dense=dense)
+    world = _add(mjcf, "worldbody")
+    _add_body(world, spec.worldbody, dense=dense, fixed=(world, np.eye(4)))
     ties = _add(mjcf, "equality")
     for equality in spec.equalities:
         _add(ties, "joint", {"joint1": equality.name1, "joint2": equality.name2}, polycoef=equality.data[:5])
@@ -216,10 +217,17 @@ def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> 
         _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(unlimited, _LISTED))
 
 
-def _add_body(element: ElementTree.Element, body: mujoco.MjsBody, *, dense: bool) -> None:
+def _add_body(
+    element: ElementTree.Element,
+    body: mujoco.MjsBody,
+    *,
+    dense: bool,
+    fixed: tuple[ElementTree.Element, Array] | None,
+) -> None:
     """Add what a body has: its inertia, with those of the bodies fixed to it, if it moves; joints, geoms and bodies.
 
-    If geoms are `dense`, they take precedence over inertias, link by link, and each body has its own.
+    If geoms are `dense`, they take precedence over inertias, link by link, and each body has its own. `fixed` is the
+    <worldbody> and the body's frame in it (4, 4), if it does not move: bodies that float go there, as MuJoCo wants it.
     """
     if body.joints or dense:
         moments = _moments(body, carrying=not dense)
@@ -246,7 +254,13 @@ def _add_body(element: ElementTree.Element, body: mujoco.MjsBody, *, dense: bool
         numbers = {"size": geom.size[: _SIZES[kind]]} if _SIZES[kind] else {}
         _add(element, "geom", attributes, **numbers, pos=geom.pos, quat=geom.quat, rgba=geom.rgba, density=geom.density)
     for child in body.bodies:
-        _add_body(_add(element, "body", {"name": child.name}, pos=child.pos, quat=child.quat), child, dense=dense)
+        parent, pos, quat, own = element, child.pos, child.quat, None
+        if fixed is not None:
+            own = fixed[0], fixed[1] @ _frame(pos, quat)
+            if body.name != "world" and any(_kind(joint) == "free" for joint in child.joints):
+                parent, pos, quat = own[0], own[1][:3, 3], quaternion_of(own[1][:3, :3])
+        added = _add(parent, "body", {"name": child.name}, pos=pos, quat=quat)
+        _add_body(added, child, dense=dense, fixed=None if child.joints else own)
 
 
 def _moments(body: mujoco.MjsBody, *, carrying: bool = True) -> Array:
