@@ -559,6 +559,22 @@ class Biting:
             for key in ("sets", "policies")
             for it in (Biting(), 3, "light", (1,), None)
         ],
+        *[
+            (
+                lambda name=name, it=it: Campaign.of_sets(SETUP, ("light",), **{name: it}),
+                f"options: got '{name}', want one",
+            )
+            for name, it in {
+                "seed": 5,
+                "goal_radius": 0.2,
+                "solution": None,
+                "scenario": "quadrotor",
+                "sweeps": {},
+                "goal_tolerance": 0.1,
+                "design_disturbances": (),
+                "strength": 1.0,
+            }.items()
+        ],
         (
             lambda: ls.check_derivatives(lq.Dynamics(enormous, states={"x": "m"}, controls={"u": "N"}, level="plain")),
             "enormous(x, u, p): got ",

@@ -236,7 +236,7 @@ class Campaign(Setup):
           setup: what it shares with other studies; its design disturbances are a set, too.
           sets: names of the sweeps.
           policies: as in `Campaign`; by default those of the first four that the scenario allows.
-          **options: the other attributes of `Campaign`.
+          **options: the other attributes of `Campaign`, which are not those of a `Setup`.
         """
         check_kind("setup", setup, Setup, "a Setup")
         sets = check_items("sets", sets, str, "a tuple of names of sets of disturbances")
@@ -244,6 +244,10 @@ class Campaign(Setup):
         scenario, design = setup.resolved, setup.design_disturbances
         impossible = impossible_policies(scenario, setup.given)
         shared = {field.name: getattr(setup, field.name) for field in dataclasses.fields(Setup)}
+        for name in options:  # what the setup or the sets state would be ignored
+            check_name(
+                "options", name, [name for name in CAMPAIGN_FIELDS if name not in (*shared, "sweeps", "policies")]
+            )
         named = {
             "design_disturbances": None if design is None else tuple(design_disturbances(scenario, design)),
             "sweeps": {name: disturbance_set(name, scenario) for name in sets},
