@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mechanisms import sled
 from sampling import examples, rarely
+from scipy.spatial.transform import Rotation
 from tracking import track
 
 import lqrsim as ls
@@ -172,6 +173,25 @@ def test_obstacles_that_move_and_are_in_no_mjcf(other: str, seed: int) -> None:
     nearest = [shape.nearest(shape.places(state), away) for state, away in zip(states, gone, strict=True)]
     np.testing.assert_array_equal(nearest, each.argmin(axis=1))
     assert shape.world.names == world.names
+
+
+@pytest.mark.parametrize("mirrored", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, -1)], ids=str)
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box", "plane"])
+@pytest.mark.parametrize("seed", range(2))
+def test_left_handed_axes_of_an_obstacle_are_those_of_its_mirror_image(
+    kind: str, mirrored: tuple[int, int, int], seed: int
+) -> None:
+    """The free side of a plane is along its own z."""
+    robot, rng = arm("capsule", "box", seed), np.random.default_rng(seed)
+    turned = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+    axes, size = turned * mirrored, np.zeros(3) if kind == "plane" else np.array([0.2, 0.3, 0.1])
+    right = turned * [1, mirrored[2], mirrored[2]] if kind == "plane" else turned
+    states = robot.at() + rng.normal(0, 0.2, (4, len(robot.at())))
+    found, wanted = (
+        robot.among(ls.World([ls.Obstacle("it", kind, np.array([1.0, 0.5, 0.2]), its, size)])) for its in (axes, right)
+    )
+    distances = [shape.clearance(shape.places(states)) for shape in (found, wanted)]
+    np.testing.assert_allclose(*distances, rtol=0, atol=1e-9)
 
 
 SLED = sled(

@@ -172,9 +172,14 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def quaternion_of(rotation: Array) -> Array:
-    """The quaternion (4,) of a rotation (3, 3) or (9,), scalar first."""
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    """The quaternion (4,) of a rotation (3, 3) or (9,), scalar first; of a reflection, with the x axis turned back.
+
+    The shapes of obstacles but meshes are their own mirror images, so that their axes may be left-handed.
+    """
+    axes, quaternion = np.reshape(rotation, (3, 3)), np.empty(4)
+    if np.linalg.det(axes) < 0:
+        axes = axes * [-1.0, 1.0, 1.0]
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(axes).ravel())
     return quaternion
 
 
