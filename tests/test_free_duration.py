@@ -344,6 +344,26 @@ def test_solvers_that_cannot_free_it_say_so() -> None:
         ls.prepare(free)
     with pytest.raises(ls.InputError, match="duration"):
         ls.smooth(free, finish=None)
+    soft = dataclasses.replace(free, constraints=(), initial=ls.QuadraticCost([9.0, 9.0], about=[0.0, 0.0]))
+    with pytest.raises(ls.InputError, match="duration"):
+        ls.lq.smooth_continuous(soft)
+
+
+@pytest.mark.parametrize("longest", [4.0, 4.5, 20.0])
+@pytest.mark.parametrize("shortest", [0.1, 3.0, 3.9])
+@pytest.mark.parametrize("after", [1, 8, 19])
+def test_the_rest_of_a_plan_has_the_time_that_is_left(longest: float, shortest: float, after: int) -> None:
+    """What is over and what follows take together no less than the shortest and no more than the longest duration."""
+    near = ls.QuadraticCost([1.0, 1.0], about=[1.0, 0.0])
+    whole = dataclasses.replace(problem(duration=(shortest, longest)), constraints=(), final_cost=near)
+    rest = whole.from_state([0.5, 0.1], after=after)
+    past = after * whole.dt
+    assert rest.duration is not None
+    low, high = rest.duration
+    assert past + high == pytest.approx(longest)
+    assert low == pytest.approx(max(shortest - past, 1e-3 * high))
+    dataclasses.replace(rest)  # it is as a new problem may be
+    assert low * (1 - 1e-9) <= ls.smooth(rest).trajectory.horizon <= high * (1 + 1e-9)
 
 
 HURRIED = """

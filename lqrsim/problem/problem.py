@@ -48,6 +48,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
 ACCURATE = 1e-11  # smallest accuracy of steps; errors below are rounding
+SHORTEST = 1e-3  # of a free duration whose least has passed, relative to the longest that is left
 Constraints = Annotated[
     Sequence[Constraint],
     Want("a list of constraints, such as [Clearance(...)] or, for a function, [SymbolicConstraint(function)]"),
@@ -245,7 +246,8 @@ class Problem(OneVersion):
     def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
         """The rest of the problem after some steps, from a state (n,) that is given exactly.
 
-        Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it.
+        Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it. The time of those
+        steps is taken from a free duration.
 
         Args:
           previous: (m,) the last command, from which a `control_rate` counts; by default the problem's own, and after
@@ -270,6 +272,9 @@ class Problem(OneVersion):
         segments = tuple(knot - after for knot in self.segments if knot > after + 1)  # each has two steps at least
         constraints, stage_cost = tuple(part.ahead(after) for part in self.constraints), self.stage_cost.ahead(after)
         rest = {"steps": self.steps - after, "begin": self.begin + after * self.dt, "segments": segments}
+        if self.duration is not None:
+            low, high = (seconds - after * self.dt for seconds in self.duration)
+            rest["duration"] = max(low, SHORTEST * high), high
         return other._with(**rest, constraints=constraints, stage_cost=stage_cost)._bound_anew()
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":

@@ -269,6 +269,8 @@ def smooth_continuous(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
             " the primal form has no other start"
         )
+    if problem.duration is not None:
+        raise InputError("duration: got a free duration, want None in continuous time; use `smooth`")
     if problem.constraints:
         raise InputError("constraints: got a problem with constraints, want none in continuous time; use `smooth`")
     if problem.control_rate is not None:
