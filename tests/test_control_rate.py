@@ -1,6 +1,7 @@
 """Costs and limits of the rates of controls, against problems in which they are written out."""
 
 import pickle
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -439,6 +440,27 @@ class TestProblems:
     def test_rates_that_do_not_fit(self, stated: dict[str, Any], message: str) -> None:
         with pytest.raises(ls.InputError, match=message):
             pendulum(control_rate=ls.ControlRate(**stated))
+
+    @pytest.mark.parametrize("rates", [None, ls.ControlRate(weight=0.1), ls.ControlRate(limits=9.0)])
+    @pytest.mark.parametrize("states", [1, 2, 3])
+    @pytest.mark.parametrize("steps", [19, 20, 21])
+    def test_starts_of_other_shapes_are_refused_as_those_of_the_problem(
+        self, rates: ls.ControlRate | None, states: int, steps: int
+    ) -> None:
+        """The last command is no state that a caller could give."""
+        if (states, steps) == (2, 20):
+            return
+        problem = pendulum(control_rate=rates)
+        plan = ls.Trajectory(np.zeros((steps + 1, states)), np.zeros((steps, 1)), problem.dt)
+        starts: list[tuple[Any, str]] = [(plan, f"states: got shape ({steps + 1}, {states}), want (21, 2)")]
+        if states != 2:
+            starts.append((ls.InitialPrior(np.ones(states), about=np.zeros(states)), f"got shape ({states},), want (2,)"))
+        else:
+            other = solved(replace(pendulum(), steps=steps))
+            starts += [(start, f"gain: got shape ({steps}, 1, 2), want (20, 1, 2)") for start in (other, other.policy)]
+        for start, said in starts:
+            with pytest.raises(ls.InputError, match=re.escape(said)):
+                ls.smooth(problem, start=start)
 
     def test_what_rates_do_not_go_with(self) -> None:
         rate = ls.ControlRate(weight=1.0, limits=1.0)

@@ -32,7 +32,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, copy_of, parts_of
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, is_function
+from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, is_function, resolve
 from lqrsim.solvers.settings import Settings, SmootherSettings
 
 P = TypeVar("P", Solution, Replan)
@@ -175,7 +175,13 @@ def widened(start: Any, problem: Problem, wide: Problem) -> Any:
     """A start of the problem as one of the problem with the last command."""
     if is_function(start):
         start = start(problem)
+    if isinstance(start, InitialPrior | Trajectory | AffinePolicy | Plan):
+        resolve(start, problem)  # refuses other shapes as those of the problem
     m = len(problem.control_coordinates)
+
+    def with_commands(plan: Trajectory) -> Trajectory:
+        return replace(plan, states=_with_commands(plan.states, plan.controls))
+
     match start:
         case InitialPrior():
             padded = [(0, 0)] * (start.about.ndim - 1) + [(0, m)]
@@ -184,7 +190,7 @@ def widened(start: Any, problem: Problem, wide: Problem) -> Any:
                 obstacles=start.obstacles, controls=start.controls,
             )  # fmt: skip
         case Trajectory():
-            return replace(start, states=_with_commands(start.states, start.controls))
+            return with_commands(start)
         case AffinePolicy():
             nominal = start.control_coordinates.clip(np.einsum("tij,tj->ti", start.gain, start.nominal) + start.offset)
             return replace(
@@ -199,7 +205,7 @@ def widened(start: Any, problem: Problem, wide: Problem) -> Any:
             goal = None if start.goal is None else np.pad(start.goal, (0, m), constant_values=np.nan)
             return Plan(
                 status=start.status, detail=start.detail, policy=widened(start.policy, problem, wide),
-                trajectory=widened(start.trajectory, problem, wide), cost_to_go=None,
+                trajectory=with_commands(start.trajectory), cost_to_go=None,
                 multipliers=(*start.multipliers, *zeros), goal=goal,
             )  # fmt: skip
         case _:
