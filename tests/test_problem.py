@@ -14,6 +14,7 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.errors import check_symmetric
 from lqrsim.problem.costs import CostSum
+from lqrsim.problem.last_command import with_last_command
 from lqrsim.solvers import compiled
 
 
@@ -512,6 +513,10 @@ class TestProblemsThatBeginInside:
             assert np.isfinite(ls.smooth(rest, noise=self.NOISE, max_iterations=3).cost)
         with pytest.raises(ls.InputError, match=r"initial: got a start at .* inside obstacle 'ball'"):
             dataclasses.replace(rest, initial=ls.FixedState(place))
+        if rest.control_rate is not None:  # as for softer contacts
+            wide = with_last_command(rest)
+            again = dataclasses.replace(wide, dynamics=wide.dynamics)
+            np.testing.assert_array_equal(again.start, [*place, 0.0, 0.0])
 
     @settings(max_examples=examples(6))
     @given(away=st.floats(-0.2, 0.2), soft=st.booleans())

@@ -126,7 +126,7 @@ def with_last_command(problem: Problem) -> Problem:
     begun: Cost
     initial = problem.initial
     if isinstance(initial, FixedState):
-        initial = FixedState(np.pad(initial.numbers, (0, m)))
+        initial = initial._extended(np.zeros(m))
         begun = initial._cost
     else:
         # A weight, which costs nothing: a cost-to-come needs one of each state.
