@@ -225,6 +225,8 @@ def test_what_is_no_belief_is_refused() -> None:
         ("got a matrix of 2 rows", lambda: ls.belief.Belief(robot(), **two)),
         ("got a reading that depends on u", lambda: ls.belief.Belief(robot(), **told).readings),
         ("covariance: got one that is not positive definite", lambda: belief().state([0, 0, 0], [1, 1, 0])),
+        ("covariance: got -1, want standard deviations >= 0", lambda: belief().state([0, 0, 0], [1, -1, 1])),
+        ("covariance: got .* want a symmetric", lambda: belief().state([0, 0, 0], np.eye(3) + np.eye(3, k=1))),
         ("chance: got 0.7", lambda: belief().chance_constraint(unicycle, chance=0.7)),
         ("parameters: got 'skid' twice", lambda: ls.belief.Belief(
             robot(), dt=DT, noise=belief().process, sensors=ls.belief.NoisySensors(beacons, parameters={"skid": 1.0}),
@@ -336,12 +338,13 @@ def drive(scenario: ls.Scenario, **changed: Any) -> ls.Problem:
     return ls.Problem(dynamics=of, **given | changed)
 
 
+@pytest.mark.parametrize("wall", ["wall", "deviations", "deviations_"])
 @pytest.mark.parametrize("chance", [0.2, 0.02])
-def test_a_chance_constraint_is_a_quantile_away(chance: float) -> None:
+def test_a_chance_constraint_is_a_quantile_away(chance: float, wall: str) -> None:
     """At drawn beliefs: SciPy's quantile, of the distance's gradient times the covariance, times four."""
     of = drive(ls.scenarios.differential_drive()).dynamics
     assert isinstance(of, ls.belief.Belief)
-    side = of.chance_constraint(lambda x, u, p: p.wall - x.x * x.y, chance=chance, parameters={"wall": 1.0})
+    side = of.chance_constraint(lambda x, u, p: getattr(p, wall) - x.x * x.y, chance=chance, parameters={wall: 1.0})
     value = PlainTerm(side.bind(of), len(of.state_coordinates), 2).value
     rng = np.random.default_rng(0)
     for _ in range(20):

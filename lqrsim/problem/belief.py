@@ -33,7 +33,9 @@ from lqrsim.errors import (
     check_items,
     check_kind,
     check_name,
+    check_symmetric,
     excerpt,
+    free_name,
     real,
     shaped,
     vectors_of,
@@ -165,9 +167,14 @@ class Belief(Dynamics):
         """
         n, rows = self.size, self.rows
         numbers = real("covariance", covariance)
-        full = np.diag(check_array("covariance", numbers, (n,)) ** 2) if numbers.ndim == 1 else numbers
+        if numbers.ndim == 1:
+            numbers = np.diag(check_array("covariance", numbers, (n,)))
+            if (numbers < 0).any():
+                raise InputError(f"covariance: got {numbers.min():g}, want standard deviations >= 0")
+            numbers = numbers**2
+        full = check_symmetric("covariance", check_array("covariance", numbers, (n, n)))
         try:
-            root = np.linalg.cholesky(check_array("covariance", full, (n, n))[np.ix_(rows, rows)])
+            root = np.linalg.cholesky(full[np.ix_(rows, rows)])
         except np.linalg.LinAlgError:
             raise InputError("covariance: got one that is not positive definite, want every deviation > 0") from None
         return np.concatenate([check_array("mean", mean, (n,)), root[np.tril_indices(len(rows))]])
@@ -225,7 +232,7 @@ class Belief(Dynamics):
         values: Mapping[str, float] = {} if parameters is None else parameters
         check_kind("chance_constraint: parameters", values, Mapping, "a dictionary by name")
         n, rows, names = self.size, self.rows, tuple(self.robot.state_coordinates.names)
-        quantile = -NormalDist().inv_cdf(chance)
+        quantile, deviations = -NormalDist().inv_cdf(chance), free_name("deviations", values)
 
         @functools.wraps(function)
         def margin(x: Any, u: Any, p: Any) -> list[Any]:
@@ -236,10 +243,10 @@ class Belief(Dynamics):
             for entry in returned if isinstance(returned, list | tuple) else [returned]:
                 slopes = [sympify(entry).diff(x[i]) for i in rows]
                 spread = sum(sum(slopes[i] * root[i][j] for i in range(j, len(rows))) ** 2 for j in range(len(rows)))
-                margins.append(entry - p.deviations * sqrt(spread))
+                margins.append(entry - getattr(p, deviations) * sqrt(spread))
             return margins
 
-        return SymbolicConstraint(margin, parameters={**values, "deviations": quantile}, name=name)
+        return SymbolicConstraint(margin, parameters={**values, deviations: quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
         """The beliefs (K, N) of the extended Kalman filter one period later.
