@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -542,3 +542,40 @@ class TestProblemsThatBeginInside:
             rest = stated.from_state([-1.0, 1.0], after=after)
             assert rest.segments == left
             assert dataclasses.replace(rest, risk=0.0).segments == left
+
+
+class TestOtherParts:
+    """Costs and constraints are refused in place of others as they are in a new problem."""
+
+    WORLD = ls.World([
+        ls.Obstacle(
+            "ball", "sphere", np.array([1.0, 5.0, 0.0]), np.eye(3), np.array([0.3, 0.0, 0.0]),
+            velocity=np.array([1.0, 0.0, 0.0]),
+        )
+    ])  # fmt: skip
+    PARTS: ClassVar[dict[str, Any]] = {
+        "constraints": [ls.Clearance(WORLD, radius=0.1)],
+        "stage_cost": ls.ControlCost([0.1, 0.1]) + ls.ObstacleCost(WORLD, radius=0.1),
+        "final_cost": ls.ControlCost([1.0, 1.0]) + ls.QuadraticCost([1.0, 1.0], about=[2.0, 0.0]),
+    }
+
+    @pytest.mark.parametrize(
+        "fields", [{}, {"duration": (0.5, 3.0), "time_weight": 1.0}, {"between_knots": True}, {"segments": [10]}]
+    )
+    @pytest.mark.parametrize("part", PARTS)
+    def test_they_are_refused_alike(self, part: str, fields: dict[str, Any]) -> None:
+        problem, other = TestProblemsThatBeginInside().problem(**fields), {part: self.PARTS[part]}
+
+        def said(make: Callable[[], ls.Problem]) -> str:
+            try:
+                make()
+            except ls.InputError as error:
+                return str(error)
+            return ""
+
+        stated = said(lambda: dataclasses.replace(problem, **other))
+        assert (
+            said(lambda: problem.with_constraints(**other) if part == "constraints" else problem.with_costs(**other))
+            == stated
+        )
+        assert bool(stated) == (part == "final_cost" or bool({"duration", "between_knots"} & fields.keys()))

@@ -199,12 +199,10 @@ class Problem(OneVersion):
         initial = self.initial._cost if isinstance(self.initial, FixedState) else self.initial
         costs = {"stage_cost": self.stage_cost, "final_cost": self.final_cost, "initial": initial}
         bound = {name: self._bound(terms_of(cost)) for name, cost in costs.items()}
-        for name in ("initial", "final_cost"):
-            if any(term.uses_control for term in bound[name]):
-                raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         constraint_terms = bind_all(self.constraints, self.dynamics, self.times)
         noise_term = None if self.noise is None else self.noise.bind(self.dynamics)
         keep(self, _terms=bound, constraint_terms=constraint_terms, noise_term=noise_term)
+        self._check_end_costs()
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         self._check_duration()
@@ -282,7 +280,7 @@ class Problem(OneVersion):
         given = {"stage_cost": stage_cost, "final_cost": final_cost}
         costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
         terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
-        return self._with(**costs, _terms=self._terms | terms)
+        return self._with(**costs, _terms=self._terms | terms)._checked_parts()
 
     def _refined(self, plan: Trajectory) -> "Problem | None":
         """The problem with constraints as they are to be along a plan that misses some within its periods, or None."""
@@ -294,7 +292,8 @@ class Problem(OneVersion):
     @checked
     def with_constraints(self, constraints: Constraints) -> "Problem":
         """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`."""
-        return self._with(constraints=constraints, constraint_terms=bind_all(constraints, self.dynamics, self.times))
+        terms = bind_all(constraints, self.dynamics, self.times)
+        return self._with(constraints=constraints, constraint_terms=terms)._checked_parts()
 
     @checked
     def later(self, seconds: Finite) -> "Problem":
@@ -359,6 +358,13 @@ class Problem(OneVersion):
         terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
         constraints = bind_all(self.constraints, self.dynamics, self.times)
         return self._with(_terms=self._terms | {"stage_cost": terms}, constraint_terms=constraints)
+
+    def _checked_parts(self) -> "Problem":
+        """The same problem. Raises InputError if its costs or constraints do not go with the rest."""
+        self._check_end_costs()
+        self._check_duration()
+        self._check_between_knots()
+        return self
 
     def _with(self, **changed: Any) -> "Problem":
         """The problem with other parts, without checks.
@@ -511,6 +517,12 @@ class Problem(OneVersion):
         if self.accuracy is not None or self.between_knots:
             parts.append(repr((self.accuracy, self.between_knots)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
+
+    def _check_end_costs(self) -> None:
+        """Raises InputError if the initial or the final cost depends on the control."""
+        for name in ("initial", "final_cost"):
+            if any(term.uses_control for term in self._terms[name]):
+                raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
 
     def _check_duration(self) -> None:
         """Raises InputError if the duration is not as described, or must not be free for this kind of problem."""

@@ -179,7 +179,8 @@ class PreparedSolver(OneVersion):
 
         Args:
           state: (n,) the state to plan from.
-          start: a plan with as many steps as the problem has left: `before.shifted(k)`.
+          start: a plan with as many steps as the problem has left: `before.shifted(k)`; with `after`,
+            `before.shifted(k, horizon="shrinking")`.
           problem: the problem to solve from that state; by default the prepared one.
           after: number of steps that are over; the rest is solved.
           time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
