@@ -199,3 +199,22 @@ def test_a_trap_is_left_with_a_fixed_duration() -> None:
     converged = [one.start for one in solution.candidates if one.status is Status.CONVERGED]
     assert converged
     assert all("round obstacles" in start for start in converged)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+@pytest.mark.parametrize("height", [0.0, 0.4])
+@pytest.mark.parametrize("free", [False, True])
+def test_ways_of_few_steps(steps: int, height: float, free: bool) -> None:
+    """Those of one step have no knot between start and goal. It jumps over the pillar, for which it needs its time."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [u[0], u[1]], states={"x": "m", "y": "m"}, controls={"u": "m/s", "v": "m/s"},
+        position=("x", "y"), control_limits=(-2.0, 2.0),
+    )  # fmt: skip
+    options: dict[str, Any] = {"duration": (0.1, 20.0), "time_weight": 1.0} if free else {}
+    problem = dataclasses.replace(
+        stated(dynamics, [0.0, 0.0], [4.0, 0.0], pillar(0.5, height=height)), dt=0.6 / steps, steps=steps, **options
+    )
+    solution = ls.smooth(problem, max_iterations=50)
+    assert solution.status is (Status.CONVERGED if free else Status.INFEASIBLE)
+    if free and steps % 2:
+        assert solution.trajectory.horizon == pytest.approx(2.0, rel=1e-6)

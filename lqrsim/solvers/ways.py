@@ -320,13 +320,13 @@ def _fits(stages: Stages, headings: Headings, ends: Array, points: Array) -> npt
     else:
         attitudes = np.vstack([ends, *(np.where(entries == i, turn, start) for i in space.angles)])
     rows = np.isin(stages.owners, np.flatnonzero(passable(problem)))
-    knots = problem.steps - 1  # between the first and the last, where a row may not act
+    knots = max(problem.steps - 1, 1)  # between the first and the last, where a row may not act; or the last
     fits = np.ones((len(attitudes), len(points)), dtype=bool)
     controls = np.broadcast_to(problem.nominal_controls, (problem.steps, len(problem.control_coordinates)))
     for fitting, attitude in zip(fits, attitudes, strict=True):
         for first in range(0, len(points), knots):
             batch = points[first : first + knots]
-            states = np.tile(attitude, (knots + 2, 1))
+            states = np.tile(attitude, (problem.steps + 1, 1))
             states[1 : 1 + len(batch), place] = batch
             values = stages.values(Motion(in_c_order(states), in_c_order(controls)))[1 : 1 + len(batch), rows]
             fitting[first : first + knots] = ~(values < 0).any(axis=1)
