@@ -270,6 +270,19 @@ def test_a_price_below_it_is_paid(which: int, share: float) -> None:
     assert elastic.violation > 1e-4
 
 
+@pytest.mark.parametrize("price", [0.1, 10.0])
+@pytest.mark.parametrize("most", [1, 2, 3, 5])
+@pytest.mark.parametrize("loose", ["bounds", "nothing", "both"])
+def test_constraints_that_a_stopped_plan_keeps_are_not_called_missed(loose: str, most: int, price: float) -> None:
+    """Nor do those without a row, as of an empty world, end the solve."""
+    balls = ls.CollisionSpheres(lambda x, p: [(x[0], 0.0)], [0.1])
+    wide, empty = ls.StateBounds(v=(-50.0, 50.0)), ls.Clearance(ls.World([]), balls=balls)
+    of = problem(*{"bounds": [wide], "nothing": [empty], "both": [empty, wide]}[loose], final=[3.0, 1.0])
+    solution = ls.smooth(of, elastic=price, max_iterations=most)
+    assert "missed" not in solution.detail
+    assert solution.violation == 0
+
+
 # Warm starts.
 
 

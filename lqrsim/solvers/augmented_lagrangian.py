@@ -350,8 +350,6 @@ class AugmentedLagrangian:
 
     def worst(self) -> str:
         """A text that names the worst violated constraint, its violation and its time."""
-        if self.kept and not self._work.priced:
-            return "the plan keeps the constraints, but there are better ones"
         missed = [
             (np.abs(values) if multipliers.term.equality else -(values + multipliers.margin)).max(initial=-np.inf)
             for multipliers, values in self._each()
@@ -360,6 +358,8 @@ class AugmentedLagrangian:
             violation - allowed_violation(multipliers.term, self._allowed)
             for violation, multipliers in zip(missed, self._constraints, strict=True)
         ]
+        if self.kept and (not self._work.priced or not max(excess, default=0.0) > 0):
+            return "the plan keeps the constraints, but there are better ones"
         which = int(np.argmax(excess))
         term, (step, row) = self._constraints[which].term, self._worst_of(which)
         time = step * self._problem.dt
