@@ -342,6 +342,9 @@ def test_solvers_that_cannot_free_it_say_so() -> None:
         ls.ilqr(dataclasses.replace(free, constraints=()))
     with pytest.raises(ls.InputError, match="duration"):
         ls.prepare(free)
+    fixed = dataclasses.replace(free, duration=None, time_weight=0.0)
+    with pytest.raises(ls.InputError, match="duration"):
+        ls.prepare(fixed).check(free)
     with pytest.raises(ls.InputError, match="duration"):
         ls.smooth(free, finish=None)
     soft = dataclasses.replace(free, constraints=(), initial=ls.QuadraticCost([9.0, 9.0], about=[0.0, 0.0]))

@@ -99,8 +99,7 @@ class PreparedSolver(OneVersion):
 
     @checked
     def __init__(self, problem: Problem, settings: SmootherSettings, threads: int = 1) -> None:
-        if problem.duration is not None:
-            raise InputError("problem: got a free duration, want a fixed one for solves in real time")
+        _check_fixed(problem)
         self.problem, self.settings, self.threads = problem, settings, threads
         self._structure = compiled.structure(problem)
         self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
@@ -151,8 +150,9 @@ class PreparedSolver(OneVersion):
         """Check that a problem needs no compiling: only numbers may differ from the prepared one.
 
         Raises:
-          InputError: the problem would have to be compiled.
+          InputError: the problem would have to be compiled, or has a free duration.
         """
+        _check_fixed(problem)
         other = (problem.control_rate is None) != (self._wide is None)
         if other or compiled.structure(problem) != self._structure:
             raise InputError(
@@ -253,6 +253,12 @@ class PreparedSolver(OneVersion):
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
             seconds=time.perf_counter() - clock, iterating=iterating,
         )  # fmt: skip
+
+
+def _check_fixed(problem: Problem) -> None:
+    """Raises InputError for a problem with a free duration."""
+    if problem.duration is not None:
+        raise InputError("problem: got a free duration, want a fixed one for solves in real time")
 
 
 def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
