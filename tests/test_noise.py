@@ -573,3 +573,35 @@ def test_the_remedy_names_the_cost_of_the_plan(noise: ls.Noise) -> None:
     assert solution.remedy.endswith(f"; the plan costs {solution.cost:.6g}")
     assert abs(solution.iterations[-1].cost - solution.cost) > 1e-3
     assert ls.smooth(problem, max_iterations=20).status is ls.Status.CONVERGED
+
+
+def _falls(x: Any, u: Any, p: Any) -> list[Any]:
+    from sympy import log
+
+    return [u[0] + log(x[0])]
+
+
+def _roots(x: Any, u: Any, p: Any) -> list[Any]:
+    from sympy import sqrt
+
+    return [u[0] - 3 * sqrt(x[0])]
+
+
+def _escapes(x: Any, u: Any, p: Any) -> list[Any]:
+    return [u[0] + 50 * x[0] ** 3]
+
+
+@pytest.mark.parametrize(("rate", "start"), [(_falls, 0.01), (_roots, 0.02), (_escapes, 1.0)])
+@pytest.mark.parametrize("limit", [1.0, 2.0, np.inf])
+def test_a_solve_is_the_same_after_one_with_noise_that_failed(rate: Any, start: float, limit: float) -> None:
+    """Where states leave their domain, both look for a line of states, in memory that they share."""
+    dynamics = ls.Dynamics(rate, states={"x": "m"}, controls={"u": "m/s"}, control_limits=(-limit, limit))
+    plain = ls.Problem(
+        dynamics=dynamics, dt=0.3, steps=7, initial=ls.FixedState([start]), stage_cost=ls.ControlCost([0.1]),
+        final_cost=ls.QuadraticCost([10.0], about=[1.0]),
+    )  # fmt: skip
+    noisy = plain.driven_by(ls.Noise(0.01 * np.eye(1)), None)
+    solutions = [ls.smooth(problem, max_iterations=40) for problem in (noisy, plain, noisy, plain)]
+    for first, again in zip(solutions[:2], solutions[2:], strict=True):
+        assert first.status is again.status
+        np.testing.assert_array_equal(first.trajectory.states, again.trajectory.states)
