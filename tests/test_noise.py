@@ -605,3 +605,22 @@ def test_a_solve_is_the_same_after_one_with_noise_that_failed(rate: Any, start: 
     for first, again in zip(solutions[:2], solutions[2:], strict=True):
         assert first.status is again.status
         np.testing.assert_array_equal(first.trajectory.states, again.trajectory.states)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 6])
+@pytest.mark.parametrize("known", [False, True])
+def test_the_cost_of_a_replan_with_constraints_is_that_of_runs(steps: int, known: bool) -> None:
+    """Without the penalties that keep the goal, as the cost of a solution, whether or not the start knows them."""
+    dynamics = ls.Dynamics(lambda x, u, p: [u[0], u[1]], states={"x": "m", "y": "m"}, controls={"u": "", "v": ""})
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=steps, initial=ls.FixedState([-0.2, 0.0]),
+        stage_cost=ls.ControlCost([0.1, 0.1]), final_cost=ls.QuadraticCost([10.0, 10.0], about=[0.1, 0.0]),
+        constraints=[ls.GoalState([0.1, 0.0])], noise=ls.Noise(0.05 * np.eye(2)),
+    )  # fmt: skip
+    solution = ls.smooth(problem)
+    start = solution if known else ls.smooth(problem.with_constraints([]))
+    replan = ls.prepare(problem).solve([-0.2, 0.0], start)
+    assert replan.success
+    assert replan.cost == pytest.approx(solution.cost, rel=1e-4)
+    runs = ls.sample_costs(problem, solution, trials=20_000)
+    assert solution.cost == pytest.approx(runs.mean(), abs=4 * runs.std() / np.sqrt(len(runs)))

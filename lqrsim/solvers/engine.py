@@ -490,11 +490,7 @@ class SolveRun:
                 tolerance=tolerance, kept=self.work.keeps(values),
             )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
-            # The expected cost without penalties of constraints, which the cost-to-go of the solver has.
-            out, none = np.zeros(1, CERTIFICATE), no_value(result.states)
-            task, first, last, options, _, *others = self._check_arguments(declarations.EVALUATE, result, none, out)
-            self._loop(task, first, last, options, self._without_penalties(), *others)
-            certificate = replace(certificate, cost=float(out[0]["cost"]))
+            certificate = replace(certificate, cost=self.expected_cost(result))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         result = replace(result, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
@@ -538,6 +534,13 @@ class SolveRun:
             cost._replace(constraints=cost.constraints._replace(size=0)) for cost in (model.stage, model.final)
         )
         return model._replace(stage=stage, final=final, noise=model.noise._replace(risk=model.noise.risk * (1, 1, 0)))
+
+    def expected_cost(self, result: RunResult) -> float:
+        """The cost under noise without penalties of constraints, which the cost-to-go of the solver has."""
+        out, none = np.zeros(1, CERTIFICATE), no_value(result.states)
+        task, first, last, options, _, *others = self._check_arguments(declarations.EVALUATE, result, none, out)
+        self._loop(task, first, last, options, self._without_penalties(), *others)
+        return float(out[0]["cost"])
 
     def weigh_noise(self, plan: Motion) -> None:
         """From now on, weigh noise whose cost depends on the plan by the cost-to-go about this plan without penalties.

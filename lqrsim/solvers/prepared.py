@@ -211,6 +211,8 @@ class PreparedSolver(OneVersion):
                     result, ended = ConstrainedRun(run, Known()).run_to_end(), time.perf_counter()
             else:
                 result = _solve(run, best)
+                if problem.noise_term is not None and problem.constraints:
+                    result = replace(result, cost=run.expected_cost(result))
                 ended = time.perf_counter()
         if stop.error is not None:
             raise stop.error
