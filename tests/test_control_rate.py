@@ -454,7 +454,8 @@ class TestProblems:
         plan = ls.Trajectory(np.zeros((steps + 1, states)), np.zeros((steps, 1)), problem.dt)
         starts: list[tuple[Any, str]] = [(plan, f"states: got shape ({steps + 1}, {states}), want (21, 2)")]
         if states != 2:
-            starts.append((ls.InitialPrior(np.ones(states), about=np.zeros(states)), f"got shape ({states},), want (2,)"))
+            prior = ls.InitialPrior(np.ones(states), about=np.zeros(states))
+            starts.append((prior, f"got shape ({states},), want (2,)"))
         else:
             other = solved(replace(pendulum(), steps=steps))
             starts += [(start, f"gain: got shape ({steps}, 1, 2), want (20, 1, 2)") for start in (other, other.policy)]

@@ -304,7 +304,8 @@ class TestChecks:
         deep: Any = kind()
         for _ in range(100_000):
             deep = {"a": deep} if kind is dict else kind([deep])
-        for value in (deep, endless):
+        values: list[Any] = [deep, endless]
+        for value in values:
             assert f"a {type(value).__name__}" in repr(BetweenKnots(0.0, 0.0, {"clearance": value}))
 
     def test_memory_is_that_of_the_machine_and_its_limits(self) -> None:
