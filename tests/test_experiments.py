@@ -155,6 +155,19 @@ def test_benchmark_of_intervals() -> None:
     assert "rare failures, 95 % intervals" in script.report(result)
 
 
+@pytest.mark.parametrize(("share", "times"), [(0.0, 1.0), (0.3, 3.0), (0.1, 5.0), (0.02, 8.0)])
+def test_an_interval_of_a_standard_deviation_covers_it_also_with_heavy_tails(share: float, times: float) -> None:
+    """Normal numbers, a share of which deviates by some times as much; three standard deviations of 400 studies."""
+    script, rng = import_module("belief_space"), np.random.default_rng(0)
+    true, covered = np.sqrt(1 - share + share * times**2), 0
+    for _ in range(400):
+        sample = np.where(rng.random(4000) < share, times, 1.0) * rng.normal(size=4000)
+        value, low, high = script.deviation(sample)
+        assert low < value < high
+        covered += low <= true <= high
+    assert 0.95 - 3.3e-2 <= covered / 400 <= 0.95 + 3.3e-2
+
+
 @pytest.mark.long
 def test_benchmark_of_sensors() -> None:
     """A small part: a drawn half of a preset and four noises; what is counted is what the trials say."""
