@@ -8,7 +8,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -132,6 +132,25 @@ def test_robust_policies_reports_what_has_no_chance(measured: list[float] | None
         ([[measured, measured], [[0.3, 0.2, 1.0], [0.1, 0.0, 0.15]]], "| light | 1 | 3 | 3 | 3 | 0 | 1 |"),
     ):
         assert module.report({"light": pairs})[1].splitlines()[-1] == row
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.02, 0.3, 0.6])
+def test_a_filter_that_is_right_is_inside_its_bands_whatever_is_lost(lost: float) -> None:
+    """Errors and innovations that are normal as predicted, a share of the latter never measured."""
+    of_run, rng = import_module("robust.consistency").of_run, np.random.default_rng(0)
+    trials, steps, size = 200, 400, 3
+    innovations = rng.normal(size=(steps, trials, size))
+    innovations[rng.random((steps, trials)) < lost] = np.nan
+    run = SimpleNamespace(estimates=rng.normal(size=(steps + 1, trials, size)), innovations=innovations)
+    right = np.tile(np.eye(size), (steps + 1, 1, 1))
+    law = SimpleNamespace(filter=SimpleNamespace(corrected=right, innovation=right))
+    space = SimpleNamespace(difference=np.subtract)
+    states = np.zeros((trials, steps + 1, size))
+    rollout = SimpleNamespace(states=states, state_coordinates=space, controller_run=run)
+    found = of_run(law, rollout, np.arange(trials))
+    for name in ("NEES", "NIS"):
+        assert found[name]["mean"] == pytest.approx(1, abs=0.01)
+        assert found[name]["inside"] == pytest.approx(95, abs=3.3)  # three standard deviations of 400 knots
 
 
 def test_funnels_of_known_truth() -> None:

@@ -44,10 +44,10 @@ def of_run(law: ls.OffsetFree, rollout: ls.Rollout, well: npt.NDArray[np.intp]) 
         ("NEES", errors, law.filter.corrected[:knots, :n, :n]),
         ("NIS", run.innovations[:knots, well], law.filter.innovation[:knots]),
     ):
-        size, count = off.shape[2], len(well)
         squares = np.einsum("tki,tij,tkj->tk", off, np.linalg.inv(covariance), off)  # NaN where nothing came
+        size, count = off.shape[2], np.isfinite(squares).sum(axis=1)
         each = np.nanmean(squares, axis=1)
-        low, high = chi2.ppf((0.025, 0.975), size * count) / count
+        low, high = (chi2.ppf(tail, size * count) / count for tail in (0.025, 0.975))
         inside = float(((each > low) & (each < high)).mean())
         found[name] = {"mean": float(each.mean() / size), "inside": 100 * inside}
     return found | {"trials": len(well)}
