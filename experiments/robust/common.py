@@ -18,7 +18,7 @@ from lqrsim.stress.statistics import rate
 
 Reached = npt.NDArray[np.bool_]
 PRESETS = ("light", "moderate", "severe")
-KEPT = ("particles", "world_trials", "without", "hardened", "seed")
+KEPT = ("particles", "world_trials", "without", "hardened", "seed")  # what rows depend on
 # The chance of collision that a safe plan is asked for; under severe turbulence few plans have less.
 ASKED = {"light": 1e-3, "moderate": 1e-2, "severe": 0.2}
 
@@ -53,10 +53,7 @@ class Config(FolderSettings):
 
     def kept(self) -> Kept:
         """What is done."""
-        return Kept(
-            self.keep,
-            {name: getattr(self, name) for name in ("particles", "world_trials", "without", "hardened", "seed")},
-        )
+        return Kept(self.keep, {name: getattr(self, name) for name in KEPT})
 
     def bounded(self) -> Self:
         """The settings, reduced by `--quick`."""
