@@ -344,8 +344,9 @@ def report(result: Result) -> str:
         lines += [
             "### Until it fails",
             f"{config['failing']} trials of each strength: successes in %. A law is not run beyond the strength at"
-            " which none succeed. Strengths are in m/s, N, N m, and shares of the numbers, the efficiency and the mass;"
-            " theirs end at 0.6 for rotors and at 2 for the payload, too.",
+            " which none succeed. Strengths are the mean speed of the wind in m/s; each component of the force in N,"
+            " and of the torque in N m; by what share a number of the model, or a rotor's efficiency, is off at most;"
+            " and the payload as a share of the mass. Theirs end at 0.6 for rotors and at 2 for the payload, too.",
             table(("strength", *LAWS), rows),
         ]
     if "delay" in result:

@@ -176,7 +176,8 @@ def report(result: Result) -> str:
         ),
         picture(result, "feedback_paths", f"The first {count} trials of each, up to their first collision"),
         f"{result['trials']} trials of each strength and policy, one undisturbed; p is McNemar's exact test of feedback"
-        " against open loop. Errors are distances from the plan, until a trial collides or is lost.",
+        " against open loop. Errors are distances from the plan, until a trial collides or is lost; rms is the mean"
+        " over the trials of each one's.",
     ]
     for name, robot in result["robots"].items():
         rows = [

@@ -243,6 +243,11 @@ def interval(estimate: Estimate) -> list[float]:
     return [estimate.value, estimate.low, estimate.high]
 
 
+def improbable(chance: float, spec: str = ".1g") -> str:
+    """A p-value in words; one that is 0 was too small for a number."""
+    return f"{chance:{spec}}" if chance else "< 1e-300"
+
+
 def between(estimate: Sequence[float], spec: str = ".2f") -> str:
     """Such a list in words."""
     value, low, high = estimate

@@ -132,6 +132,17 @@ def test_robust_policies_reports_what_has_no_chance(measured: list[float] | None
         ([[measured, measured], [[0.3, 0.2, 1.0], [0.1, 0.0, 0.15]]], "| light | 1 | 3 | 3 | 3 | 0 | 1 |"),
     ):
         assert module.report({"light": pairs})[1].splitlines()[-1] == row
+    one = {"asked": 0.01, "predicted": 0.02}
+    plans = [one | {"measured": measured}, one | {"measured": [0.04, 0.03, 0.05]}]
+    said, rows = import_module("robust.chances").report({"light": plans})
+    assert rows.splitlines()[-1] == "| light | 1 | 0.01 | 0.50 | 0.50 | 0.50 |"
+    assert said.endswith("Left out: 1 plans of which none collided.")
+
+
+@pytest.mark.parametrize(("chance", "said"), [(1.0, "1"), (0.0312, "0.03"), (2.4e-127, "2e-127"), (0.0, "< 1e-300")])
+def test_no_chance_is_said_to_be_zero(chance: float, said: str) -> None:
+    """A test of thousands of trials may have a p-value below all numbers."""
+    assert import_module("runner").improbable(chance) == said
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.02, 0.3, 0.6])

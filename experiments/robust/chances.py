@@ -133,14 +133,17 @@ CASES: dict[str, Callable[[int], Case]] = {
 
 
 def report(found: dict[str, Any]) -> list[str]:
-    rows = []
+    rows, without = [], 0
     for name, plans in found.items():
         ratios = [row["predicted"] / row["measured"][0] for row in plans if row["measured"] and row["measured"][0] > 0]
         shares = [f"{pick(ratios):.2f}" if ratios else "-" for pick in (min, np.median, max)]
         asked = ", ".join(f"{chance:g}" for chance in sorted({row["asked"] for row in plans}))
-        rows.append([name, len(plans), asked, *shares])
+        rows.append([name, len(ratios), asked, *shares])
+        without += len(plans) - len(ratios)
     return [
         "OffsetFree on safe plans: the predicted chance over the measured one. Predictions below"
-        f" {COUNTED:g} are held against splitting, others are counted.",
+        f" {COUNTED:g} are held against splitting, others are counted."
+        + f" Left out: {without} plans of which none collided."
+        * (without > 0),
         table(("robot, preset", "plans", "asked", "least", "median", "most"), rows),
     ]

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from peers import RotorPy, Unavailable
 from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE
-from runner import progress, table
+from runner import improbable, progress, table
 
 import lqrsim as ls
 from lqrsim.control.controllers import ControllerLike
@@ -95,8 +95,8 @@ def report(found: dict[str, Any]) -> list[str]:
     ]
     dearer = ", ".join(f"{100 * one['dearer']:+.0f} % ({preset})" for preset, one in presets.items())
     against = [
-        f"{one['against']['only_ours']} against {one['against']['only_theirs']} ({preset}, p ="
-        f" {one['against']['p_value']:.1g})"
+        f"{one['against']['only_ours']} against {one['against']['only_theirs']} ({preset}, p:"
+        f" {improbable(one['against']['p_value'])})"
         for preset, one in presets.items()
         if "against" in one
     ]
@@ -106,7 +106,8 @@ def report(found: dict[str, Any]) -> list[str]:
         " plan is asked for a chance of collision of "
         + ", ".join(f"{chance:g} ({preset})" for preset, chance in ASKED.items())
         + f", and costs more than the default plan by {dearer} in the median. RotorPy's law has the gains that a"
-        " search found best (`experiments/rotorpy_gains.py`). Trials that only ours reaches against those that only"
+        " search found best for the default plan of the first query, at light, and for the other presets at moderate"
+        " (`experiments/rotorpy_gains.py`). Trials that only ours reaches against those that only"
         f" theirs does, McNemar's exact test: {peers}.",
         table(("reached (%)", *presets), rows),
     ]

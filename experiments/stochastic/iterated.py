@@ -37,6 +37,6 @@ def report(found: dict[str, Any]) -> list[str]:
     ]
     return [
         f"{found['queries']} queries from exactly the given start, rotors off by {100 * found['share']:g} % of their"
-        " force.",
+        " force. Iterations of the smoother are those of the start whose plan it returns.",
         table(("", "converged", "expected cost, mean", "iterations, median", "not worse than iLQG"), rows),
     ]

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from runner import table
+from runner import improbable, table
 
 import lqrsim as ls
 from stochastic.common import PLACE, Config, drive, on_oil, paired, quadrotor, rotors
@@ -38,7 +38,13 @@ def report(found: dict[str, Any]) -> list[str]:
     sure = sum(row["chance"] < SURE for row in rows)
     gain = [100 * (row["other"] / row["mean"] - 1) for row in rows]
     oil = [
-        [f"{row['more']:g}", f"{row['away']:.2f}", f"{row['mean']:.2f}", f"{row['other']:.4g}", f"{row['chance']:.0e}"]
+        [
+            f"{row['more']:g}",
+            f"{row['away']:.2f}",
+            f"{row['mean']:.2f}",
+            f"{row['other']:.4g}",
+            improbable(row["chance"], ".0e"),
+        ]
         for row in found["oil"]
     ]
     head = ("slips so many times more", "keeps away, m", "mean cost", "of the plan without noise", "p")
