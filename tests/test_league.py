@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -173,6 +174,35 @@ def test_a_solver_that_claims_what_is_not_so_has_solved_nothing(
     assert found["solved"] == [False]
     assert found["target"]["iterations"] == found["exact"]["iterations"] == [None]
     assert "double_integrator, liar, instance 0: claimed, but the dynamics: missed by" in solver_league.report(result)
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 3])
+def test_box_fddp_has_the_least_processor_time_of_its_calls_as_all_have(
+    iterations: int, solved: tuple[ls.Problem, ls.Solution], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that waits and does nothing: by the clock that takes long, and no processor."""
+    problem, solution = solved
+    calls, plan = list[float](), solution.trajectory
+
+    class Waiting:
+        def __init__(self, problem: ls.Problem) -> None: ...
+
+        def solve(self, *told: Any) -> tuple[peers.Answer, list[Moment]]:
+            calls.append(0.0)
+            time.sleep(0.02)
+            moments = [Moment(number, 0.02 * number / iterations, 1.0, 0.0) for number in range(1, iterations + 1)]
+            return peers.Answer(plan.states, plan.controls, 1.0, iterations, converged=iterations > 0), moments
+
+    monkeypatch.setattr(contestants, "BoxFddp", Waiting)
+    run = contestants.CONTESTANTS["box-FDDP"](problem, compile=False)(problem, plan)
+    assert len(calls) == contestants.REPEATS
+    if run.exact is None:
+        assert iterations == 0
+        return
+    first = run.first(lambda moment: True)
+    assert first is not None
+    assert first.seconds == pytest.approx(run.exact.seconds / iterations)
+    assert run.exact.seconds < 0.01
 
 
 def test_what_is_not_taken_or_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

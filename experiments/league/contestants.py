@@ -174,7 +174,10 @@ def _box_fddp(problem: ls.Problem, *, compile: bool) -> Solve:
     solver = BoxFddp(problem)
 
     def solve(problem: ls.Problem, start: Start) -> Run:
-        answer, moments = solver.solve(problem, *_guess(problem, start))
+        guess = _guess(problem, start)
+        (answer, moments), took = _timed(lambda: solver.solve(problem, *guess))
+        share = took.processor / moments[-1].seconds if moments else 1.0  # its own are by the clock, and of one call
+        moments = [replace(moment, seconds=share * moment.seconds) for moment in moments]
         return Run(
             plan=ls.Trajectory(answer.states, answer.controls, problem.dt), cost=answer.cost,
             status="converged" if answer.converged else "failed", solved=answer.converged,
