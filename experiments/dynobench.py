@@ -13,7 +13,7 @@ stated for `ls.smooth(problem)` alone, with a free duration in 100 steps:
   clear    with 3 cm of clearance, as published plans keep.
   exact    with `accuracy=` and `between_knots=True`.
   euler    as dynobench has it, a map of Euler steps of 0.01 or 0.1 s, with 3 cm of clearance: the fewest steps that
-           converge, from the plan of `clear` and at most a few counts.
+           converge, from the plan of `clear`, whose time is not counted here, and at most a few counts.
   outside  as `knots`, by a search that knows the robots (`kinodynamic/outside.py`), for comparison; not by default.
 
 What is said is judged by `kinodynamic/check.py`, which has nothing of lqrsim: `euler` by dynobench's own conditions,
