@@ -118,6 +118,30 @@ def test_the_check_of_families_can_fail() -> None:
     assert "not finite" in dense.contradictions(case, _with_plan(early, states=lost))[0]
 
 
+@pytest.mark.parametrize("kind", ["given", "symmetric", "flat", *rarely("saturating", "scales")])
+def test_a_plan_beside_an_optimum_is_none(kind: str) -> None:
+    """Controls that are inside their limits are moved by a hundredth; where that costs nothing, nothing is said."""
+
+    @settings(max_examples=examples(20), suppress_health_check=[HealthCheck.too_slow])
+    @given(number=st.integers(0, 2**32 - 1))
+    def holds(number: int) -> None:
+        case = dataclasses.replace(families.draw(kind, number), given=None)
+        solution = ls.smooth(case.problem, threads=1)
+        controls, rng = solution.trajectory.controls, np.random.default_rng(number)
+        inside = (controls > case.low) & (controls < case.high)
+        moved = controls + 1e-2 * np.abs(controls).max() * rng.normal(size=controls.shape) * inside
+        moved = np.clip(moved, case.low, case.high)
+        cost = float(case.cost(moved))
+        if solution.status is not Status.CONVERGED or case.problem.constraints or not cost > 1.001 * solution.cost > 0:
+            return
+        beside = _with_plan(solution, states=case.roll(moved), controls=moved)
+        certificate = dataclasses.replace(solution.certificate, cost=cost)
+        found = dense.contradictions(case, dataclasses.replace(beside, certificate=certificate))
+        assert any("could still be saved" in one or "saddle" in one for one in found), f"{case}: {found}"
+
+    holds()
+
+
 def test_what_is_known_otherwise_is_noticed() -> None:
     drawn = known.draw("weights", 0)
     solution = ls.smooth(drawn.problem)

@@ -19,6 +19,7 @@ from .families import Case
 COST = 1e-7  # rounding of sums of a few hundred terms, and of steps that amplify it
 ACTIVE = 1e-5  # how near to a bound or a limit, relative to its size, counts as at it
 FLAT = 1e-6  # eigenvalues up to this part of the largest are neither positive nor negative: those of differences
+SLACK = 10.0  # times the tolerance: what may still be saved; the solver's own Hessians are others
 GAIN = 1e-6  # what a step may lower the cost by where nothing can be gained, relative
 WORSE = 1e-6  # a plan that costs this much more than another, relative, is worse
 VIOLATED = 1e-6  # tolerance of constraints, in their units
@@ -122,6 +123,7 @@ class Dense:
       inequality: (K,) which of these are. forces: (K,) multipliers by least squares. left: (D,) what of the gradient
         they leave.
       hessian: (D, D) of the Lagrangian. reduced: the eigenvalues of the Hessian on the tangent space of the rows.
+      slopes: of the cost along their eigenvectors.
     """
 
     gradient: Array
@@ -131,6 +133,7 @@ class Dense:
     left: Array
     hessian: Array
     reduced: Array
+    slopes: Array
 
 
 def dense(case: Case, solution: ls.Solution) -> Dense:
@@ -177,8 +180,8 @@ def dense(case: Case, solution: ls.Solution) -> Dense:
         _, values, across = np.linalg.svd(rows)
         rank = int((values > 1e-8 * values.max()).sum())
         tangent = across[rank:].T
-    reduced = np.linalg.eigvalsh(tangent.T @ hessian @ tangent) if tangent.shape[1] else np.zeros(0)
-    return Dense(gradient, rows, inequality, forces, left, hessian, reduced)
+    reduced, across = np.linalg.eigh(tangent.T @ hessian @ tangent)
+    return Dense(gradient, rows, inequality, forces, left, hessian, reduced, (tangent @ across).T @ left)
 
 
 def _sizes(case: Case, z: Array) -> Array:
@@ -202,6 +205,12 @@ def _of_an_optimum(case: Case, solution: ls.Solution) -> list[str]:
     claimed = solution.curvature
     least = float(of.reduced.min(initial=np.inf))
     largest = max(float(np.abs(of.reduced).max(initial=0.0)), 1e-3 * curve, 1e-300)
+    bent = of.reduced > FLAT * largest
+    promised = 0.5 * float((of.slopes[bent] ** 2 / of.reduced[bent]).sum())
+    tolerance, cost = solution.options["tolerance"], float(_cost(case, _variables(case, solution)))
+    assert isinstance(tolerance, float)
+    if not promised <= SLACK * tolerance * abs(cost) + 1e-11 * _size(case):
+        found.append(f"no optimum: {promised:.2g} of {cost:.2g} could still be saved")
     if least < -FLAT * largest:
         found.append(f"a saddle: the least eigenvalue is {least:.2g} of {largest:.2g} (said: {claimed})")
     if claimed == "minimum" and least < 1e-11 * largest:
