@@ -115,6 +115,40 @@ def test_the_dual_form_takes_a_fixed_start_singular_steps_and_singular_costs(
 
 
 @settings(max_examples=examples(20))
+@given(
+    seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 12), far=st.sampled_from([1.0, 1e3]), fixed=st.booleans(),
+    stated=st.booleans(),
+)  # fmt: skip
+def test_a_plan_that_can_be_followed_costs_nothing_and_is_found(
+    seed: int, steps: int, far: float, fixed: bool, stated: bool
+) -> None:
+    """Deviations from a plan are weighed, in coordinates about the origin: rounding is all that is left of the cost.
+
+    `stated`: the weights are about the plan; otherwise states begin far from an origin to which the drift brings them.
+    """
+    problem, rng = random_problem(seed, 3, 2, steps), np.random.default_rng(seed)
+    states, controls = [far * rng.normal(size=3)], far * rng.normal(size=(steps, 2))
+    for A, B, u, c in zip(problem.A, problem.B, controls, problem.c, strict=True):
+        states.append(A @ states[-1] + B @ u + c)
+    if not stated:  # to the origin in one step, at which all weights are
+        controls, drift = 0 * controls, np.zeros_like(problem.c)
+        drift[0], states = -problem.A[0] @ states[0], [states[0], *[np.zeros(3)] * steps]
+        problem = dataclasses.replace(problem, c=drift)
+        problem.H[0, :3] = problem.H[0, :, :3] = 0.0
+    plan = np.hstack([states[:-1], controls])
+    pull = np.einsum("tij,tj->ti", problem.H, plan)
+    ends = problem.Q0 @ states[0], problem.QT @ states[-1]
+    problem = dataclasses.replace(
+        problem, h=-pull, k=0.5 * np.einsum("ti,ti->t", pull, plan), fixed=states[0] if fixed else None,
+        q0=-ends[0], k0=0.5 * float(ends[0] @ states[0]), qT=-ends[1], kT=0.5 * float(ends[1] @ states[-1]),
+    )  # fmt: skip
+    for form in ("dual",) if fixed else ("primal", "dual"):
+        solution, size = smoothed(problem, form), max(1.0, float(np.abs(states).max()))
+        assert abs(solution.cost) <= 1e-12 * size**2
+        np.testing.assert_allclose(solution.trajectory.states, states, rtol=0, atol=1e-9 * size)
+
+
+@settings(max_examples=examples(20))
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 8))
 def test_value_functions_are_the_cost_of_the_rest_of_the_way(seed: int, steps: int) -> None:
     problem = random_problem(seed, 3, 2, steps)

@@ -60,10 +60,11 @@ def smooth_lq(
     if not detail:
         predicted = float(Quadratic(*(part[0] for part in passes.to_go))(start)) + _cost_at(initial, start)
         with np.errstate(all="ignore"):
-            # If the terms of the cost at the origin cancel, a rounding error relative to them remains.
+            # If terms of the cost at the origin or of the cost-to-go cancel, a rounding error relative to them remains.
             terms = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
             terms += abs(float(initial.constant)) if isinstance(initial, Quadratic) else 0.0
-            optimality = abs(value - predicted) / max(abs(value), 1e-28 * terms, 1e-300)
+            terms += float(Quadratic(*(np.abs(part[0]) for part in passes.to_go))(np.abs(start)))
+            optimality = abs(value - predicted) / max(abs(value), ROUNDING / ACCURACY * terms, 1e-300)
             gap, residual = _off_plan(parts, passes, states)
         if not optimality < ACCURACY:
             detail = f"too ill-conditioned: the plan costs {value:.9g}, the cost-to-go promised {predicted:.9g}"
@@ -98,6 +99,9 @@ def smooth_lq(
 
 # Relative accuracy of cost and states that a solved problem must have.
 ACCURACY = 1e-6
+
+# Of a cost in which larger terms cancel, the part of these terms that is taken for rounding.
+ROUNDING = 1e-14
 
 # The passes that `lq_passes` numbers.
 _WHICH = ("backward pass", "forward pass", "minimum of the total cost")
