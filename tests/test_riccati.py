@@ -149,6 +149,20 @@ def test_a_plan_that_can_be_followed_costs_nothing_and_is_found(
 
 
 @settings(max_examples=examples(20))
+@given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 6), rank=st.integers(0, 2))
+def test_the_covariance_is_the_inverse_of_the_dense_hessian_with_any_start(seed: int, steps: int, rank: int) -> None:
+    """The primal form takes a singular initial cost: all else determines the start."""
+    problem = random_problem(seed, 3, 2, steps)
+    root = np.random.default_rng(seed).normal(size=(3, rank))
+    problem = dataclasses.replace(problem, Q0=root @ root.T, q0=np.zeros(3))
+    total = smoothed(problem, "primal").total_cost
+    assert isinstance(total.cost_to_come, ls.types.Quadratic)
+    hessian = (total.cost_to_go + total.cost_to_come).hessian
+    unit = total.covariance() @ hessian
+    np.testing.assert_allclose(unit, np.tile(np.eye(3), (steps + 1, 1, 1)), rtol=0, atol=1e-9)
+
+
+@settings(max_examples=examples(20))
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 8))
 def test_value_functions_are_the_cost_of_the_rest_of_the_way(seed: int, steps: int) -> None:
     problem = random_problem(seed, 3, 2, steps)

@@ -151,8 +151,9 @@ class TotalCost:
         """
         come, curvature = self.cost_to_come, self.cost_to_go.hessian
         with _invertible("hessian"):
-            covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
-            return covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + curvature @ covariance)
+            if isinstance(come, Quadratic):
+                return np.linalg.inv(come.hessian + curvature)
+            return come.covariance @ np.linalg.inv(np.eye(curvature.shape[-1]) + curvature @ come.covariance)
 
     def minimum(self) -> Array:
         """The least total cost at each knot, (T+1,); the same at all knots for a linear-quadratic problem."""
