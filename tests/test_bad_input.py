@@ -239,6 +239,8 @@ CALLS: list[tuple[Callable[[], object], str]] = [
      "^initial: got a FixedState, want an initial cost"),
     (lambda: ls.lq.smooth_continuous(replace(drive().problem, duration=(9.0, 30.0), time_weight=0.1)),
      "^duration: got a free duration, want None"),
+    *[(partial(ls.load, "plan.npz", kind), "^kind: got .*, want one of ls.Solution, .* ls.types.Funnel, ls.stress")
+      for kind in ([], {}, np.zeros(2), "Solution", int)],
     (lambda: drive().problem.site_errors(np.zeros(3)), r"states: got shape \(3,\), want"),
     (lambda: drive().problem.site_errors(np.zeros((2, 4))), r"states: got shape \(2, 4\), want"),
     (lambda: ls.smooth(replace(drive().problem, initial=ls.FixedState((0, -2.5, np.pi))), form="primal"),

@@ -85,8 +85,9 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.types.OutputFeedbackPolicy`,
         `ls.types.Funnel` or `ls.stress.FailureCertificate`. By default, any.
     """
-    if kind is not None and kind not in FORMATS:
-        names = (f"ls.{'stress.' if allowed is FailureCertificate else ''}{allowed.__name__}" for allowed in FORMATS)
+    if kind is not None and not any(kind is allowed for allowed in FORMATS):  # it may have no hash
+        homes = {OutputFeedbackPolicy: "types.", Funnel: "types.", FailureCertificate: "stress."}
+        names = (f"ls.{homes.get(allowed, '')}{allowed.__name__}" for allowed in FORMATS)
         raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(names)}")
     wanted = None if kind is None else FORMATS[kind][0]
     path = check_path(wanted or "path", path)
