@@ -9,12 +9,16 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from lqrsim.machine import processor
 
 
-@cache
 def versions() -> dict[str, str]:
     """Name -> version of lqrsim, of the libraries that its numbers depend on, and of Python; and the `processor`.
 
     If all are equal, the same program gives the same bits.
     """
+    return dict(_versions())  # one for each result, which its owner may change
+
+
+@cache
+def _versions() -> dict[str, str]:
     installed = versions_of("lqrsim", "numpy", "llvmlite", "mujoco")
     return {"python": platform.python_version()} | installed | {"processor": processor()}
 

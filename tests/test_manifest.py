@@ -262,6 +262,16 @@ def test_avx_512_is_left_out_unless_asked_for(
     assert machine.instruction_set.__wrapped__()[2] == features
 
 
+def test_what_is_changed_in_the_versions_of_one_result_is_not_in_others() -> None:
+    stage = ls.lq.Stage(A=[[[1.0]], [[1.0]]], B=[[1.0]], R=[[1.0]])
+    end: Any = ls.types.Quadratic([[1.0]], [0.0], 0.0)  # pyright: ignore[reportArgumentType]
+    one, other = (ls.lq.smooth_lq(stage, initial=end, final=end) for _ in range(2))
+    before = dict(other.versions)
+    changed: Any = one.versions
+    changed["numpy"] = "0.1"
+    assert before == other.versions == versions.versions()
+
+
 def test_a_campaign_does_not_go_on_with_another_processor(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
