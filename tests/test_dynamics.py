@@ -298,6 +298,11 @@ FIELDS = {
         (_piece, {}, r"_piece\(x, u, p\): got Piecewise.* in entry 1, want its last case to be \(expression, True\)"),
         (_pendulum, {"parameters": {"_k": 1.0}}, "got the name '_k', want a Python name without a leading underscore"),
         (_pendulum, {"parameters": {1: 1.0}}, "parameters: got the name 1, want a Python name"),
+        (
+            _pendulum,
+            {"parameters": {"\u00b5": 1.0, "\u03bc": 2.0}},  # the micro sign, and the Greek letter
+            "parameters: got two names that are p.\u03bc in Python, want different ones",
+        ),
         (_pendulum, {"states": ["angle", "speed"]}, "states: got .*, want a dictionary of name: unit"),
         (_pendulum, {"control_limits": ("a", "b")}, r"control_limits: got .*, want \(lowest, highest\), each a number"),
         (_pendulum, {"level": 3}, "level: got 3, want one of: symbolic, compiled, jax, plain"),
@@ -312,3 +317,11 @@ def test_bad_dynamics_get_one_line(function, fields: dict, message: str) -> None
     with pytest.raises(ls.InputError, match=message) as caught:
         _ = ls.Dynamics(function, **{**FIELDS, **fields}).source
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["\u00b5", "\ufb01nal", "\u2115", "\u212b", "e\u0301"])
+def test_formulas_find_names_that_python_writes_in_another_way(name: str) -> None:
+    """The micro sign, a ligature, the sign of natural numbers, that of the angstrom, an accent of its own."""
+    formula = eval(f"lambda x, u, p: [x.{name} + 2 * u.{name} + 3 * p.{name}, x[:1].{name}]")
+    dynamics = ls.Dynamics(formula, states={name: "", "other": ""}, controls={name: ""}, parameters={name: 5.0})
+    np.testing.assert_array_equal(dynamics.rate([1.0, 7.0], [2.0]), [20.0, 1.0])

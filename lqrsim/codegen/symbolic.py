@@ -36,7 +36,7 @@ class Vector(tuple[Any, ...]):
 
     def __new__(cls, symbols: Iterable[Any], names: Sequence[str]) -> "Vector":
         vector = super().__new__(cls, symbols)
-        vector.names = tuple(names)
+        vector.names = tuple(unicodedata.normalize("NFKC", name) for name in names)  # as Python does in x.µ
         return vector
 
     def __getattribute__(self, name: str) -> Any:  # names come first: a state may be called `count`
@@ -65,8 +65,11 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
             raise InputError(
                 f"parameters: got the name {excerpt(name)}, want a Python name without a leading underscore, for p.name"
             )
-    # Python normalises the name in p.µ.
-    normal = {unicodedata.normalize("NFKC", name): value for name, value in parameters.items()}
+    normal: dict[str, float] = {}
+    for name, value in parameters.items():
+        if (same := unicodedata.normalize("NFKC", name)) in normal:  # Python normalises the name in p.µ
+            raise InputError(f"parameters: got two names that are p.{same} in Python, want different ones")
+        normal[same] = value
     return {name: check_number(f"parameters: {name}", value) for name, value in normal.items()}
 
 
