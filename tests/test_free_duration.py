@@ -448,7 +448,9 @@ def by_waypoints(places: list[float], knots: list[int], end: float, steps: int =
     ("places", "knots", "end"),
     [([2.0], [20], -1.0), ([2.0], [6], -1.0), ([2.0, -1.0], [10, 20], 0.5), *rarely(([1.0], [30], -2.0))],
 )
-def test_segments_take_the_times_that_they_need(places: list[float], knots: list[int], end: float) -> None:
+def test_segments_take_the_times_that_they_need(
+    places: list[float], knots: list[int], end: float, tmp_path: Path
+) -> None:
     """There and back: at each waypoint the cart turns a centimetre before it, so segments last 2 sqrt(way) each.
 
     That the turns and the switches between them are at knots costs some thousandths, and half a step for each turn.
@@ -459,6 +461,7 @@ def test_segments_take_the_times_that_they_need(places: list[float], knots: list
     seconds = 2 * np.sqrt(np.abs(np.diff(turns)))
     assert seconds.sum() * (1 - 1e-6) <= solution.trajectory.horizon <= 1.005 * seconds.sum()
     fixed = by_waypoints(places, knots, end).with_duration_of(solution)
+    assert ls.load(ls.save(solution, tmp_path / "plan.npz"), ls.Solution).options == solution.options
     assert fixed.duration is None
     assert fixed.dt == pytest.approx(solution.trajectory.dt)
     ends = np.cumsum(seconds)[:-1]

@@ -256,7 +256,8 @@ class DurationSearch:
         """Solve with a fixed duration."""
         solution = self._solve(fixed, settings)
         if fixed.segments:
-            solution = replace(solution, options=dict(solution.options) | {"segments": fixed.segments})
+            knots = [*fixed.segments]  # a list, as it is in a file
+            solution = replace(solution, options=dict(solution.options) | {"segments": knots})
         self._total += max(len(solution.iterations), sum(candidate.iterations for candidate in solution.candidates))
         return solution
 
