@@ -472,6 +472,7 @@ def test_the_example_on_an_emulated_stm32f405(drive_solution: ls.Solution, tmp_p
         ({"interpolate": 1}, "interpolate: got 1, want"),
         ({"name": "my policy"}, "name: got 'my policy', want lower-case letters"),
         ({"name": "main"}, "name: got 'main', want lower-case letters"),
+        ({"name": 41 * "a"}, "name: got 41 characters, .*, want a name of at most 40$"),
         ({"factor": np.nan}, "policy: planned: got NaN or infinity in it, want finite numbers"),
         ({"factor": 1e300}, "policy: planned: got .*, want numbers that a float holds"),
     ],

@@ -74,7 +74,7 @@ def export_c(
     number: Annotated[str, OneOf(NUMBERS)] = "float",
     gains: Annotated[str, OneOf(GAINS)] = "full",
     interpolate: bool = False,
-    name: Annotated[str, Want("a name of at most 40 letters"), 40] = "policy",
+    name: Annotated[str, Want("a name"), 40] = "policy",
 ) -> ExportedC:
     """Write a policy as C99 with constant tables, and an example with a CMake file.
 
