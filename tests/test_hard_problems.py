@@ -1,6 +1,7 @@
 """What once was wrong, or could be: numbers far from one, motions that escape, starts that lead nowhere."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,6 +136,17 @@ class TestLinearQuadratic:
             )  # fmt: skip
             assert solution.status is Status.NOT_POSITIVE_DEFINITE
             assert "minimum of the total cost" in solution.detail
+
+    @pytest.mark.parametrize("growth", [1e60, 1e100, 1e160, 1e200])
+    @pytest.mark.parametrize("steps", [2, 4])
+    def test_what_overflows_says_so_and_can_be_saved(self, growth: float, steps: int, tmp_path: Path) -> None:
+        stage = ls.lq.Stage(A=np.full((steps, 1, 1), growth), B=[[1.0]], R=[[1.0]], Q=[[1.0]])
+        end = ls.types.Quadratic(np.eye(1), np.zeros(1), 0.0)
+        for start in (end, ls.FixedState([1.0])):
+            solution = ls.lq.smooth_lq(stage, initial=start, final=end)
+            loaded = ls.load(ls.save(solution, tmp_path / "failed.npz"), ls.Solution)
+            assert loaded.status is solution.status
+            assert loaded.detail == solution.detail
 
     @pytest.mark.parametrize("weight", [1.0, 1e4, 1e8, 1e12])
     @pytest.mark.parametrize("effort", [1.0, 1e-6])

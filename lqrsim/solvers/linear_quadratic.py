@@ -53,6 +53,8 @@ def smooth_lq(
     clock = time.perf_counter()
     parts = _parts(stage)
     passes, failure = _passes(parts, initial, final, form)
+    for part in passes.policy if failure else ():
+        part[~np.isfinite(part)] = 0.0  # as where the pass did not get, for a policy in a file is finite
     start, detail = _start(passes, failure, initial)
     states, controls, value = _rollout(parts, passes.policy, start)
     value += float(final(states[-1])) + _cost_at(initial, states[0])
