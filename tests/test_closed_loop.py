@@ -69,6 +69,19 @@ def test_a_trial_is_the_same_to_the_last_bit_whatever_runs_beside_it(request, fi
     assert (together.states[1:, -1] != together.states[:-1, -1]).all()
 
 
+@pytest.mark.parametrize("noise", [0.3, 0.6, 1.0])
+def test_periods_in_contact_are_those_of_a_trial_alone(arena, noise):
+    """Robots bounce off a wall within a period, while others run theirs again because they collide in it."""
+    ahead = track(DifferentialDrive(), (0.5, -2.4, 0.0), np.full((60, 2), 0.3), 1 / 6)
+    disturbances = [ControlNoise(noise)]
+    together = simulate(arena, ahead, disturbances=disturbances, trials=12, frames=False)
+    assert len({*together.contacts.tolist()}) > 3
+    for trial in range(12):
+        alone = simulate(arena, ahead, disturbances=disturbances, first_trial=trial, frames=False)
+        for name in RECORDS[:-1]:
+            np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[trial], err_msg=name)
+
+
 def test_adding_a_disturbance_leaves_the_draws_of_those_before_it(cage):
     one = simulate(cage, hover(10), disturbances=[ForceNoise(0.1)])
     two = simulate(cage, hover(10), disturbances=[ForceNoise(0.1), MeasurementNoise(0.01)])

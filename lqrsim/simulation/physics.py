@@ -231,7 +231,10 @@ class MujocoPhysics(Physics):
         for part in range(self.parts):
             period.states[part][rows] = again.states[part][rows]
             period.frames[part][rows] = again.frames[part][rows]
-            period.touching[part] = again.touching[part]
+            if len(period.touching[part]):  # the others' contacts are those of their own period
+                period.touching[part][rows] = again.touching[part][rows]
+            else:
+                period.touching[part] = again.touching[part]
         period.stable[rows] = again.stable[rows]
 
     def touched(self, period: Period) -> npt.NDArray[np.bool_]:
