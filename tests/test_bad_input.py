@@ -340,6 +340,10 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: roll(of.MeasurementNoise({"z": 0.1})), "MeasurementNoise: std: got 'z', want"),
     (lambda: roll(of.Push((1.0, 0.0, 0.0), at=5.0)),
      "^Push: at: got 5 s, want a time before the plan ends at 5 s$"),
+    (lambda: roll(of.Push((1.0, 0.0, 0.0), at=1e308)), r"^Push: at: got 1e\+308 s, want a time before"),
+    (lambda: fly(of.ActuatorLoss(at=1e308)), r"^ActuatorLoss: at: got 1e\+308 s, want a time before"),
+    *[(lambda factor=factor: of.MassMismatch(factor=factor).scaled(1e6), r"^MassMismatch: strength: got 1e\+06, want")
+      for factor in (0.5, 1.5)],
     (lambda: roll(of.ThrustMismatch(0.01)),
      "^ThrustMismatch: got robot differential_drive, whose actuators are servos"),
     *[(lambda kind=kind, numbers=numbers: roll(getattr(of, kind)(*numbers)),

@@ -407,6 +407,8 @@ class TestReplanner:
             ({"every": 0.01}, r"every: got 0\.01 s, want at least a control period, 0\.0333333 s"),
             ({"deadline": 1.1}, r"deadline: got 1\.1 s, 33 control periods, want at most every=1 s"),
             ({"deadline": -1.0}, "deadline: got -1"),
+            ({"deadline": 1e308}, r"deadline: got 1e\+308 s, .* want at most every=1 s"),
+            ({"computing": 1e308}, r"deadline: got 1e\+308 s, .* want at most every=1 s"),
             ({"horizon": "fixed"}, "horizon: got 'fixed', want one of"),
             ({"computing": "fast"}, "computing: got 'fast', want seconds, a function or \"measured\""),
             ({"computing": -0.1}, r"computing: got -0\.1"),
@@ -419,6 +421,13 @@ class TestReplanner:
     def test_bad_input(self, quadrotor: ls.Scenario, quadrotor_solution, wrong: dict[str, Any], line: str) -> None:
         with pytest.raises(ls.InputError, match=f"Replanner: {line}"):
             anything(ls.Replanner)(quadrotor.problem, quadrotor_solution, **{"every": 1.0} | wrong)
+
+    def test_any_number_of_seconds_lies_between_two_solves(self, quadrotor: ls.Scenario, quadrotor_solution) -> None:
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=1e308)
+        assert not any(law.rule.due(step, step - 1) for step in range(1, 60))
+        with law.live(clock=lambda: 0.0) as live:
+            for t in (0.0, 1e300, 1e308):
+                assert np.isfinite(live.step(quadrotor_solution.trajectory.states[-1], t)).all()
 
     def test_changes_that_would_compile_are_a_failure_with_its_reason(
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution

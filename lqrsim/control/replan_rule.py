@@ -22,6 +22,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.prepared import prepare
 
 Changes = Annotated[Callable[[float, Problem], Problem], Want("a function of the time and the problem")]
+MOST_PERIODS = 1e12  # that a number of control periods is rounded to; more are as many
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +168,9 @@ class ReplanRule:
         self.every = check_number(f"{who}: {name}", every, above=0.0)
         if self.every < 0.999 * problem.dt:
             raise InputError(f"{who}: {name}: got {self.every:g} s, want at least a control period, {problem.dt:g} s")
-        self.periods = round(self.every / problem.dt)
+        self.periods = round(min(self.every / problem.dt, MOST_PERIODS))
         self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
-        self.delay = math.ceil(self.deadline / problem.dt - 1e-9)
+        self.delay = math.ceil(min(self.deadline / problem.dt, 2 * MOST_PERIODS) - 1e-9)
         if self.delay > self.periods:
             raise InputError(
                 f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"

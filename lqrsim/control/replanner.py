@@ -13,7 +13,15 @@ import numpy.typing as npt
 from lqrsim.annotations import Bounds, Index, Want, checked
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
-from lqrsim.control.replan_rule import ActivePlan, Changes, ReplanLog, ReplanRule, SolveRequest, within_rates
+from lqrsim.control.replan_rule import (
+    MOST_PERIODS,
+    ActivePlan,
+    Changes,
+    ReplanLog,
+    ReplanRule,
+    SolveRequest,
+    within_rates,
+)
 from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
@@ -114,7 +122,7 @@ class LiveReplanner:
         t = check_number("t", t, at_least=0.0)
         state = check_array("state", state, (len(self.active.plan.policy.state_coordinates),))
         dt = self.problem.dt
-        step = int(t / dt + 1e-9)
+        step = int(min(t / dt, MOST_PERIODS) + 1e-9)
         self._adopt_answer(step)
         if self._solve is None and self._rule.due(step, self._asked):
             self._ask(state, t, step)

@@ -77,7 +77,10 @@ class Mismatch(Disturbance):
         strength = self._strength(strength)
         if self.factor is None:
             return replace(self, std=strength * (self.std or 0.0))
-        factor = np.asarray(self.factor) ** strength
+        with np.errstate(over="ignore", under="ignore"):
+            factor = np.asarray(self.factor) ** strength
+        if not (np.isfinite(factor) & (factor > 0)).all():
+            raise InputError(f"{type(self).__name__}: strength: got {strength:g}, want less: the result overflows")
         return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
 
     def spread(self, plant: Plant) -> Array:
