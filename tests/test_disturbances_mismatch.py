@@ -1,5 +1,7 @@
 """Robots and surroundings that are not as planned, against MuJoCo: what moves, by how much."""
 
+from itertools import permutations
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import load_scene
-from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.closed_loop import ClosedLoop, simulate
 from lqrsim.simulation.disturbances import (
     AxleMismatch,
     DisplacedObstacles,
@@ -118,6 +120,23 @@ def test_larger_wheels_stand_on_the_floor_level(arena):
         rollout = simulate(arena, still, disturbances=[WheelRadiusMismatch(factor=factor)])
         # As much as with its usual wheels: it settles by a third of a millimetre, until the contacts hold it.
         np.testing.assert_allclose(rollout.frames[0, :, arena.qpos], usual.frames[0, :, arena.qpos], atol=2e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mismatches_of_one_kind_are_one_of_their_product(arena, seed):
+    """For all fields that the wheels have, whatever other mismatch comes between."""
+    first, second, other = np.random.default_rng(seed).uniform(0.6, 1.5, 3)
+    still = track(arena.robot, (0.0, -2.5, 0.0), np.zeros((2, 2)), 1 / 6, feedback=False)
+    for kind, between in permutations((WheelRadiusMismatch, AxleMismatch, FrictionMismatch, MassMismatch), 2):
+        models = list[list[np.ndarray]]()
+        for factors in ((first, other, second), (first * second, other)):
+            kinds = (kind, between, kind)
+            disturbances = [one(factor=factor) for one, factor in zip(kinds, factors, strict=False)]
+            loop = ClosedLoop(plant=arena, plan=still, disturbances=disturbances, frames=False)
+            fields = ("geom_size", "body_pos", "geom_friction", "body_mass")
+            models.append([loop.physics.simulations.expand(field) for field in fields])
+        for one, both in zip(*models, strict=True):
+            np.testing.assert_allclose(one, both, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])

@@ -235,9 +235,10 @@ class WheelRadiusMismatch(WheelMismatch):
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         wheels, hubs = wheel_geoms(plant)
-        simulations.expand("geom_size")[:, wheels] *= factors[:, :, None]
+        sizes = simulations.expand("geom_size")
         # Raise the axle by the difference of the radii, so that the wheel touches the floor and the casters do not.
-        raised = plant.model.geom_size[wheels, 0] * (factors - 1)
+        raised = sizes[:, wheels, 0] * (factors - 1)
+        sizes[:, wheels] *= factors[:, :, None]
         parents = placed(plant.model).xmat[plant.model.body_parentid[hubs]].reshape(-1, 3, 3)
         simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * parents[:, 2]  # upward, in their axes
 
@@ -253,7 +254,10 @@ class AxleMismatch(WheelMismatch):
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         _, hubs = wheel_geoms(plant)
         from_middle = plant.model.body_pos[hubs] - plant.model.body_pos[hubs].mean(axis=0)
-        simulations.expand("body_pos")[:, hubs] += (factors - 1)[:, :, None] * from_middle
+        places = simulations.expand("body_pos")
+        off = places[:, hubs] - places[:, hubs].mean(axis=1, keepdims=True)
+        longer = np.vecdot(off, from_middle) / np.vecdot(from_middle, from_middle)  # by other mismatches
+        places[:, hubs] += ((factors - 1) * longer)[:, :, None] * from_middle
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return self._of_parameter(plant, "axle_length")
