@@ -133,6 +133,23 @@ def test_motor_lag_is_the_mean_of_the_differential_equation_over_each_period(cag
     assert not rollout.saturated.any()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_limits_that_meet_stay_where_they_met(arena, seed):
+    """At each strength as at the one found by small steps, within the robot's own limits, on one side or both."""
+    rng, space = np.random.default_rng(seed), arena.robot.dynamics.control_coordinates
+    low, high = np.sort(rng.uniform(-0.5, 0.5, 2))
+    for sides in ({"lowest": low}, {"highest": high}, {"lowest": low, "highest": high}, {"share": 0.3}):
+        narrowed = Saturation(**sides)
+        found = next(
+            limits for s in np.arange(1, 200, 1e-3) if np.ptp(limits := narrowed.scaled(s).limits(arena)) < 2e-3
+        )
+        for strength in (200.0, 1e6, 1e308):
+            limits = narrowed.scaled(strength).limits(arena)
+            np.testing.assert_array_equal(limits[0], limits[1])
+            np.testing.assert_allclose(limits, found, atol=4e-3)
+            assert (space.low <= limits[0]).all() and (limits[1] <= space.high).all()
+
+
 def test_saturation_narrows_the_limits(arena, cage):
     space = cage.robot.dynamics.control_coordinates
     np.testing.assert_allclose(Saturation(share=0.8).limits(cage), [[0.0] * 4, [0.8 * 3.71] * 4])
@@ -140,8 +157,6 @@ def test_saturation_narrows_the_limits(arena, cage):
     np.testing.assert_allclose(Saturation(highest=(0.2, 0.3)).limits(arena), [[-0.5] * 2, [0.2, 0.3]])
     np.testing.assert_allclose(Saturation(lowest=1.0).scaled(0.5).limits(cage), [[0.5] * 4, [3.71] * 4])
     np.testing.assert_allclose(Saturation(share=0.5).scaled(0.0).limits(cage), [space.low, space.high])
-    crossed = Saturation(lowest=-0.1, highest=0.2).scaled(2.0)  # to 0.3 and -0.1: the middle of both
-    np.testing.assert_allclose(crossed.limits(arena), np.full((2, 2), 0.1))
     rollout = simulate(cage, hover(), disturbances=[ControlNoise(0.5), Saturation(lowest=1.0, highest=1.4)], trials=3)
     assert rollout.applied.min() == 1.0
     assert rollout.applied.max() == 1.4

@@ -121,11 +121,14 @@ class Saturation(Disturbance):
                     f"Saturation: strength: got {self.strength:g} for robot {plant.robot.name}, which has no limits of"
                     " its own to interpolate from, want 1"
                 )
-            wanted[moved] = full[moved] + self.strength * (wanted[moved] - full[moved])
-        low, high = wanted
-        crossed = low > high
-        low[crossed] = high[crossed] = (low[crossed] + high[crossed]) / 2
-        return low, high
+            by = np.zeros_like(full)
+            by[moved] = wanted[moved] - full[moved]
+            closing, width = by[0] - by[1], full[1] - full[0]
+            meeting = np.divide(width, closing, out=np.full(len(space), np.inf), where=closing > 0)
+            wanted = full + np.minimum(self.strength, meeting) * by
+            met = self.strength >= meeting
+            wanted[:, met] = np.minimum(wanted[0], full[1])[met]
+        return wanted[0], wanted[1]
 
     def check(self, plant: Plant) -> None:
         self.limits(plant)
@@ -174,7 +177,9 @@ class ActuatorLoss(Disturbance):
         check_gains(self, plant)
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        period = int(np.ceil(min(self.at / plan.dt, plan.steps) - 1e-9))  # a time within rounding of a knot counts as that knot
+        period = int(
+            np.ceil(min(self.at / plan.dt, plan.steps) - 1e-9)
+        )  # a time within rounding of a knot counts as that knot
         if period >= plan.steps:
             raise InputError(
                 f"ActuatorLoss: at: got {self.at:g} s, want a time before the last control period of the plan, which"

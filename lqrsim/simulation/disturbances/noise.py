@@ -230,7 +230,8 @@ class Push(Disturbance):
         return f"push of {words(self.impulse)} N s at {self.at:g} s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        period = int(min(self.at / plan.dt, plan.steps) + 1e-9)  # a time that is a knot, up to rounding, belongs to the next period
+        periods = min(self.at / plan.dt, plan.steps)
+        period = int(periods + 1e-9)  # a time that is a knot, up to rounding, belongs to the next period
         if period >= plan.steps:
             raise InputError(f"Push: at: got {self.at:g} s, want a time before the plan ends at {plan.horizon:g} s")
         forces = np.zeros((plan.steps, 3))
