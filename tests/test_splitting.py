@@ -70,8 +70,32 @@ def test_sizes_are_those_of_numpy() -> None:
         ("integers", {"low": [1, 2], "high": [5, 9]}), ("integers", {"low": [[1], [2]], "high": 4, "size": (2, 3)}),
         ("integers", {"low": [3, 4, 5]}), ("integers", {"low": 2, "high": np.array([3, 4]), "endpoint": True}),
         ("choice", {"a": [1.5, 2.5], "size": (2, 2)}), ("choice", {"a": 4, "size": 2, "replace": False}),
+        ("integers", {"low": [1, 2, 3]}), ("integers", {"low": 0, "high": [1, 2], "endpoint": True}),
+        ("choice", {"a": np.ones((2, 3)), "size": 4, "axis": 1}), ("choice", {"a": np.ones((2, 3))}),
+        ("choice", {"a": np.ones((4, 3)), "size": 2, "replace": False, "shuffle": False}),
     ):  # fmt: skip
         assert np.shape(getattr(draws, name)(**arguments)) == np.shape(getattr(numpy, name)(**arguments)), name
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.int8, np.uint16, "int32", int, bool, np.float32, "float64"])
+def test_types_and_bounds_are_those_of_numpy(dtype: Any) -> None:
+    rng, draws = np.random.default_rng(0), PrescribedDraws(np.linspace(-9, 9, 4000))
+    whole = np.dtype(dtype).kind != "f"
+    for size in (None, 7, (2, 3)) if whole else (7, (2, 3)):
+        if whole:
+            calls = [lambda of, size=size: of.integers(0, 2, size, dtype)]
+            calls += [lambda of, size=size: of.integers(1, size=size, dtype=dtype, endpoint=True)]
+        else:
+            calls = [
+                lambda of, name=name, size=size: getattr(of, name)(size, dtype)
+                for name in ("random", "standard_normal")
+            ]
+        for call in calls:
+            assert np.asarray(call(draws)).dtype == np.asarray(call(rng)).dtype
+    if whole:
+        assert set(PrescribedDraws(np.linspace(-9, 9, 4000)).integers(0, 2, 4000, dtype).tolist()) == {0, 1}
+    else:
+        assert PrescribedDraws(np.linspace(-9, 9, 4000)).random(4000, dtype).max() < 1
 
 
 # Trials of a robot

@@ -22,7 +22,6 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 
 Size = int | Sequence[int] | None
-_LARGEST = np.nextafter(1.0, 0.0)  # the largest number that NumPy's `random` draws from [0, 1)
 
 
 class PrescribedDraws:
@@ -34,10 +33,13 @@ class PrescribedDraws:
     def __init__(self, numbers: Array) -> None:
         self.numbers, self.used = numbers, 0
 
-    def standard_normal(self, size: Size = None) -> Any:
+    def standard_normal(self, size: Size = None, dtype: npt.DTypeLike = np.float64) -> Any:
         count = 1 if size is None else int(np.prod(size))
         numbers = self._draw(count)
-        return float(numbers[0]) if size is None else numbers.reshape(size).copy()
+        kind = np.dtype(dtype)
+        if size is None:
+            return float(kind.type(numbers[0]))
+        return numbers.reshape(size).astype(kind)
 
     def _draw(self, count: int) -> Array:
         if self.used + count > len(self.numbers):
@@ -45,8 +47,9 @@ class PrescribedDraws:
         self.used += count
         return self.numbers[self.used - count : self.used]
 
-    def random(self, size: Size = None) -> Any:
-        return np.minimum(ndtr(self.standard_normal(size)), _LARGEST)[()]
+    def random(self, size: Size = None, dtype: npt.DTypeLike = np.float64) -> Any:
+        kind = np.dtype(dtype).type
+        return np.minimum(ndtr(self.standard_normal(size)).astype(kind), np.nextafter(kind(1), kind(0)))[()]
 
     def normal(self, loc: npt.ArrayLike = 0.0, scale: npt.ArrayLike = 1.0, size: Size = None) -> Any:
         drawn = self.standard_normal(_shape(size, loc, scale))
@@ -60,25 +63,29 @@ class PrescribedDraws:
         return -np.asarray(scale) * np.log1p(-self.random(_shape(size, scale)))
 
     def integers(
-        self, low: npt.ArrayLike, high: npt.ArrayLike | None = None, size: Size = None, *, endpoint: bool = False
-    ) -> Any:
-        least, beyond = (np.asarray(side) for side in ((0, low) if high is None else (low, high)))
-        drawn = np.floor(self.random(_shape(size, least, beyond)) * (beyond - least + endpoint))
-        drawn = drawn.astype(np.int64) + least
-        return drawn if np.ndim(drawn) else int(drawn)
+        self, low: npt.ArrayLike, high: npt.ArrayLike | None = None, size: Size = None,
+        dtype: npt.DTypeLike = np.int64, endpoint: bool = False,
+    ) -> Any:  # fmt: skip
+        least, most = (0, low) if high is None else (low, high)
+        least, most = np.asarray(least, dtype=np.int64), np.asarray(most, dtype=np.int64)
+        drawn = np.floor(self.random(_shape(size, least, most)) * (most - least + endpoint)).astype(np.int64) + least
+        return int(drawn) if not drawn.ndim and np.dtype(dtype) == np.int64 else drawn.astype(dtype)[()]
 
     def choice(
-        self, a: int | npt.ArrayLike, size: Size = None, replace: bool = True, p: npt.ArrayLike | None = None
-    ) -> Any:
+        self, a: int | npt.ArrayLike, size: Size = None, replace: bool = True, p: npt.ArrayLike | None = None,
+        axis: int = 0, shuffle: bool = True,
+    ) -> Any:  # fmt: skip
         options = np.arange(a) if isinstance(a, (int, np.integer)) else np.asarray(a)
+        count = options.shape[axis]
         if not replace:
             if p is not None:
                 raise InputError("choice: got p and replace=False, want one of the two")
-            order = np.argsort(self.random(len(options)))
-            return options[order[: 1 if size is None else int(np.prod(size))]].reshape(() if size is None else size)[()]
-        probabilities = np.full(len(options), 1 / len(options)) if p is None else np.asarray(p, dtype=np.float64)
+            order = np.argsort(self.random(count))
+            which = order[: 1 if size is None else int(np.prod(size))].reshape(() if size is None else size)
+            return np.take(options, which, axis)[()]
+        probabilities = np.full(count, 1 / count) if p is None else np.asarray(p, dtype=np.float64)
         which = np.searchsorted(np.cumsum(probabilities), self.random(size), side="right")
-        return options[np.minimum(which, len(options) - 1)]
+        return np.take(options, np.minimum(which, count - 1), axis)[()]
 
     def __getattr__(self, name: str) -> Any:
         raise InputError(
