@@ -145,6 +145,15 @@ def test_a_tube_ends_where_it_would_hide_the_picture(drive_solution: ls.Solution
     assert Ellipsoids.predicted(places, np.zeros((151, 2, 2))).label == "predicted: 2 sigma, 95 % in each direction"
 
 
+@pytest.mark.parametrize("moves", [0.0, 1e-12, 1e-6, 9e-4])
+def test_a_tube_about_a_plan_that_stays_in_place_is_whole(moves: float) -> None:
+    places = np.linspace((1.0, 2.0), (1.0 + moves, 2.0), 151)
+    for std in (1e-9, 0.01, 3.0):
+        tube = Ellipsoids.predicted(places, np.tile(std**2 * np.eye(2), (151, 1, 1)))
+        assert len(tube.centres) == 151
+        assert tube.label == "predicted: 2 sigma, 95 % in each direction"
+
+
 def test_shadows_in_a_plane_are_marginals() -> None:
     """The shadow of an ellipsoid along a direction, against the silhouette of many of its points."""
     covariance = np.array([[0.05, 0.02, 0.0], [0.02, 0.09, -0.03], [0.0, -0.03, 0.04]])

@@ -14,6 +14,7 @@ PREDICTED = f"predicted: {SIGMAS:g} sigma, 95 % in each direction"
 OF_COST = f"{SIGMAS:g} sigma of the cost: total ≤ least + {COST_ABOVE_LEAST:g}"
 
 WIDEST = 0.2  # largest half axis that is drawn, relative to the extent of the plan; larger ones hide the picture
+STAYS = 1e-3  # m; a plan of less extent stays in place, and its tube hides nothing
 APART = 0.8  # distance between neighbours, in half axes
 
 
@@ -28,7 +29,8 @@ class Ellipsoids:
     @classmethod
     def predicted(cls, centres: Array, covariances: Array) -> "Ellipsoids":
         """The ellipsoids of a tube about positions (T+1, d), up to the first that is too wide for a picture."""
-        largest = float(np.linalg.norm(np.ptp(centres, axis=0))) * WIDEST
+        extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+        largest = WIDEST * extent if extent > STAYS else np.inf
         wide = SIGMAS * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)) > largest
         last = int(np.argmax(wide)) if wide.any() else len(wide)
         return cls(centres[:last], covariances[:last], largest if wide.any() else None)
