@@ -392,6 +392,18 @@ class TestBegunLater:
         assert run.applied[0, :2] == pytest.approx(np.zeros((2, 2)))
         assert run.applied[0, 2, 0] == pytest.approx(-0.03)
 
+    @pytest.mark.parametrize("raises_at", [0, 3, 5, 8])
+    def test_a_controller_that_raises_on_the_way_has_failed(self, ice: ls.Plant, raises_at: int) -> None:
+        def controller(state: np.ndarray, t: float) -> np.ndarray:
+            if round(t / PLAN.trajectory.dt) == raises_at:
+                raise KeyError("lost")
+            return np.zeros(2)
+
+        run = simulate_from(ice, PLAN, np.tile([0.1, 0, 0, 0], (2, 1)), knot=5, controller=controller)
+        assert run.outcome == ("error", "error")
+        assert all("KeyError: 'lost'" in reason for reason in run.reasons)
+        assert (run.failed_at == max(raises_at - 5, 0) * PLAN.trajectory.dt).all()
+
     def test_points_fill_a_ball(self) -> None:
         """Radii to the power of the dimension are uniform, and each trial has its own point."""
         points = points_of(np.arange(500), 3, 4)

@@ -309,7 +309,12 @@ class ClosedLoop:
             controls = np.tile(self.full_trajectory.controls[step], (self.trials, 1))
             self.effects.follow(step, states, controls)
             observed = states if self._readings is None else self._readings.follow(step, states, self._held(step))
-            self.controller_run.control(step, observed)
+            try:
+                self.controller_run.control(step, observed)
+            except Exception as error:
+                failed = dict.fromkeys(range(self.trials), format_error(error))
+                self.records.end(self.records.failed_since, 0, "controller", failed)
+                break
         self.step, self.measured = 0, self.measure(0)
 
     def period(self) -> bool:
