@@ -15,6 +15,7 @@ from sampling import rarely
 from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
+from lqrsim.control.controllers import OutputFeedback
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
@@ -84,6 +85,25 @@ def test_class_page_and_compiled_controller_agree_on_a_linear_system(
         found.append(u[0])
     assert np.abs(found).max() == 1.5
     assert np.abs(found).min() < 1.5
+
+
+@pytest.mark.parametrize("latency", [0, 1, 3, 20])
+@pytest.mark.parametrize("options", [{}, {"delay": 2}, {"start": 0.0}, {"lag": 0.07, "sensors": ("s1",)}], ids=str)
+def test_a_run_of_the_policy_takes_late_and_lost_measurements_as_its_law_does(
+    latency: int, options: dict[str, Any]
+) -> None:
+    """The first one is repeated until it arrives, and each that gets lost is the last that came."""
+    rng = np.random.default_rng(0)
+    system = double_integrator(start=[1.0, 0.0], controls=np.ones((12, 1)), limits=(-2.0, 2.0))
+    law = law_of(system, **{"latency": latency} | options)
+    runs = [controller.start(2) for controller in (law, OutputFeedback(law.policy))]
+    shown = system.plan.states[0] + 0.2 * rng.normal(size=(2, 2))
+    for t in range(12):
+        if t > latency:
+            arrives = rng.random(2) < 0.6
+            shown[arrives] = system.plan.states[t - latency] + 0.2 * rng.normal(size=(np.sum(arrives), 2))
+        of_law, of_policy = (run.control(t, shown.copy()) for run in runs)
+        np.testing.assert_allclose(of_policy, of_law, rtol=0, atol=1e-9)
 
 
 def test_angles_are_taken_nearest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

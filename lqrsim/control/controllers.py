@@ -191,7 +191,10 @@ class Feedback(_OfPolicy, ControllerRun):
 
 @dataclass(frozen=True, eq=False)
 class OutputFeedback(_OfPolicy):
-    """An `OutputFeedbackPolicy` that measures states. A measurement that is bit-identical to the last one was lost."""
+    """An `OutputFeedbackPolicy` that measures states. A measurement that is bit-identical to the last one was lost.
+
+    Until the first measurement arrives, it may be shown already, as `MeasurementLatency` does.
+    """
 
     policy: OutputFeedbackPolicy
 
@@ -208,13 +211,26 @@ class OutputFeedback(_OfPolicy):
         """The indices of the measured states."""
         return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
 
+    @cached_property
+    def waits(self) -> int:
+        """The number of periods before the first measurement arrives: nothing moves the estimate of the state."""
+        policy, n = self.policy, len(self.policy.state_coordinates)
+        stays = (policy.transition[:, :n] == np.eye(n, policy.transition.shape[2])).all(axis=(1, 2))
+        moved = [
+            policy.correction.any(axis=(1, 2)),
+            policy.input[:, :n].any(axis=(1, 2)),
+            policy.drift[:, :n].any(axis=1),
+        ]
+        waiting = stays & ~np.any(moved, axis=0)
+        return policy.steps if waiting.all() else int(waiting.argmin())
+
     def start(self, trials: int) -> ControllerRun:
         return _OutputFeedbackRun(self, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
     def __init__(self, controller: OutputFeedback, trials: int) -> None:
-        self._policy, self._measures = controller.policy, controller.measures
+        self._policy, self._measures, self._waits = controller.policy, controller.measures, controller.waits
         self._z = np.tile(self._policy.start(), (trials, 1))
         self._previous = np.full((trials, len(self._policy.state_coordinates)), np.nan)
 
@@ -223,7 +239,8 @@ class _OutputFeedbackRun(ControllerRun):
         for k, (state, previous) in enumerate(zip(measured, self._previous, strict=True)):
             y = None if np.array_equal(state, previous) else state[self._measures]
             commands[k], self._z[k] = policy.step(self._z[k], y, step * policy.dt)
-        self._previous[:] = measured
+        if step >= self._waits:
+            self._previous[:] = measured
         return commands
 
 
