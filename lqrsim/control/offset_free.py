@@ -115,6 +115,10 @@ class OffsetFree(Controller):
         replan_always: bool = False,
     ) -> None:
         check_plan("OffsetFree", problem, solution)
+        if replan_always and replan_every is None:
+            raise InputError(
+                "OffsetFree: replan_always: got True without replan_every, want seconds between two solves"
+            )
         plan = solution.trajectory
         memory = min(plan.horizon, MEMORY) if memory is None else memory
         memory = check_seconds("OffsetFree: memory", memory, above=0.0)

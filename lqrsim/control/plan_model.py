@@ -93,6 +93,8 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
 
     def make() -> dict[str, Any]:
         values, x, _ = symbolic.trace(function, states, (), [])
+        if not values:
+            raise InputError(f"sensors: got {of}, which returns nothing, want at least one number that is measured")
         slopes = {(i, j): value.diff(xj) for i, value in enumerate(values) for j, xj in enumerate(x)}
         slopes = {f"out[{i}, {j}]": slope for (i, j), slope in slopes.items() if slope != 0}
         assigned = {f"out[{i}]": value for i, value in enumerate(values)}
