@@ -106,6 +106,20 @@ def test_a_run_of_the_policy_takes_late_and_lost_measurements_as_its_law_does(
         np.testing.assert_allclose(of_policy, of_law, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("shown", [1e308, -1.7e308])
+@pytest.mark.parametrize("options", [{}, {"delay": 2}, {"latency": 1}, {"lag": 0.07}], ids=str)
+def test_a_filter_that_diverges_ends_its_own_trial_alone(shown: float, options: dict[str, Any]) -> None:
+    system = double_integrator(start=[1.0, 0.0], controls=np.ones((12, 1)), limits=(-2.0, 2.0))
+    controller = OutputFeedback(law_of(system, **options).policy)
+    together, alone = controller.start(2), controller.start(1)
+    for t in range(12):
+        usual, sign = system.plan.states[[t]] + 0.1 * np.sin(t), 1.0 if t % 2 else -1.0
+        commands = together.control(t, np.concatenate([usual, [[sign * shown, shown]]]))
+        np.testing.assert_array_equal(commands[:1], alone.control(t, usual))
+    assert together.estimator_diverged() == {1: "the state of the filter is not finite"}
+    assert alone.estimator_diverged() == {}
+
+
 def test_angles_are_taken_nearest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Measurements of the differential drive with whole turns added: not a digit that counts is another."""
     monkeypatch.chdir(tmp_path)

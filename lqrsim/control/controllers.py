@@ -233,12 +233,21 @@ class _OutputFeedbackRun(ControllerRun):
         self._policy, self._measures, self._waits = controller.policy, controller.measures, controller.waits
         self._z = np.tile(self._policy.start(), (trials, 1))
         self._previous = np.full((trials, len(self._policy.state_coordinates)), np.nan)
+        self._diverged: dict[int, str] = {}
+
+    def estimator_diverged(self) -> Mapping[int, str]:
+        return self._diverged
 
     def control(self, step: int, measured: Array) -> Array:
         policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))
         for k, (state, previous) in enumerate(zip(measured, self._previous, strict=True)):
             y = None if np.array_equal(state, previous) else state[self._measures]
-            commands[k], self._z[k] = policy.step(self._z[k], y, step * policy.dt)
+            with np.errstate(over="ignore", invalid="ignore"):
+                commands[k], z = policy.step(self._z[k], y, step * policy.dt)
+            if np.isfinite(z).all():
+                self._z[k] = z
+            else:  # `step` would refuse it, and end the other trials, too
+                self._diverged.setdefault(k, "the state of the filter is not finite")
         if step >= self._waits:
             self._previous[:] = measured
         return commands
