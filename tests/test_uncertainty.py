@@ -307,6 +307,9 @@ def test_those_of_ones_own(cage):
     assert ls.uncertainty_of(cage, [OwnInNumbers(told)]) == told
     with pytest.raises(InputError, match=r"^OwnInNumbers: uncertainty: got 3, want a method that returns"):
         ls.uncertainty_of(cage, [OwnInNumbers(3)])
+    two = ls.disturbances.Uncertainty(start=(0.1, 0.2))
+    with pytest.raises(InputError, match=r"^Uncertainty: start: got 12 and 2 numbers, want as many of each$"):
+        ls.uncertainty_of(cage, [ls.disturbances.InitialStateError(0.1), OwnInNumbers(two)])
     wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("forse_x", 0.2)])
     with pytest.raises(InputError, match=r"^Uncertainty: unknowns: got 'forse_x', want .*force_x"):
         ls.uncertainty_of(cage, [OwnInNumbers(wrong)])

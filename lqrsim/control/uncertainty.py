@@ -278,5 +278,8 @@ def _added(name: str, first: PerEntry, second: PerEntry) -> PerEntry:
             return other
     if isinstance(first, Mapping) or isinstance(second, Mapping):
         raise InputError(f"Uncertainty: {name}: got two dictionaries, {excerpt(first)} and {excerpt(second)}, want one")
-    both = np.hypot(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
+    one, another = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    if one.ndim and another.ndim and len(one) != len(another):
+        raise InputError(f"Uncertainty: {name}: got {len(one)} and {len(another)} numbers, want as many of each")
+    both = np.hypot(one, another)
     return float(both) if both.ndim == 0 else tuple(both.tolist())
