@@ -289,6 +289,36 @@ def test_a_policy_that_returns_nan_fails_and_is_not_taken_for_zero(sled):
     assert np.isnan(rollout.states[0, 5:]).all()
 
 
+@dataclass(frozen=True)
+class _Pushed(Disturbance):
+    """Pushes the second of three trials by a number, from the fifth period on."""
+
+    kind: str
+    number: float
+
+    def start(self, plant, plan, generators):
+        return Effect(
+            **{self.kind: lambda step, states: np.outer([0.0, self.number if step >= 5 else 0.0, 0.0], [0, 1, 0])}
+        )
+
+
+@pytest.mark.parametrize("number", [1e400, -1e400, 1e400 - 1e400], ids=str)
+@pytest.mark.parametrize(("kind", "with_drag"), [("force", False), ("torque", False), ("wind", True)])
+def test_a_force_that_is_not_finite_loses_its_trial(cage, arena, number, kind, with_drag):
+    for plant, plan in ((cage, hover(12)), (arena, weave(12)))[: 1 if with_drag else 2]:
+        if np.isinf(number):
+            pushed = _Pushed(kind, 1.0)
+            assert "diverged" not in simulate(plant, plan, disturbances=[pushed], trials=3, frames=False).outcome
+        with np.errstate(invalid="ignore"):  # infinity times zero
+            rollout = simulate(plant, plan, disturbances=[_Pushed(kind, number)], trials=3)
+        assert [one == "diverged" for one in rollout.outcome] == [False, True, False]
+        assert rollout.reasons[0] == rollout.reasons[2] == ""
+        assert rollout.reasons[1].startswith(
+            f"disturbances at {5 * rollout.plan.dt:.4g} s: got a force, torque or wind"
+        )
+        np.testing.assert_array_equal(rollout.states[[0, 2]], simulate(plant, plan, trials=2).states)
+
+
 def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
     """Beyond 1e10 MuJoCo sets all controls to zero, and only warns; the record would say that they were applied."""
 

@@ -121,7 +121,7 @@ class Rollout:
         the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot on.
       failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
         after that knot.
-      reasons: (K) why the controller failed or its filter diverged; empty otherwise.
+      reasons: (K) why the controller failed, its filter diverged or a force was not finite; empty otherwise.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each disturbance, and whether the goal moved.
       tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,

@@ -73,10 +73,10 @@ def simulate(
     In each control period: read the true state, measure it, compute the control, disturb it, saturate it, apply
     disturbing forces, step the physics, and let the state jump.
 
-    A trial ends with its first collision, as `collisions.py` defines it, when its simulation becomes unstable, when the
-    filter of its controller diverges, or when the controller fails. A controller fails if it raises an exception, which
-    ends all trials that it computes together, or if it returns invalid controls. Records after a collision do not
-    count. In the other cases they are NaN.
+    A trial ends with its first collision, as `collisions.py` defines it, when its simulation becomes unstable, when a
+    disturbing force is not finite, when the filter of its controller diverges, or when the controller fails. A
+    controller fails if it raises an exception, which ends all trials that it computes together, or if it returns
+    invalid controls. Records after a collision do not count. In the other cases they are NaN.
 
     Args:
       plan: a solution or another plan, which gives the first state, the duration, and the reference for comparisons. By
@@ -137,7 +137,7 @@ class Records:
       contacts: (K,) number of control periods in contact.
       lost_since: (K,) knot from which on the records are invalid; T+1 if all are valid.
       failed_since: (K,) knot at which the controller failed; T+1 if it never failed.
-      reasons: the reason why each trial's controller failed or its filter diverged; empty for other trials.
+      reasons: why each trial's controller failed, its filter diverged or a force was not finite; else empty.
       frames: arrays of MuJoCo's qpos, (K, nq) each.
     """
 
@@ -375,6 +375,11 @@ class ClosedLoop:
         """The disturbing forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3)."""
         wrench, wind = self.effects.push(self.knot + step, self.states)
         self.records.wrench[:, step] = wrench
+        lost = _not_finite(wrench) | _not_finite(wind)
+        if lost.any():  # MuJoCo would let such a robot stand still, without a warning
+            reasons = dict.fromkeys(np.flatnonzero(lost).tolist(), "got a force, torque or wind that is not finite")
+            self.records.end(self.records.lost_since, step, "disturbances", reasons)
+            wrench[lost], wind[lost] = 0.0, 0.0
         return wrench, wind
 
     def advance(self, step: int, controls: Array, wrench: Array, wind: Array) -> None:
