@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -297,9 +298,10 @@ class _Pushed(Disturbance):
     number: float
 
     def start(self, plant, plan, generators):
-        return Effect(
-            **{self.kind: lambda step, states: np.outer([0.0, self.number if step >= 5 else 0.0, 0.0], [0, 1, 0])}
-        )
+        hooks: dict[str, Any] = {
+            self.kind: lambda step, states: np.outer([0.0, self.number if step >= 5 else 0.0, 0.0], [0, 1, 0])
+        }
+        return Effect(**hooks)
 
 
 @pytest.mark.parametrize("number", [1e400, -1e400, 1e400 - 1e400], ids=str)

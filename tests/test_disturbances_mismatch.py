@@ -134,6 +134,7 @@ def test_mismatches_of_one_kind_are_one_of_their_product(arena, seed):
             disturbances = [one(factor=factor) for one, factor in zip(kinds, factors, strict=False)]
             loop = ClosedLoop(plant=arena, plan=still, disturbances=disturbances, frames=False)
             fields = ("geom_size", "body_pos", "geom_friction", "body_mass")
+            assert isinstance(loop.physics, MujocoPhysics)
             models.append([loop.physics.simulations.expand(field) for field in fields])
         for one, both in zip(*models, strict=True):
             np.testing.assert_allclose(one, both, rtol=1e-12, atol=1e-15)

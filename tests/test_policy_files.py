@@ -95,13 +95,14 @@ def test_a_run_of_the_policy_takes_late_and_lost_measurements_as_its_law_does(
     """The first one is repeated until it arrives, and each that gets lost is the last that came."""
     rng = np.random.default_rng(0)
     system = double_integrator(start=[1.0, 0.0], controls=np.ones((12, 1)), limits=(-2.0, 2.0))
-    law = law_of(system, **{"latency": latency} | options)
+    stated: dict[str, Any] = {"latency": latency} | options
+    law = law_of(system, **stated)
     runs = [controller.start(2) for controller in (law, OutputFeedback(law.policy))]
     shown = system.plan.states[0] + 0.2 * rng.normal(size=(2, 2))
     for t in range(12):
         if t > latency:
             arrives = rng.random(2) < 0.6
-            shown[arrives] = system.plan.states[t - latency] + 0.2 * rng.normal(size=(np.sum(arrives), 2))
+            shown[arrives] = system.plan.states[t - latency] + 0.2 * rng.normal(size=(int(arrives.sum()), 2))
         of_law, of_policy = (run.control(t, shown.copy()) for run in runs)
         np.testing.assert_allclose(of_policy, of_law, rtol=0, atol=1e-9)
 
