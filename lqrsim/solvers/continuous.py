@@ -277,8 +277,6 @@ def smooth_continuous(
         raise InputError("control_rate: got rates, which are per control period, want none; use `smooth`")
     if problem.noise is not None:
         raise InputError("noise: got a problem with noise, which is per control period, want none; use `smooth`")
-    if problem.duration is not None:
-        raise InputError("duration: got a free duration, want None, and the dt of a fixed one; or use `smooth`")
     for cost in terms_of(problem.stage_cost):
         if cost.by_knot:
             raise InputError(f"stage_cost: got a {cost.name} with a row for each knot, want one; or use `smooth`")
