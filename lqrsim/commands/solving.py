@@ -223,8 +223,7 @@ class Simulate:
         solution, scenario = console.load_with_scenario(self.solution, self.scenario)
         if self.open_loop:
             solution = solution.open_loop()
-        if self.design_disturbances is not None:
-            check_designed((self.controller,))
+        check_designed(self.design_disturbances, (self.controller,))
         controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
         named = [disturbance for name in self.disturbances for disturbance in disturbance_set(name, scenario)]
         disturbances = [*(disturbance.scaled(self.strength) for disturbance in named), *self._single_disturbances()]

@@ -211,8 +211,7 @@ class View:
             plant = scenario.plant()
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             arguments = viewer.arguments_for_plant(plant, solution, goal)
-            if self.design_disturbances is not None:
-                check_designed((self.controller,))
+            check_designed(self.design_disturbances, (self.controller,))
             controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
             disturbances = [kind.scaled(self.disturbances) for kind in scenario.disturbances if self.disturbances]
 

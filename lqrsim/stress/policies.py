@@ -55,9 +55,9 @@ DEFAULT_DESIGN = "moderate"  # the set for which policies are designed by defaul
 Design = Sequence[Disturbance] | str | None  # disturbances, the name of a set, or None for the default
 
 
-def check_designed(policies: Sequence[str]) -> None:
-    """Raise InputError unless one of the policies can be designed for disturbances."""
-    if not {*DESIGNED} & {*policies}:
+def check_designed(design: Design, policies: Sequence[str]) -> None:
+    """Raise InputError if disturbances are given and none of the policies is designed for any."""
+    if design is not None and not {*DESIGNED} & {*policies}:
         raise InputError(
             f"design_disturbances: got them with {', '.join(policies)}, want {' or '.join(DESIGNED)}, or leave them out"
         )

@@ -154,8 +154,7 @@ class Study(Setup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.design_disturbances is not None:
-            check_designed((self.policy,))
+        check_designed(self.design_disturbances, (self.policy,))
 
     @cached_property
     def disturbances(self) -> list[Disturbance]:
@@ -215,12 +214,9 @@ class Campaign(Setup):
             values = getattr(self, field)
             if not values or len(set(values)) < len(values):
                 raise InputError(f"{field}: got {excerpt(values)}, want at least one entry, each at most once")
-        if self.design_disturbances is not None:
-            check_designed(self.policies)
-            if not self.design_disturbances:
-                raise InputError(
-                    "design_disturbances: got none, want at least one disturbance, or None for the default"
-                )
+        check_designed(self.design_disturbances, self.policies)
+        if self.design_disturbances is not None and not self.design_disturbances:
+            raise InputError("design_disturbances: got none, want at least one disturbance, or None for the default")
         files = -(-self.trials // self.shard) * len(self.cells)
         if files > _MOST_FILES:
             raise InputError(
