@@ -15,6 +15,7 @@ ros2_control take them. Frames follow REP 103, as in this package: z up; the bod
 
 import contextlib
 import functools
+import itertools
 import math
 import os
 import re
@@ -116,7 +117,7 @@ def run(
         steps = math.ceil(seconds / dt - 1e-9)
     needed = law.policy.measured_coordinates.names if isinstance(law, OutputFeedback) else states.names
     node, commands = _Node(domain), _checked_topic(commands)
-    inlet = _Inlet(node, _topics(odometry, joints), states, needed, names, reliable=lockstep)
+    inlet = _Inlet(node, _topics(commands, odometry, joints), states, needed, names, reliable=lockstep)
     _wait(inlet.matched, patience, inlet.lacking)
     outlet = node.writer(commands, "Float64MultiArray")  # seeing this writer means that its states are heard
     _wait(outlet.get_matched_subscriptions, patience, lambda: f"commands: got no reader of {commands}")
@@ -192,7 +193,8 @@ class SimulatedRobot:
         policy = plan.policy if isinstance(plan, Plan) else check_kind("plan", plan, AffinePolicy, "a plan or a policy")
         self._controls = policy.control_coordinates
         self._patience = patience
-        self._names, node, topics = _renamed(policy.state_coordinates, names), _Node(domain), _topics(odometry, joints)
+        topics = _topics(commands, odometry, joints)
+        self._names, node = _renamed(policy.state_coordinates, names), _Node(domain)
         self._turns_about = _turns_about(policy.state_coordinates, self._names)
         self._outlets = {kind: node.writer(topic, kind) for kind, topic in topics.items()}
         self._inlet: _Reader | None = node.reader(commands, "Float64MultiArray")
@@ -264,10 +266,15 @@ def _checked_topic(topic: object) -> str:
     return topic
 
 
-def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
+def _topics(commands: str, odometry: str | None, joints: str | None) -> dict[str, str]:
+    """The topics of states by their kind of message. Raises InputError if one name is of two topics."""
     topics = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
     if not topics:
         raise InputError("odometry: got none, want a topic of states in odometry=, in joints=, or in both")
+    fields = {"commands": commands, "odometry": odometry, "joints": joints}
+    for (first, topic), (second, other) in itertools.combinations(fields.items(), 2):
+        if topic is not None and topic == other:
+            raise InputError(f"{second}: got {excerpt(topic)}, as for {first}, want a topic of its own")
     return topics
 
 

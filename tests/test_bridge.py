@@ -299,6 +299,9 @@ def test_a_live_replanner_runs(topics: dict[str, Any], quadrotor: ls.Scenario, q
         ({"joints": "joint states"}, "topic: got 'joint states', want a ROS 2 topic name"),
         ({"joints": "/a//b"}, "topic: got"),
         ({"commands": 3}, "topic: got 3"),
+        ({"odometry": "/j"}, "joints: got '/j', as for odometry, want a topic of its own"),
+        ({"commands": "/j"}, "joints: got '/j', as for commands, want a topic of its own"),
+        ({"commands": "/o", "odometry": "/o"}, "odometry: got '/o', as for commands, want a topic of its own"),
         ({"names": {"theta": "heading"}}, r"names: got \['theta'\], want some of slider"),
         ({"names": {"theta": "heading", 3: "x"}}, r"names: got \[3, 'theta'\], want some of slider"),
         ({"names": {"slider": "x", "slider_velocity": "x"}}, "names: got 'x' for slider and for slider_velocity, want"),
@@ -316,6 +319,14 @@ def test_what_cannot_be_is_told_in_a_line(changed: dict[str, Any], message: str)
     with pytest.raises(ls.InputError, match=message) as told:
         bridge.run(**{**asked, "patience": 0.1, **changed})
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("one", ["commands", "odometry", "joints"])
+def test_a_simulated_robot_has_a_topic_for_each(one: str) -> None:
+    names = {"commands": "/c", "odometry": "/o", "joints": "/j"}
+    for other in names.keys() - {one}:
+        with pytest.raises(ls.InputError, match=r"got '/\w', as for \w+, want a topic of its own"):
+            bridge.SimulatedRobot(policy(), **{**names, one: names[other]})
 
 
 def test_what_is_not_there_is_named(topics: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
