@@ -197,6 +197,8 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
         (lambda env: (env.reset(), env.step([0.0])), "action: got shape (1, 1)"),
         (lambda env: env.reset(options={"wind": 1}), "options: got 'wind', want one of: disturbances, preset"),
         (lambda env: env.reset(options={"preset": "mild"}), "disturbances: got 'mild', want one of: scenario, calm"),
+        (lambda env: env.reset(options={"preset": None}), "options: preset: got None, want a name, as in"),
+        (lambda env: env.reset(options={"preset": ["calm"]}), "options: preset: got ['calm'], want a name, as in"),
         (lambda env: env.reset(options={"strength": 2}), "options: got strength alone"),
         (lambda env: env.reset(options={"preset": "calm", "disturbances": ()}), "options: got disturbances and preset"),
         (lambda env: lqrsim.gym.Expert(env)(np.zeros((0, 13))), "observation: got shape (0, 13), want (13,) or"),

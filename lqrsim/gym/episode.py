@@ -141,6 +141,8 @@ class Task:
             if "strength" in settings:
                 raise InputError("options: got strength alone, want it with disturbances or preset")
             return first, self._disturbances
+        if "preset" in settings:
+            check_kind("options: preset", settings["preset"], str, "a name, as in lqrsim.disturbances.preset")
         disturbances = settings.get("disturbances", settings.get("preset"))
         return first, self.disturbances_of(disturbances, settings.get("strength", 1.0))
 
