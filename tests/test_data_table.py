@@ -125,7 +125,7 @@ def test_latex_compiles(tmp_path: Path) -> None:
 def test_a_file_is_what_its_name_says(tmp_path: Path) -> None:
     columns: dict[str, Any] = {"name": [NASTY], "x": [np.float64(0.1)], "n": [np.int32(3)]}
     table = ls.types.DataTable(columns, notes=["a note"])
-    for ending, text in ((".csv", table.csv()), (".tex", table.latex()), (".md", str(table))):
+    for ending, text in ((".csv", table.csv()), (".tex", table.latex()), (".md", str(table)), (".CSV", table.csv())):
         path = table.save(tmp_path / f"a{ending}")
         assert path.read_bytes() == text.encode()
     assert table.select(["x"]).columns == {"x": (0.1,)}
@@ -172,7 +172,8 @@ def test_rates_are_those_of_the_trials(results: ls.stress.Results) -> None:
 def test_the_command_writes_them(
     results: ls.stress.Results, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for ending, text in ((".csv", results.rates().csv()), (".tex", results.rates().latex())):
+    csv, latex = results.rates().csv(), results.rates().latex()
+    for ending, text in ((".csv", csv), (".tex", latex), (".CSV", csv), (".Tex", latex)):
         path = tmp_path / f"rates{ending}"
         assert main(["report", str(results.folder), "--out", str(path)]) == 0
         assert capsys.readouterr().out == f"wrote {path}\n"

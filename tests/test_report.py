@@ -208,10 +208,10 @@ def test_trials_that_did_not_run_through_are_told(
 def test_command_writes_the_page(
     results: Results, path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = tmp_path / "page.html"
-    assert main(["report", str(results.folder), "--out", str(page), "--videos", "0"]) == 0
-    assert str(page) in capsys.readouterr().out
-    assert page.read_bytes() == path.read_bytes()
+    for page in (tmp_path / "page.html", tmp_path / "OTHER.HTML"):
+        assert main(["report", str(results.folder), "--out", str(page), "--videos", "0"]) == 0
+        assert str(page) in capsys.readouterr().out
+        assert page.read_bytes() == path.read_bytes()
     for words in (["--out", "page.txt"], ["--videos", "-1"]):
         assert main(["report", str(results.folder), *words]) == 2
     assert main(["report", str(tmp_path)]) == 2

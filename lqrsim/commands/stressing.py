@@ -145,16 +145,17 @@ class Report:
     json: Json = False
 
     def run(self) -> int:
+        from lqrsim.errors import check_path
         from lqrsim.stress.data_table import ENDINGS
 
         path = self.out or self.folder / "report.html"
-        if path.suffix not in (".html", *ENDINGS):
-            raise ls.InputError(f"--out: got {path}, want a name that ends in .html, {', '.join(ENDINGS)}")
-        if path.suffix in ENDINGS:
+        check_path("--out", path, suffixes=(".html", *ENDINGS))
+        is_table = path.suffix.lower() in ENDINGS
+        if is_table:
             refuse(self, ("videos",), f"with {path}, want it with a page, .html")
         console.check_output("--out", path.parent, path.name)
         results = ls.stress.Results(self.folder, scenario=self.scenario)
-        if path.suffix in ENDINGS:
+        if is_table:
             results.rates().save(path)
         else:
             with console.progress("reporting", "part") as progress:

@@ -119,7 +119,7 @@ class DataTable:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the table in the format that the name ends with, .csv, .tex or .md; returns its path."""
         path = check_table_path("path", path)
-        text = _WRITERS[path.suffix](self)
+        text = _WRITERS[path.suffix.lower()](self)
         with replacing(path) as unfinished:
             unfinished.write_text(text, encoding="utf-8", newline="\n")
         return path
@@ -148,10 +148,7 @@ ENDINGS = tuple(_WRITERS)
 
 def check_table_path(field: str, path: object) -> Path:
     """The path of a table's file. Raises InputError unless its name ends with one of ENDINGS."""
-    checked = check_path(field, path)
-    if checked.suffix not in ENDINGS:
-        raise InputError(f"{field}: got {excerpt(str(checked))}, want a name that ends in {', '.join(ENDINGS)}")
-    return checked
+    return check_path(field, path, suffixes=ENDINGS)
 
 
 def fraction_format(trials: int) -> str:
