@@ -192,12 +192,12 @@ def success(cell: Cell, outcomes: Outcomes) -> Success:
 
 @checked
 def alike(cell: Cell, outcomes: Outcomes) -> bool:
-    """Whether there are several trials, and all are the same run: nothing was drawn, as at strength 0.
+    """Whether all trials are the same run, or there is one only: nothing was drawn, as at strength 0.
 
     Equal outcomes do not show it: random trials may end alike. Trials that were not simulated do not count, nor do
     trials that differ although nothing was drawn.
     """
-    if len(outcomes) < 2 or np.isnan(outcomes.ended).any():
+    if not len(outcomes) or np.isnan(outcomes.ended).any():
         return False
     if cell.strength and not outcomes.deterministic:
         return False
