@@ -141,6 +141,17 @@ def test_what_is_kept_between_knots_is_kept_in_continuous_time(number: int) -> N
     assert "between_knots=True)" not in str(kept)  # the steps may be off: no accuracy is asked for
 
 
+@pytest.mark.parametrize("number", [1, 2, 3])
+@pytest.mark.parametrize("begin", [-2.0, 5.0])
+def test_times_between_knots_are_those_of_the_plan(number: int, begin: float) -> None:
+    """As those of knots: from the plan's first one, whenever it begins."""
+    problem = between_knots.draw(number).problem
+    found = ls.smooth(problem, threads=1).between_knots().violations
+    later = ls.smooth(replace(problem, begin=begin), threads=1)
+    assert later.between_knots().violations == found
+    assert all(0 <= time <= later.trajectory.horizon for _, time in found.values())
+
+
 def test_a_plan_that_is_right_between_its_knots_stays_as_it_is() -> None:
     case = between_knots.draw(9)  # a point with much room
     plans = [ls.smooth(replace(case.problem, between_knots=asked), threads=1) for asked in (False, True)]

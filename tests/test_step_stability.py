@@ -15,14 +15,14 @@ END = 2.785293563405282  # the real root of 1 - z + z^2/2 - z^3/6 + z^4/24 = 1 a
 CLEAR = 1e-3  # relative distance from the end of stability, within which three digits do not tell the two sides apart
 
 
-def plan(rate: float, dt: float) -> ls.Solution:
+def plan(rate: float, dt: float, begin: float = 0.0) -> ls.Solution:
     """A plan for x' = rate x + u."""
     lag = ls.Dynamics(
         lambda x, u, p: [p.rate * x[0] + u[0]], states={"x": "m"}, controls={"u": "m/s"}, parameters={"rate": rate}
     )
     problem = ls.Problem(
         dynamics=lag, dt=dt, steps=5, initial=ls.FixedState([0.1]), stage_cost=ls.ControlCost([1.0]),
-        final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+        final_cost=ls.QuadraticCost([1.0], about=[0.0]), begin=begin,
     )  # fmt: skip
     return ls.smooth(problem)
 
@@ -62,6 +62,12 @@ def test_an_oscillator_is_stable_where_its_steps_do_not_grow(damping: float, pro
     )  # fmt: skip
     for solution in (ls.smooth(problem), ls.ilqr(problem)):
         assert ("are unstable" in solution.detail) == (growth > 1)
+
+
+@pytest.mark.parametrize("begin", [-3.0, 0.0, 7.0])
+def test_its_time_is_that_of_the_plan(begin: float) -> None:
+    """As those of knots: from the plan's first one, whenever it begins."""
+    assert "are unstable: at 0 s (step 1 of 5)" in plan(-10.0, 1.0, begin=begin).detail
 
 
 def test_what_grows_by_the_dynamics_is_not_named() -> None:

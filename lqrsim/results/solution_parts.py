@@ -311,7 +311,8 @@ class BetweenKnots:
         motion.
       end_error: the same for the last knot and the exact motion from the first knot under the plan's controls.
       violations: name of an inequality, as in `Problem.violations` -> its largest violation between the knots, in its
-        unit, and its time in s; for all that are violated by more than rounding. Obstacles that move are left out.
+        unit, and its time in s from the first knot, as all times of a plan; for all that are violated by more than
+        rounding. Obstacles that move are left out.
     """
 
     step_error: float

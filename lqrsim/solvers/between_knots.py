@@ -59,7 +59,7 @@ class PlanErrors:
         ):
             for row, name in enumerate(names_of(constraint, term)):
                 t = int(np.argmax(worst[:, row]))
-                violation = float(worst[t, row]), problem.begin + problem.dt * (t + float(times[t, row]))
+                violation = float(worst[t, row]), problem.dt * (t + float(times[t, row]))
                 if violation[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
                     violations[name] = violation
         return BetweenKnots(self.step_error, self.end_error, violations)

@@ -67,7 +67,7 @@ def unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bo
     name = problem.dynamics.state_coordinates.names[carrier]
     value = f"{rate.real:.3g}" + (f" +- {abs(rate.imag):.3g}i" if rate.imag else "")
     return UnstableStep(
-        f"Runge-Kutta steps of {step:g} s are unstable: at {problem.begin + t * problem.dt:g} s (step {t + 1} of"
+        f"Runge-Kutta steps of {step:g} s are unstable: at {t * problem.dt:g} s (step {t + 1} of"
         f" {problem.steps}) df/dx has the stable eigenvalue {value} 1/s, mostly of {name}, whose deviations a"
         f" step multiplies by {growth:.3g}",
         problem.dynamics._with_finer_steps(step, longest),
