@@ -44,6 +44,17 @@ def problem(dynamics: ls.Dynamics, **changed: Any) -> ls.Problem:
     return ls.Problem(dynamics=dynamics, **given | changed)
 
 
+@settings(max_examples=examples(50))
+@given(dt=st.floats(-10, 10), period=st.floats(1e-3, 1))
+def test_the_period_near_one_is_possible(dt: float, period: float) -> None:
+    """That of the map, or none for less than half of it."""
+    dynamics = unicycle(period=period)
+    near = dynamics.period_near(dt)
+    assert (near == 0) == (dt / period <= 0.5)
+    if near > 0:
+        dynamics.check_period(near)
+
+
 @settings(max_examples=examples(30))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_gains_are_those_of_riccati_equations(seed: int) -> None:

@@ -442,8 +442,13 @@ class Dynamics:
 
     @checked
     def period_near(self, dt: Finite) -> float:
-        """The possible duration of steps nearest to `dt`, in seconds: `dt` itself, or a multiple of `period`."""
-        return dt if self.period is None else round(dt / self.period) * self.period
+        """The possible duration of steps nearest to `dt`, in seconds: `dt` itself; of a map its period; 0 for none.
+
+        Of MuJoCo it is a multiple of the physics step.
+        """
+        if self.period is None:
+            return dt
+        return self.period if round(dt / self.period) >= 1 else 0.0
 
     def _parts_of(self, dt: float, most: int) -> int:
         """The number of equal parts, up to `most`, of a period of `dt` seconds at whose ends states are known."""

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import process
-from lqrsim.annotations import Count, Positive, checked
+from lqrsim.annotations import Count, Finite, Positive, checked
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
@@ -425,6 +425,10 @@ class MjcfDynamics(Dynamics):
 
     def _parts_of(self, dt: float, most: int) -> int:
         return round(dt / self.period)
+
+    @checked
+    def period_near(self, dt: Finite) -> float:
+        return max(round(dt / self.period), 0) * self.period
 
     @checked
     def check_period(self, dt: Positive) -> None:
