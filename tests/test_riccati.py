@@ -4,11 +4,12 @@ Tolerance 1e-9, relative to the size of what is compared: the problems are well 
 horizons up to 12), and two ways of solving the same linear system differ by rounding alone.
 """
 
+import contextlib
 import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic, random_problem, solve_dense
 from sampling import examples
@@ -160,6 +161,26 @@ def test_the_covariance_is_the_inverse_of_the_dense_hessian_with_any_start(seed:
     hessian = (total.cost_to_go + total.cost_to_come).hessian
     unit = total.covariance() @ hessian
     np.testing.assert_allclose(unit, np.tile(np.eye(3), (steps + 1, 1, 1)), rtol=0, atol=1e-9)
+
+
+@settings(max_examples=examples(20))
+@given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 3), fixed=st.booleans(), singular=st.booleans())
+def test_another_form_is_advised_where_it_is_taken(seed: int, steps: int, fixed: bool, singular: bool) -> None:
+    """A control that pays in the stage cost has no forward pass; the primal form has no fixed start."""
+    rng = np.random.default_rng(seed)
+    stage = ls.lq.Stage(
+        A=rng.normal(size=(steps, 2, 2)) * (1.0, 0.0 if singular else 1.0), B=rng.normal(size=(steps, 2, 1)),
+        R=[[-1e-3]],
+    )  # fmt: skip
+    start = ls.types.Quadratic(np.eye(2), np.zeros(2), 0.0)
+    ends = {"initial": ls.FixedState([1.0, 0.0]) if fixed else start, "final": start}
+    failed = ls.lq.smooth_lq(stage, **ends)
+    assume(failed.detail.startswith("forward pass"))
+    assert ('form="primal"' in failed.detail) == (not fixed and not singular)
+    with contextlib.ExitStack() as refused:
+        if fixed or singular:
+            refused.enter_context(pytest.raises(ls.InputError, match=r"got a FixedState|singular"))
+        ls.lq.smooth_lq(stage, **ends, form="primal")
 
 
 @settings(max_examples=examples(20))

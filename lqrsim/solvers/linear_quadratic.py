@@ -4,6 +4,7 @@ import time
 from typing import Annotated
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.annotations import OneOf, Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_memory
@@ -133,7 +134,7 @@ def _passes(
         constant.copy(), passes,
     )  # fmt: skip
     failure = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
-    if failed >= 0 and form == "dual" and which > 0:
+    if which > 0 and failed >= 0 and form == "dual" and isinstance(initial, Quadratic) and _invertible(A).all():
         failure += '; try form="primal"'
     return passes, failure
 
@@ -215,11 +216,16 @@ def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) ->
     return covariance, mean, constant + 0.5 * float(gradient @ mean)
 
 
+def _invertible(A: Array) -> npt.NDArray[np.bool_]:
+    """Whether each step has inverse dynamics, (T,), without which there is no primal form."""
+    return np.linalg.cond(A) < 1e12
+
+
 def _inverse(A: Array, B: Array, c: Array) -> tuple[Array, Array]:
     """The inverse dynamics x_t = Abar x_{t+1} + Bbar u_t + cbar, as [Abar Bbar] (T, n, n+m) and cbar (T, n)."""
-    condition = np.linalg.cond(A)
-    if not condition.max() < 1e12:
-        step = int(np.argmax(condition))
+    invertible = _invertible(A)
+    if not invertible.all():
+        step = int(np.argmin(invertible))
         raise InputError(f'stage: A: got a singular matrix at step {step}, want an invertible one, or form="dual"')
     inverse = np.linalg.inv(A)
     return np.ascontiguousarray(np.concatenate([inverse, -inverse @ B], axis=2)), -np.einsum("tij,tj->ti", inverse, c)
