@@ -241,6 +241,9 @@ CALLS: list[tuple[Callable[[], object], str]] = [
      "^duration: got a free duration, want None"),
     *[(partial(ls.load, "plan.npz", kind), "^kind: got .*, want one of ls.Solution, .* ls.types.Funnel, ls.stress")
       for kind in ([], {}, np.zeros(2), "Solution", int)],
+    *[(lambda far=far: replace(drive().problem, begin=far).later(far),
+       rf"^seconds: got {far:g} after begin, {far:g}, want a finite sum".replace("+", r"\+"))
+      for far in (1e308, -1.5e308)],
     (lambda: drive().problem.site_errors(np.zeros(3)), r"states: got shape \(3,\), want"),
     (lambda: drive().problem.site_errors(np.zeros((2, 4))), r"states: got shape \(2, 4\), want"),
     (lambda: ls.smooth(replace(drive().problem, initial=ls.FixedState((0, -2.5, np.pi))), form="primal"),

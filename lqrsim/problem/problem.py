@@ -303,7 +303,10 @@ class Problem(OneVersion):
         Args:
           seconds: the delay in seconds; with such costs or constraints, a multiple of dt.
         """
-        other = self._with(begin=self.begin + seconds, initial=_anywhere(self.initial))
+        begin = self.begin + seconds
+        if not np.isfinite(begin):  # the sum of two finite numbers
+            raise InputError(f"seconds: got {seconds:g} after begin, {self.begin:g}, want a finite sum")
+        other = self._with(begin=begin, initial=_anywhere(self.initial))
         if any(term.by_knot for term in (*terms_of(self.stage_cost), *self.constraints)):
             steps = round(seconds / self.dt)
             if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
