@@ -622,5 +622,10 @@ def test_the_cost_of_a_replan_with_constraints_is_that_of_runs(steps: int, known
     replan = ls.prepare(problem).solve([-0.2, 0.0], start)
     assert replan.success
     assert replan.cost == pytest.approx(solution.cost, rel=1e-4)
+    assert replan.before == pytest.approx(start.cost, rel=1e-9)
+    for most in (1, 2, 4, 7):  # stopped plans, too
+        stopped = ls.prepare(problem, max_iterations=most).solve([-0.2, 0.0], start)
+        again = ls.prepare(problem).solve([-0.2, 0.0], stopped)
+        assert again.before == pytest.approx(stopped.cost, rel=1e-9)
     runs = ls.sample_costs(problem, solution, trials=20_000)
     assert solution.cost == pytest.approx(runs.mean(), abs=4 * runs.std() / np.sqrt(len(runs)))

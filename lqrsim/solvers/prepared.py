@@ -211,8 +211,7 @@ class PreparedSolver(OneVersion):
                     result, ended = ConstrainedRun(run, Known()).run_to_end(), time.perf_counter()
             else:
                 result = _solve(run, best)
-                if problem.noise_term is not None and problem.constraints:
-                    result = replace(result, cost=run.expected_cost(result))
+                result = replace(result, cost=_cost_of(run, result.cost, result.plan, result.law))
                 ended = time.perf_counter()
         if stop.error is not None:
             raise stop.error
@@ -291,6 +290,13 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
         return result
     except InputError as error:  # a function that is not finite at the start
         return replace(_unchanged(best), status=Status.NOT_FINITE, detail=str(error))
+
+
+def _cost_of(run: SolveRun, cost: float, plan: Motion, law: Policy) -> float:
+    """The cost of a plan in a run: under noise with constraints without their penalties, which `cost` has there."""
+    if run.problem.noise_term is None or not run.problem.constraints or not np.isfinite(cost):
+        return cost
+    return run.expected_cost(RunResult(status=Status.STALLED, plan=plan, law=law))
 
 
 def _unchanged(best: "_Best") -> RunResult:
@@ -485,7 +491,8 @@ class _Best:
         run.roll_out()
         self.rolling_out = time.perf_counter() - clock
         values = self._work.constraint_values(self._work.last)
-        self.cost, self.violation = self._work.cost, self._work.violation(values)
+        self.cost = _cost_of(run, self._work.cost, self._work.last, self._work.arrays.last_policy)
+        self.violation = self._work.violation(values)
         self.before = self.cost
         self.plan = copied(self._work.last)
         self.law = Policy(guess.gain, guess.offset)
@@ -501,8 +508,12 @@ class _Best:
     def __call__(self, iteration: Iteration) -> None:
         if iteration.optimality < self._run.final and iteration.violation == 0:
             return  # probably the last one; `consider` sees it
-        if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
-            arrays = self._work.arrays
+        if iteration.method not in ("smooth", "newton"):
+            return
+        arrays, cost = self._work.arrays, iteration.cost
+        if iteration.method == "smooth":
+            cost = _cost_of(self._run, cost, arrays.last, arrays.last_policy)
+        if self._beaten_by(cost, iteration.violation):
             if iteration.method == "newton":
                 parts = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
             else:
@@ -515,7 +526,7 @@ class _Best:
             copies = self._copies[: len(parts)]  # the cost-to-go about Newton's plans is computed at the end
             for copy, array in zip(copies, parts, strict=True):
                 np.copyto(copy, array)
-            self._keep(iteration.cost, iteration.violation, copies)
+            self._keep(cost, iteration.violation, copies)
 
     def consider(self, result: RunResult) -> None:
         """Adopt the final result if it converged and is as good as the best, or if it is better."""
