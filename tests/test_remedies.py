@@ -9,9 +9,12 @@ import pytest
 from failing_solves import CASES, UPRIGHT, mass, problem, reach, swing
 
 import lqrsim as ls
+from lqrsim.kernels.records import Motion, Policy
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import budget
+from lqrsim.solvers.assembly import remedy_of
+from lqrsim.solvers.engine import RunResult
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -27,6 +30,21 @@ def test_a_remedy_helps_where_it_is_printed(name: str) -> None:
         better = case.solver(case.of if other is None else other, **options)
         assert better.success, better.summary()
         assert better.remedy == ""
+
+
+@pytest.mark.parametrize("status", [Status.STALLED, Status.NOT_POSITIVE_DEFINITE])
+@pytest.mark.parametrize("limits", [{}, {"limit": 0.5}])
+def test_ilqr_is_not_told_of_options_that_it_lacks(status: Status, limits: dict[str, float]) -> None:
+    """It rarely fails so; the remedy is that for a result which says that it did."""
+    of = problem(**limits)
+    found = ls.ilqr(of, stop="cost")
+    plan = Motion(found.trajectory.states, found.trajectory.controls)
+    failed = RunResult(status=status, plan=plan, law=Policy(found.policy.gain, found.policy.offset))
+    remedy = remedy_of(of, failed, (), dict(found.options), shorter="")
+    assert "finish" not in remedy
+    if limits or status is Status.NOT_POSITIVE_DEFINITE:
+        better = "the interior point" if limits else "Newton's method"
+        assert remedy == f"solve with smooth: {better} finds plans where this method does not"
 
 
 def test_an_interrupted_solve_goes_on_from_the_solution_of_the_exception() -> None:

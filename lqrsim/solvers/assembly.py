@@ -220,7 +220,8 @@ def remedy_of(
     helps = status is Status.NOT_POSITIVE_DEFINITE or (bounded and status is not Status.NOT_FINITE)
     if paper and can_be_exact(problem) and helps and status is not Status.TIME_LIMIT:
         better = "the interior point" if bounded else "Newton's method"
-        return f'solve with finish="newton" and stop="optimal": {better} finds plans where this method does not'
+        how = 'finish="newton" and stop="optimal"' if "form" in options else "smooth"  # iLQR has no finish
+        return f"solve with {how}: {better} finds plans where this method does not"
     if status is Status.NOT_FINITE and not np.isfinite(result.states).all():
         begin = "begin with start=[...], controls under which the states stay in their domain"
         return begin if "form" in options else f"solve with smooth, or {begin}"
