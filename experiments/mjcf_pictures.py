@@ -45,7 +45,7 @@ def main(config: Config) -> Result:
             rollout = ls.simulate(ls.Plant(robot, robot.scene), solution)
         render_still(
             config, result, name.replace(" ", "_"), rollout, every=problem.steps * problem.dt / (TIMES - 1),
-            overlays=("trace",), titles=(name,),
+            overlays=("trace",),
         )  # fmt: skip
     if result["figures"]:
         pictures = [config.out / FIGURES / name for name in result["figures"]]

@@ -115,7 +115,9 @@ def test_it_is_seen_where_it_is(flight: ls.Rollout, quadrotor_solution: ls.Solut
     def picture(*levels: float, knots: tuple[int, ...] = (60, 110)) -> np.ndarray:
         funnel = funnel_by_hand(quadrotor_solution, 0.15**2 * np.eye(3), knots=knots, levels=levels or (0.0, 0.0))
         show: tuple[Overlay, ...] = ("funnel",) if levels else ()
-        options = PictureOptions(camera="top", overlays=show, funnel=funnel, quality="draft", size=(640, 360))
+        options = PictureOptions(
+            camera="top", overlays=show, funnel=funnel if levels else None, quality="draft", size=(640, 360)
+        )
         with open_picture(flight, options) as drawn:
             camera = drawn.panes[0].camera
             assert camera is not None

@@ -263,7 +263,7 @@ def test_pixels_tell_where_a_planar_quadrotor_is(flown, tmp_path: Path) -> None:
     assert abs(cameras.calibrated("side", rollout).forward[1]) == 1
     found = ls.verify_run(rollout, solution=solution)
     assert found.passed, found
-    video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10, solution=solution)
+    video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10)
     found = ls.verify_video(video, rollout, solution=solution)
     assert found.passed, found
     with pytest.raises(ls.InputError, match="views: got top, want side to measure"):

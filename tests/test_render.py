@@ -20,7 +20,7 @@ import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.captions import Legend
-from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay
+from lqrsim.view.options import ALL_OVERLAYS, DRAWN_BY, OVERLAYS, Overlay
 from lqrsim.view.overlays import DrawnTube, Overlays, Scale, colour_of, legend_entries
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
@@ -400,8 +400,10 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
 
     def shown(*overlays: Overlay) -> np.ndarray:
-        options: dict = {"time": 2.1, "size": (480, 270), "overlays": overlays, "solution": quadrotor_solution}
-        return pixels(render(noisy, tmp_path / "still.png", funnel=funnel, **options))
+        options: dict = {"time": 2.1, "size": (480, 270), "overlays": overlays}
+        options |= {"solution": quadrotor_solution} if "cost_tube" in overlays else {}
+        options |= {"funnel": funnel} if "funnel" in overlays else {}
+        return pixels(render(noisy, tmp_path / "still.png", **options))
 
     bare = shown()
     for overlay in ALL_OVERLAYS:
@@ -413,6 +415,23 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
         render(dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options)
     with pytest.raises(ls.InputError, match="solution: got None with the overlay cost_tube"):
         render(flight, tmp_path / "a.png", **options)
+
+
+@pytest.mark.parametrize("name", DRAWN_BY)
+@pytest.mark.parametrize("several", [False, True])
+def test_what_no_overlay_draws_is_refused(
+    flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: Path, name: str, several: bool
+) -> None:
+    funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
+    given: Any = {"solution": quadrotor_solution, "funnel": funnel, "titles": ("a",)}[name]
+    given = [None, given] if several and name != "titles" else given
+    others = tuple(overlay for overlay in ALL_OVERLAYS if overlay != DRAWN_BY[name])
+    message = f"^{name}: got one without {DRAWN_BY[name]} in overlays=, want it with that"
+    with pytest.raises(ls.InputError, match=message):
+        render([flight] * (1 + several), tmp_path / "a.png", overlays=others, **{name: given})
+    if name != "titles" and not several:
+        with pytest.raises(ls.InputError, match=message):
+            ls.view.render_html(flight, tmp_path / "a.html", overlays=others, **{name: given})
 
 
 def test_predicted_tube_has_the_half_axes_of_its_covariance(flight: ls.Rollout, drive: ls.Rollout) -> None:

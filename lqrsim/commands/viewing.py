@@ -22,15 +22,11 @@ from lqrsim.commands.options import (
     refuse,
     stated,
 )
-from lqrsim.view.options import OVERLAY_KINDS, OVERLAYS, Overlay, Quality
+from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
     from lqrsim.view.viewer import MovableGoal
     from lqrsim.view.viewer_base import Viewer
-
-
-# Options, and the overlays that draw what they say; a recording has its funnel whatever the overlays.
-DRAWN_BY = {"solution": "cost_tube", "funnel": "funnel", "title": "caption"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +111,11 @@ class Render:
         kind = out.suffix.lower()
         for name, overlay in DRAWN_BY.items() if kind != ".rrd" else ():
             if overlay not in self.overlays:
-                refuse(self, (name,), f"without {overlay} in --overlays, want it with that")
+                refuse(
+                    self,
+                    ("title" if name == "titles" else name,),
+                    f"without {overlay} in --overlays, want it with that",
+                )
         if kind in (".mp4", ".gif", ".png"):
             return
         if kind not in (".html", ".rrd"):

@@ -36,6 +36,7 @@ from lqrsim.view.overlays import (
     MovingBody,
     Overlays,
     Shown,
+    check_drawn,
     common_scale,
     error_colours,
     legend_entries,
@@ -68,6 +69,7 @@ def render_html(
       overlays: as in `render`, except that there is always a caption.
     """
     path = check_path("path", path, suffixes=(".html",))
+    check_drawn(overlays, solution=solution, funnel=funnel)
     rows, arrays = _rows(rollout, trial), _Arrays()
     scale = common_scale(RecordedTrial(rollout, row) for row in rows)
 

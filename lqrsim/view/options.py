@@ -47,6 +47,8 @@ OVERLAY_KINDS: dict[Overlay, OverlayKind] = {
 """What each overlay draws."""
 ALL_OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
 OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if OVERLAY_KINDS[name].default)
+# What is given for an overlay, and that overlay; a recording for Rerun has its funnel whatever the overlays.
+DRAWN_BY: dict[str, Overlay] = {"solution": "cost_tube", "funnel": "funnel", "titles": "caption"}
 CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)
 INSETS_FRACTION = 0.4  # fraction of a run's part for its insets

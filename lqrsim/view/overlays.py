@@ -16,10 +16,20 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.results.solution import Solution
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
-from lqrsim.view.options import OVERLAY_KINDS, Colour, Overlay
+from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, Colour, Overlay
 from lqrsim.view.recorded_trial import RecordedTrial, interpolated
 
 Shown = Annotated[Sequence[Overlay], Want("a tuple of overlays")]
+
+
+def check_drawn(overlays: Sequence[Overlay], **given: object) -> None:
+    """Raise InputError if one of `DRAWN_BY` is given, for one run or for several, without the overlay that draws it."""
+    for name, value in given.items():
+        items = value if isinstance(value, Sequence) else (value,)
+        if (overlay := DRAWN_BY[name]) not in overlays and any(item is not None for item in items):
+            raise InputError(f"{name}: got one without {overlay} in overlays=, want it with that")
+
+
 Rgba = tuple[float, float, float, float]
 
 # Opacities for planar robots and for robots in space.

@@ -19,7 +19,7 @@ from lqrsim.view import geoms, gl
 from lqrsim.view.cameras import CameraView, camera_view
 from lqrsim.view.captions import Caption, Legend, Pixels
 from lqrsim.view.options import OVERLAYS, Box, Quality, side_by_side, split_into_panes
-from lqrsim.view.overlays import Arrow, Overlays, Shown, common_scale
+from lqrsim.view.overlays import Arrow, Overlays, Shown, check_drawn, common_scale
 from lqrsim.view.recorded_trial import RecordedTrial, rows_of
 from lqrsim.view.video_metadata import Pane
 
@@ -181,6 +181,7 @@ class PictureOptions:
     speed: float = 1.0
 
     def __post_init__(self) -> None:
+        check_drawn(self.overlays, solution=self.solution, funnel=self.funnel, titles=self.titles)
         width, height = self.pixels
         if width % 2 or height % 2:
             raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
