@@ -1,5 +1,6 @@
 """Funnels: against the closed form of a linear system's region of success, and how runs begin on the way."""
 
+import functools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -478,6 +479,25 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert knot["time"] == pytest.approx(140 / 30)
     assert main(["funnel", "quadrotor", "--knots", "150", "--out", str(tmp_path)]) == 2
     assert "want some of 0 to 149" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("shape", "drawn"), [({"radius": 0.25}, 0.25), ({"balls": None}, 0.0), ({"geoms": None}, 0.0)])
+def test_its_picture_on_the_command_line_has_grey_places_of_one_ball_only(
+    funnel: ls.types.Funnel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: dict[str, Any], drawn: float
+) -> None:
+    """As those of policies: around several balls or geoms they would be wrong."""
+    seen: list[float] = []
+
+    def plotted(*args: Any, radius: float, **options: Any) -> Path:
+        seen.append(radius)
+        return tmp_path / "funnel.png"
+
+    monkeypatch.setattr(ls, "funnel", functools.wraps(ls.funnel)(lambda **options: funnel))
+    monkeypatch.setattr(ls.view, "plot_funnel", plotted)
+    monkeypatch.setattr(ls.stress.Study, "closed_loop", {})
+    monkeypatch.setattr(ls.Quadrotor, "shape", shape)
+    assert main(["funnel", "quadrotor", "--out", str(tmp_path)]) == 0
+    assert seen == [drawn]
 
 
 class TestReplannerWhenLeft:

@@ -255,7 +255,7 @@ class FunnelCommand(StudyOptions):
             console.result(funnel=as_json.of_funnel(result))
             console.save(result, folder / "funnel.npz")
             if space.position and set(space.position) <= set(result.chosen):
-                world, radius = scenario.scene.world, scenario.robot.radius
+                world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)
                 console.wrote(ls.view.plot_funnel(result, folder / "funnel.png", world=world, radius=radius))
             return 0 if result.levels.any() else 1
 

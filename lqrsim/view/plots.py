@@ -421,6 +421,9 @@ def plot_funnel(
     Outlines are dark at certified knots and pale between them, where the level is interpolated. The ellipsoids of all
     states are projected onto the position: whether a run may begin at a place also depends on the other states. A robot
     in space is seen from above and from the side.
+
+    Args:
+      radius: as in `plot_policy`: 0 for a robot of several balls or geoms.
     """
     views = funnel_views(funnel, world, radius)
     with styles.figure(path, style=style) as figure:
