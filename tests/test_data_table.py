@@ -169,6 +169,17 @@ def test_rates_are_those_of_the_trials(results: ls.stress.Results) -> None:
         assert (table["low"][row], table["high"][row]) == wanted
 
 
+def test_each_table_is_read_once(results: ls.stress.Results, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a summary and for rates, but where trials were stopped: their reasons are read for these alone."""
+    read, table = list[str](), ls.stress.Results.table
+    monkeypatch.setattr(ls.stress.Results, "table", lambda self, shard: read.append(shard.file) or table(self, shard))
+    shards = sorted(shard.file for shard in results.shards())
+    for asked in (results.summary, results.rates):
+        read.clear()
+        asked()
+        assert sorted(read) == shards
+
+
 def test_the_command_writes_them(
     results: ls.stress.Results, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

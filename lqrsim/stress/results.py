@@ -181,8 +181,11 @@ class Results:
     def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], analysis.Success | None]]:
         """Each cell with its outcomes so far and its success rate, None if no trial has been run."""
         for cell in self.cells:
-            ends = self.tally(cell, partial=True)
-            yield cell, ends, analysis.success(cell, self.outcomes(cell, partial=True)) if ends else None
+            if not any(self.path(shard).is_file() for shard in self.shards(cell)):
+                yield cell, Counter(), None
+                continue
+            found = self.outcomes(cell, partial=True)
+            yield cell, Counter(found.outcome.tolist()), analysis.success(cell, found)
 
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
@@ -192,7 +195,9 @@ class Results:
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
         head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
         lines = [head + "".join(f" {name:>9}" for name in others)]
+        tallies = dict[Cell, Counter[str]]()
         for cell, ends, success in self.cell_successes():
+            tallies[cell] = ends
             if success is None:
                 continue
             exact, reached = success.exact, f"{success.reached}/{success.trials}"
@@ -202,7 +207,8 @@ class Results:
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
-        lines += [*self.manifest["remarks"], *designs, *self.plans(), *self.came_to_nothing(), *self.hints()]
+        lines += [*self.manifest["remarks"], *designs, *self.plans()]
+        lines += [*self._came_to_nothing(tallies), *self._hints(tallies)]
         return "\n".join(lines)
 
     def rates(self) -> DataTable:
@@ -252,9 +258,12 @@ class Results:
 
     def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or a diverged filter."""
+        return self._came_to_nothing({cell: self.tally(cell, partial=True) for cell in self.cells})
+
+    def _came_to_nothing(self, tallies: Mapping[Cell, Counter[str]]) -> list[str]:
+        """These lines for tallies that are known; tables are read again only where there are reasons."""
         reasons: Counter[str] = Counter()
-        for cell in self.cells:
-            ends = self.tally(cell, partial=True)
+        for cell, ends in tallies.items():
             if ends["error"] or ends["diverged"]:
                 reasons.update(self.reasons(cell).values())
         return [f"{count} trials were stopped: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
@@ -264,9 +273,11 @@ class Results:
 
         Trials that ended with an error do not count.
         """
+        return self._hints({cell: self.tally(cell, partial=True) for cell in self.cells})
+
+    def _hints(self, tallies: Mapping[Cell, Counter[str]]) -> list[str]:
         reached: dict[str, int] = {}
-        for cell in self.cells:
-            ends = self.tally(cell, partial=True)
+        for cell, ends in tallies.items():
             if cell.strength > 0 and ends["error"] < ends.total():
                 reached[cell.sweep] = reached.get(cell.sweep, 0) + ends["reached"]
         sweeps = self.manifest["campaign"]["sweeps"]
