@@ -152,6 +152,27 @@ def test_times_between_knots_are_those_of_the_plan(number: int, begin: float) ->
     assert all(0 <= time <= later.trajectory.horizon for _, time in found.values())
 
 
+@pytest.mark.parametrize("margin", [0.02, np.linspace(0.0, 0.04, 5)], ids=["margin", "by knot"])
+@pytest.mark.parametrize("speed", [0.0, 0.03, -0.5])
+def test_obstacles_that_move_are_left_out(margin: float | Array, speed: float) -> None:
+    """Whatever the margins: their places between the knots are not looked at, where the plan meets the ball."""
+    point = ls.Dynamics(
+        lambda x, u, p: [u[0], u[1]], states={"x": "m", "y": "m"}, controls={"a": "m/s", "b": "m/s"},
+        position=("x", "y"),
+    )  # fmt: skip
+    ball = ls.Obstacle(
+        "ball", "sphere", np.array([-0.25, 0.0, 0.0]), np.eye(3), np.array([0.1, 0, 0]),
+        velocity=np.array([0.0, speed, 0.0]),
+    )  # fmt: skip
+    problem = ls.Problem(
+        dynamics=point, dt=1.0, steps=4, initial=ls.FixedState([-1.0, 0.0]), stage_cost=ls.ControlCost([1.0, 1.0]),
+        final_cost=ls.QuadraticCost([1e3, 1e3], about=[1.0, 0.0]),
+        constraints=[ls.Clearance(ls.World([ball]).seen_by("xy"), radius=0.05, margin=margin)],
+    )  # fmt: skip
+    violations = ls.smooth(problem).between_knots().violations
+    assert bool(violations) == (speed == 0)
+
+
 def test_a_plan_that_is_right_between_its_knots_stays_as_it_is() -> None:
     case = between_knots.draw(9)  # a point with much room
     plans = [ls.smooth(replace(case.problem, between_knots=asked), threads=1) for asked in (False, True)]

@@ -16,7 +16,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import FIRST
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.constraints import names_of
+from lqrsim.problem.constraints import Constraint, names_of
 from lqrsim.problem.problem import ACCURATE, Problem
 from lqrsim.problem.within_periods import WithinPeriods
 from lqrsim.results.solution import Solution
@@ -109,7 +109,7 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
     """
     terms = problem.constraint_terms
     within = [
-        not (term.equality or term.final_only) and not (constraint.moving and not constraint.by_knot)
+        not (term.equality or term.final_only or _moves(constraint))
         for constraint, term in zip(problem.constraints, terms, strict=True)
     ]
     if not any(within):
@@ -125,6 +125,13 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
         worst.append(missed if checked else np.zeros_like(missed))
         times.append(time)
     return worst, times
+
+
+def _moves(constraint: Constraint) -> bool:
+    """Whether it is known at the knots only: with obstacles that move, whatever its margins, or with the time."""
+    obstacles = constraint.kept_clear
+    moving = obstacles is not None and obstacles.world.moving
+    return moving or (constraint.moving and not constraint.by_knot)
 
 
 def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
