@@ -323,7 +323,7 @@ def test_what_cannot_be_is_told_in_a_line(changed: dict[str, Any], message: str)
 
 @pytest.mark.parametrize("one", ["commands", "odometry", "joints"])
 def test_a_simulated_robot_has_a_topic_for_each(one: str) -> None:
-    names = {"commands": "/c", "odometry": "/o", "joints": "/j"}
+    names: dict[str, Any] = {"commands": "/c", "odometry": "/o", "joints": "/j"}
     for other in names.keys() - {one}:
         with pytest.raises(ls.InputError, match=r"got '/\w', as for \w+, want a topic of its own"):
             bridge.SimulatedRobot(policy(), **{**names, one: names[other]})

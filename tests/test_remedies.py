@@ -34,7 +34,7 @@ def test_a_remedy_helps_where_it_is_printed(name: str) -> None:
 
 @pytest.mark.parametrize("status", [Status.STALLED, Status.NOT_POSITIVE_DEFINITE])
 @pytest.mark.parametrize("limits", [{}, {"limit": 0.5}])
-def test_ilqr_is_not_told_of_options_that_it_lacks(status: Status, limits: dict[str, float]) -> None:
+def test_ilqr_is_not_told_of_options_that_it_lacks(status: Status, limits: dict[str, Any]) -> None:
     """It rarely fails so; the remedy is that for a result which says that it did."""
     of = problem(**limits)
     found = ls.ilqr(of, stop="cost")

@@ -425,7 +425,7 @@ def test_what_no_overlay_draws_is_refused(
     funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
     given: Any = {"solution": quadrotor_solution, "funnel": funnel, "titles": ("a",)}[name]
     given = [None, given] if several and name != "titles" else given
-    others = tuple(overlay for overlay in ALL_OVERLAYS if overlay != DRAWN_BY[name])
+    others: Any = tuple(overlay for overlay in ALL_OVERLAYS if overlay != DRAWN_BY[name])
     message = f"^{name}: got one without {DRAWN_BY[name]} in overlays=, want it with that"
     with pytest.raises(ls.InputError, match=message):
         render([flight] * (1 + several), tmp_path / "a.png", overlays=others, **{name: given})
