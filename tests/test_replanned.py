@@ -31,7 +31,7 @@ def stated(*unknowns: Unknown, lag: float = 0.0, latency: int = 0, delay: int = 
 def replanned(system: Linear, uncertainty: Uncertainty, every: float | None = AGAIN * DT) -> ls.OffsetFree:
     return ls.OffsetFree(
         system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True, replan_every=every,
-        replan_always=True,
+        replan_always=every is not None,
     )  # fmt: skip
 
 

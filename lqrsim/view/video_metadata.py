@@ -83,8 +83,10 @@ def read(path: str | os.PathLike[str]) -> VideoMetadata:
     if not os.path.isfile(path):  # not the method of Path, which raises if a folder cannot be read
         raise InputError(f"video: got {excerpt_of(path)}, want a file that exists")
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with av.open(str(path)) as container:
             text = container.metadata.get("comment", "")
+    except UnicodeDecodeError:  # PyAV before 19 reads no comments of other encodings
+        text = ""
     except (FFmpegError, OSError) as error:
         raise InputError(f"video: got {path}, want one that can be read ({error})") from None
     return VideoMetadata.from_json(text)

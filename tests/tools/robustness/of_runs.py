@@ -291,7 +291,7 @@ def line(vectors: Any) -> Any:
 def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
     world, rollout, solution = place.scenario.scene.world, place.rollout, place.solution
     options = {
-        "runs": rollout, "trial": 0, "camera": "top", "insets": (), "titles": ("a title",), "overlays": ("plan",),
+        "runs": rollout, "trial": 0, "camera": "top", "insets": (), "titles": ("a title",), "overlays": ("plan", "cost_tube", "caption"),
         "solution": solution, "funnel": None, "quality": "draft", "size": (128, 96),
     }  # fmt: skip
     video = place.folder / "video.mp4"
@@ -320,7 +320,7 @@ def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
             "progress": print_nothing,
         }, 0.15),
         "render_html": ({
-            "rollout": rollout, "path": place.folder / "run.html", "trial": 0, "overlays": ("plan",),
+            "rollout": rollout, "path": place.folder / "run.html", "trial": 0, "overlays": ("plan", "cost_tube"),
             "solution": solution, "funnel": None,
         }, 0.1),
         "verify_run": ({"rollout": rollout, "trial": 0, "solution": solution, "progress": print_nothing}, 0.15),
