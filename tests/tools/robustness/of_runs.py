@@ -291,8 +291,9 @@ def line(vectors: Any) -> Any:
 def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
     world, rollout, solution = place.scenario.scene.world, place.rollout, place.solution
     options = {
-        "runs": rollout, "trial": 0, "camera": "top", "insets": (), "titles": ("a title",), "overlays": ("plan", "cost_tube", "caption"),
-        "solution": solution, "funnel": None, "quality": "draft", "size": (128, 96),
+        "runs": rollout, "trial": 0, "camera": "top", "insets": (), "titles": ("a title",),
+        "overlays": ("plan", "cost_tube", "caption"), "solution": solution, "funnel": None,
+        "quality": "draft", "size": (480, 270),
     }  # fmt: skip
     video = place.folder / "video.mp4"
     made: dict[str, tuple[Any, ...]] = {
