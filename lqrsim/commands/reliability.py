@@ -25,8 +25,8 @@ class FailureOptions(StudyOptions):
     sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
     """Disturbances, as in `lqrsim stress`. By default the disturbances of the scenario's demo."""
     failure: Literal["collision", "miss"] = "collision"
-    """collision: the robot hits an obstacle, or its simulation diverges. miss: it does not reach its goal, which is
-    what `lqrsim stress` calls a failure."""
+    """collision: the robot hits an obstacle, its trial diverges, or its controller fails. miss: it does not reach its
+    goal, which is what `lqrsim stress` calls a failure."""
 
     out: Folder = None
     """Output folder. By default runs/, the name of the command, and the name of the scenario."""
@@ -169,7 +169,7 @@ class Certify:
     """
 
     file: Annotated[Positional[Path], arg(metavar="FILE.npz")]
-    """certificate.npz from `lqrsim rare`."""
+    """certificate.npz from `lqrsim rare` or `harden`."""
     scenario: OwnScenario = None
     json: Json = False
 

@@ -195,7 +195,7 @@ class Dynamics:
 
     @property
     def period(self) -> float | None:
-        """The seconds of which every duration of a step is a multiple; None if it may be any."""
+        """For a map, the only duration of a step in s; MuJoCo's time step, of which it is a multiple; else None."""
         return self._period
 
     @property

@@ -117,8 +117,8 @@ class Rollout:
         with an obstacle; 0 if the robot passes through obstacles.
       collided_at: (K,) seconds to the first collision, at a knot or between two; infinite without a collision.
       obstacles: (K) name of the obstacle of that collision; empty without a collision.
-      diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement was not finite, or
-        the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot on.
+      diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement or a force was not
+        finite, or the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot on.
       failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
         after that knot.
       reasons: (K) why the controller failed, its filter diverged or a force was not finite; empty otherwise.
@@ -341,7 +341,7 @@ class Rollout:
 
     @property
     def diverged(self) -> npt.NDArray[np.bool_]:
-        """Whether an unstable simulation or filter ended a trial, (K,)."""
+        """Whether an unstable simulation or filter, or a number that is not finite, ended a trial, (K,)."""
         return self._endings[0] == "diverged"
 
     @property

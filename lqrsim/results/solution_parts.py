@@ -231,7 +231,8 @@ class ContactCertificate:
 class Certificate:
     """Measures of a plan, recomputed from the problem after the solve by code that the solvers do not use.
 
-    For a CONVERGED solution optimality and violation are within tolerance, the other residuals within rounding.
+    For a CONVERGED solution optimality is within twice its tolerance, violation within its own, and the other residuals
+    within rounding.
 
     Attributes:
       cost: cost of the plan; see `Solution.cost`.

@@ -119,8 +119,7 @@ def check_plant(
 
     A wrong mass, sign or unit shows in the states on which it acts. `Plant.obstacles` are removed, floors included.
     Geoms that are no obstacles in runs stay: the floor that the robot stands on, or planes parallel to the robot's
-    plane.
-    Contacts with these, and between moving parts, are in the result, by the names of the geoms.
+    plane. Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:
       simulator: a simulator to compare the dynamics with, in place of MuJoCo; it does not report contacts.

@@ -262,7 +262,8 @@ def smooth_continuous(
       the solve ended, and the detail where.
 
     Raises:
-      InputError: the dynamics or a cost is not finite at the start.
+      InputError: the dynamics or a cost is not finite at the start; or the problem has a fixed start, a free duration,
+        constraints, rates, noise, `accuracy=`, a cost with rows for knots, or dynamics that are a map.
     """
     if isinstance(problem.initial, FixedState):
         raise InputError(
@@ -271,6 +272,8 @@ def smooth_continuous(
         )
     if problem.duration is not None:
         raise InputError("duration: got a free duration, want None in continuous time; use `smooth`")
+    if problem.accuracy is not None:
+        raise InputError("accuracy: got that of steps, want None and rtol=, which is that of all integrations here")
     if problem.constraints:
         raise InputError("constraints: got a problem with constraints, want none in continuous time; use `smooth`")
     if problem.control_rate is not None:

@@ -86,8 +86,8 @@ def gradients(
       scale: (P,) typical changes of the parameters; by default their sizes, at least 1e-3 each.
 
     Raises:
-      InputError: the problem has noise, rates or a free duration, the plan is at the edge of its contact modes, or
-        limits of forces were refined within its periods.
+      InputError: the problem has noise, rates, a free duration, `accuracy=` or `between_knots=True`, the plan is at the
+        edge of its contact modes, or limits of forces were refined within its periods.
     """
     point = check_array("at", at, (None,))
     if not len(point):

@@ -257,7 +257,7 @@ class Results:
         return designs
 
     def came_to_nothing(self) -> list[str]:
-        """A line for each of the most frequent reasons of trials that ended with an error or a diverged filter."""
+        """A line for each of the most frequent reasons of trials that ended with an error or diverged."""
         return self._came_to_nothing({cell: self.tally(cell, partial=True) for cell in self.cells})
 
     def _came_to_nothing(self, tallies: Mapping[Cell, Counter[str]]) -> list[str]:
@@ -300,7 +300,7 @@ class Results:
         return lines
 
     def reasons(self, cell: Cell) -> dict[int, str]:
-        """The reasons of a cell's trials that ended with an error or a diverged filter, by number of the trial."""
+        """The reasons of a cell's trials that ended with an error or diverged, by number of the trial."""
         return {
             int(trial): str(reason)
             for table in self.tables(cell, partial=True)
