@@ -239,7 +239,8 @@ CALLS: list[tuple[Callable[[], object], str]] = [
      "^initial: got a FixedState, want an initial cost"),
     (lambda: ls.lq.smooth_continuous(replace(drive().problem, duration=(9.0, 30.0), time_weight=0.1)),
      "^duration: got a free duration, want None"),
-    (lambda: ls.lq.smooth_continuous(replace(drive().problem, accuracy=1e-6)), "^accuracy: got that of steps, want None"),
+    (lambda: ls.lq.smooth_continuous(replace(drive().problem, accuracy=1e-6)),
+     "^accuracy: got that of steps, want None"),
     *[(partial(ls.load, "plan.npz", kind), "^kind: got .*, want one of ls.Solution, .* ls.types.Funnel, ls.stress")
       for kind in ([], {}, np.zeros(2), "Solution", int)],
     *[(lambda far=far: replace(drive().problem, begin=far).later(far),

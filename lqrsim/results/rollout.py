@@ -118,7 +118,8 @@ class Rollout:
       collided_at: (K,) seconds to the first collision, at a knot or between two; infinite without a collision.
       obstacles: (K) name of the obstacle of that collision; empty without a collision.
       diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement or a force was not
-        finite, or the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot on.
+        finite, or the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot
+        on.
       failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
         after that knot.
       reasons: (K) why the controller failed, its filter diverged or a force was not finite; empty otherwise.
