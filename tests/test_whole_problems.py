@@ -41,6 +41,13 @@ def test_a_large_penalty_does_not_spoil_the_certified_cost() -> None:
         assert contradictions(drawn.problem, solution, drawn.rate) == []
 
 
+def test_rows_without_an_obstacle_give_no_warning() -> None:
+    """Their size is infinite and their multiplier 0: the product was an invalid value."""
+    drawn = draws.draw("parking", 255)
+    for solution in draws.solve(drawn):
+        assert contradictions(drawn.problem, solution, drawn.rate) == []
+
+
 def test_a_plan_that_needs_one_more_iteration_says_so() -> None:
     """The interior point had ended with the last iteration that was allowed, inside the constraints: NOT_CERTIFIED."""
     drawn = draws.draw("tracking", 1501)

@@ -105,7 +105,9 @@ class InteriorRun:
         """Whether the multipliers of all constraints are remnants of the barrier."""
         stages = self._run.stages
         acting = stages.live & (stages.owners >= 0)
-        force = stages.of_constraints(interior.multipliers) * interior.sizes.rows**2 / interior.scale
+        force = stages.of_constraints(interior.multipliers)
+        sizes = np.broadcast_to(interior.sizes.rows**2 / interior.scale, force.shape)  # infinite far from all obstacles
+        force = np.multiply(force, sizes, out=np.zeros(force.shape), where=force != 0)
         return bool((~stages.equality & (force < stages.values(interior.plan)))[acting].all())
 
     def _jumps(self, interior: InteriorResult) -> bool:
