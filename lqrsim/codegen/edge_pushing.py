@@ -196,9 +196,8 @@ def jacobian_of(operations: Operations, results: Sequence[Any], variables: Seque
         terms: dict[int, list[Any]] = defaultdict(list)
         condition, *cases = _cases_of(operation)
         if cases:
-            used = [
-                (k, a) for k, case in enumerate(cases) for a in case.free_symbols & slopes.keys()
-            ]  # at most one each
+            # A case is a symbol or a number: at most one each.
+            used = [(k, a) for k, case in enumerate(cases) for a in case.free_symbols & slopes.keys()]
             for j in sorted({j for _, a in used for j in slopes[a]}):
                 parts = [sympy.Integer(0)] * 2
                 for k, a in used:

@@ -67,8 +67,9 @@ class Stress(SetupOptions):
             campaign = ls.stress.Results(folder, scenario=self.scenario).campaign
             campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
         else:
-            own = {name: value for name, value in stated(self, ls.stress.Campaign).items() if not hasattr(setup, name)}
-            campaign = ls.stress.Campaign.of_sets(setup, self.sweep, **own)
+            options = stated(self, ls.stress.Campaign)
+            options = {name: value for name, value in options.items() if not hasattr(setup, name)}
+            campaign = ls.stress.Campaign.of_sets(setup, self.sweep, **options)
         with console.progress("stressing", "trial") as progress:
             results = ls.stress.run_campaign(
                 campaign, folder, **stated(self, ls.stress.run_campaign, progress=progress)

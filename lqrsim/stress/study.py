@@ -240,10 +240,10 @@ class Campaign(Setup):
         scenario, design = setup.resolved, setup.design_disturbances
         impossible = impossible_policies(scenario, setup.given)
         shared = {field.name: getattr(setup, field.name) for field in dataclasses.fields(Setup)}
-        for name in options:  # what the setup or the sets state would be ignored
-            check_name(
-                "options", name, [name for name in CAMPAIGN_FIELDS if name not in (*shared, "sweeps", "policies")]
-            )
+        # What the setup or the sets state would be ignored.
+        allowed = [name for name in CAMPAIGN_FIELDS if name not in (*shared, "sweeps", "policies")]
+        for name in options:
+            check_name("options", name, allowed)
         named = {
             "design_disturbances": None if design is None else tuple(design_disturbances(scenario, design)),
             "sweeps": {name: disturbance_set(name, scenario) for name in sets},

@@ -146,9 +146,8 @@ def camera_view(
     same_model = [trial for trial in beside if trial.rollout.model == recorded.rollout.model] or [recorded]
     if name in CALIBRATED:
         runs = {id(trial.rollout): trial for trial in same_model}.values()
-        sizes = [
-            0.0 if trial.rollout.radius else trial.size for trial in runs
-        ]  # bounds have the radius, if there is one
+        # The bounds of a run have the robot's radius, if it has one.
+        sizes = [0.0 if trial.rollout.radius else trial.size for trial in runs]
         bounds = zip((_bounds(trial.rollout) for trial in runs), sizes, strict=True)
         corners = np.vstack([corner for (low, high), size in bounds for corner in (low - size, high + size)])
         camera = calibrated(name, recorded.rollout, aspect, around=corners)

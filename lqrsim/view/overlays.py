@@ -210,9 +210,8 @@ class Overlays:
         if "plan" in show:
             yield Line("plan", rgba_of("plan"), "planned", recorded.planned(times) + 2 * lift, profile(0.8))
         if "forces" in show and self.scale.force >= 1e-6:
-            gap = min(
-                run.radius or recorded.size, 0.1 * recorded.model.stat.extent
-            )  # the radius of an arm is its reach
+            # The radius of an arm is its reach.
+            gap = min(run.radius or recorded.size, 0.1 * recorded.model.stat.extent)
             label, longest = f"force, longest {self.scale.force:.2g} N", ARROW * gap
             thick, for_newton = max(0.1 * gap, 1.5 * width), longest / self.scale.force
             yield Arrow("forces", rgba_of("forces"), label, recorded.force, gap, thick, for_newton)

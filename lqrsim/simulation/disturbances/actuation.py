@@ -177,9 +177,8 @@ class ActuatorLoss(Disturbance):
         check_gains(self, plant)
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        period = int(
-            np.ceil(min(self.at / plan.dt, plan.steps) - 1e-9)
-        )  # a time within rounding of a knot counts as that knot
+        # A time within rounding of a knot counts as that knot.
+        period = int(np.ceil(min(self.at / plan.dt, plan.steps) - 1e-9))
         if period >= plan.steps:
             raise InputError(
                 f"ActuatorLoss: at: got {self.at:g} s, want a time before the last control period of the plan, which"
