@@ -97,6 +97,15 @@ def test_no_family_misleads(kind: str) -> None:
     holds()
 
 
+@pytest.mark.parametrize("number", [7040, 7048, 7084, 7090, 7250, 7269, 65536])
+def test_states_of_micrometres_have_sizes_of_their_own(number: int) -> None:
+    """Typical sizes of 1 m made curvatures of minima count as zero."""
+    case = families.draw("scales", number)
+    solution = ls.smooth(case.problem, start=case.given, threads=1)
+    assert solution.curvature is Curvature.MINIMUM
+    assert dense.contradictions(case, solution) == []
+
+
 @pytest.mark.long
 def test_a_plan_beside_a_cheaper_one_leaves_its_contact_modes() -> None:
     """Within its contact modes the plan was optimal; of the plans beside it one was cheaper, and it was STALLED."""
