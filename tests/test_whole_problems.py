@@ -78,7 +78,7 @@ def test_what_is_known_beforehand_is_found(kind: str) -> None:
         assert solution.success == drawn.possible, f"{kind} {number}"
 
 
-SLOW = "contact", "overflow", "scales", "saturating"  # seconds each
+SLOW = "contact", "overflow", "scales", "saturating", "units"  # seconds each
 
 
 @pytest.mark.parametrize("kind", [*(one for one in families.KINDS if one not in SLOW), *rarely(*SLOW)])
@@ -103,6 +103,14 @@ def test_states_of_micrometres_have_sizes_of_their_own(number: int) -> None:
     case = families.draw("scales", number)
     solution = ls.smooth(case.problem, start=case.given, threads=1)
     assert solution.curvature is Curvature.MINIMUM
+    assert dense.contradictions(case, solution) == []
+
+
+@pytest.mark.parametrize("number", [6, 16, 17, 22, 25, 26, 60, 117])
+def test_saddles_are_seen_in_all_units(number: int) -> None:
+    """A length at rest had a size of 1 beside others of 1e5: the curvature along it counted as zero."""
+    case = families.draw("units", number)
+    solution = ls.smooth(case.problem, start=case.given, threads=1)
     assert dense.contradictions(case, solution) == []
 
 

@@ -245,6 +245,7 @@ class PlanStages(NamedTuple):
     jumps: Annotated[Arrays, "T+1"]  # 1 where the last state is free, and may jump; at the start, if there are any
     reset: Annotated[Arrays, "T+1 N+1"]  # the law of its change there
     reach: Annotated[Arrays, "N"]  # distances from the start to the goal
+    unit: Annotated[Arrays, "N"]  # a number for each unit; states without one have numbers of their own
     state_size: Annotated[Arrays, "N"]  # typical sizes
     control_size: Annotated[Arrays, "M"]
     projected: Annotated[Arrays, "1"]  # 1 if the projected Hessians are those of the last plan

@@ -42,8 +42,10 @@ STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: 
 PROBE_DISTANCE = (
     1e-3  # distance from a plan at which gradients are evaluated, too: at the plan itself entries may vanish
 )
-SMALLEST = 1e-3  # a state that moves less has a typical size of 1; where none moves more, relative to what moves most
-REST = 1e-12  # where no state moves more, sizes are 1, as those of rounding errors are none
+# The size of a state that hardly moves is 1, or that of another in its unit if all move little or that moves far.
+SMALLEST = 1e-3  # a state that moves less hardly moves; where none moves more, relative to what moves most
+REST = 1e-12  # where none moves more, all motions are rounding errors
+FAR = 1e3  # a state that moves more moves far
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
 # The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of
@@ -279,16 +281,21 @@ def typical_sizes(stages, plan, hessian):
     The size of a control without limits is the change that moves a state by its typical size.
     """
     steps, rows, models = stages.steps, stages.rows, stages.models
-    farthest = 0.0
+    moves, farthest = stack(N), 0.0
     for i in range(N):
         least, most = plan.states[0, i], plan.states[0, i]
         for t in range(1, steps + 1):
             least, most = min(least, plan.states[t, i]), max(most, plan.states[t, i])
-        stages.state_size[i] = max(most - least, stages.reach[i])
-        farthest = max(farthest, stages.state_size[i])
-    unit = farthest if farthest > REST and farthest < SMALLEST else 1.0
+        moves[i] = max(most - least, stages.reach[i])
+        farthest = max(farthest, moves[i])
+    small = farthest > REST and farthest < SMALLEST
+    least = SMALLEST * farthest if small else SMALLEST
     for i in range(N):
-        stages.state_size[i] = stages.state_size[i] if stages.state_size[i] > SMALLEST * unit else unit
+        most = 0.0
+        for j in range(N):
+            most = max(most, moves[j]) if stages.unit[j] == stages.unit[i] else most
+        rest = most if most > FAR or (small and most > least) else 1.0
+        stages.state_size[i] = moves[i] if moves[i] > least else rest
     for j in range(M):
         stages.control_size[j] = stages.model.limits.high[j] - stages.model.limits.low[j]
         if stages.control_size[j] < inf:

@@ -132,6 +132,8 @@ class Stages:
         self.about.uses_learned[...], self.about.reuses_derivatives[...] = 0.0, 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         self.about.jumps[...] = 0.0
+        units = problem.dynamics.state_coordinates.units
+        self.about.unit[...] = [units.index(unit) if unit else i for i, unit in enumerate(units)]
         if problem.goal is not None and problem.start is not None:
             self.about.reach[...] = np.abs(np.nan_to_num(problem.goal - problem.start))
         limit = self.owners == -1

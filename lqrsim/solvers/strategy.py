@@ -224,8 +224,11 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
     point = InteriorRun(run)
     if run.problem.constraints:
-        result = point.run_from(copied(plan), WEAK)
-        return None if result is None or not result.success else run.certified(result)
+        for barrier in WEAK, STRONG:
+            result = point.run_from(copied(plan), barrier)
+            if result is not None and result.success:
+                return run.certified(result)
+        return None
     law = compiled.law_about(plan.states, plan.controls, saddle.law.gain)
     beside = point.result(compiled.rollout(run.problem, *law, plan.states[0].copy()))
     if not beside.cost < saddle.cost:

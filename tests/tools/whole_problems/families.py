@@ -8,6 +8,7 @@ overflow    With the nominal control the state overflows or leaves its domain wi
 scales      Costs and states from 1e-8 to 1e8 of the usual size.
 time        Least time, without an effort.
 contact     A slide of an MJCF that is to push another, with controls that do so, or without.
+units       As symmetric, with lengths in units from 1e-7 to 1e7 of the usual.
 
 Each kind has few structures, so that little is compiled; all else is numbers.
 """
@@ -144,10 +145,19 @@ def _case(
     rate: Formula, states: dict[str, str], controls: dict[str, str], *, numbers: dict[str, float],
     start: Sequence[float], dt: float, steps: int, stage: Formula, final: Formula,
     limits: tuple[Any, Any] | None = None, rows: Sequence[tuple[Formula, bool, bool]] = (),
-    goal: dict[str, float] | None = None, given: Any = None, **others: Any,
+    goal: dict[str, float] | None = None, given: Any = None, unit: float = 1.0, **others: Any,
 ) -> Case:  # fmt: skip
-    """A case of formulas of (x, u, p, library); rows are formulas, whether equalities, and whether at the end only."""
+    """A case of formulas of (x, u, p, library); rows are formulas, whether equalities, and whether at the end only.
+
+    With a unit, lengths and speeds among the states are in 1 / unit metres.
+    """
     p, none, names = _Numbers(numbers), np.zeros(len(controls)), list(states)
+    if unit != 1.0:
+        sizes = [unit if of.startswith("m") else 1.0 for of in states.values()]
+        rate, stage, final = _in_unit(rate, sizes, sizes), _in_unit(stage, sizes), _in_unit(final, sizes)
+        rows = [(_in_unit(row, sizes), *how) for row, *how in rows]
+        start = [size * number for size, number in zip(sizes, start, strict=True)]
+        goal = goal and {name: sizes[names.index(name)] * number for name, number in goal.items()}
 
     def stated(formula: Formula) -> Any:
         return _named(lambda x, u, p: formula(x, u, p, sympy), formula.__name__)
@@ -179,6 +189,16 @@ def _case(
         kind="", number=0, problem=problem, rate=lambda x, u: rate(x, u, p, np),
         stage=lambda x, u: stage(x, u, p, np), final=lambda x: final(x, none, p, np), rows=tuple(own), given=given,
     )  # fmt: skip
+
+
+def _in_unit(formula: Formula, sizes: list[float], results: list[float] | None = None) -> Formula:
+    """A formula of states that are multiples of its own, as may be its results."""
+
+    def scaled(x: Any, u: Any, p: Any, lib: Any) -> Any:
+        found = formula([x[i] / size for i, size in enumerate(sizes)], u, p, lib)
+        return found if results is None else [size * rate for size, rate in zip(results, found, strict=True)]
+
+    return _named(scaled, formula.__name__)
 
 
 def _named(function: Any, name: str) -> Any:
@@ -270,7 +290,7 @@ def outside(x: Any, u: Any, p: Any, lib: Any) -> Any:
     return (x[0] - p.at) ** 2 + x[1] ** 2 - p.radius**2
 
 
-def symmetric(rng: Generator) -> Case:
+def symmetric(rng: Generator, *, unit: float = 1.0) -> Case:
     goal, radius = float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.1, 0.35))
     numbers = {
         "effort": _log(rng, 1e-2, 1.0), "goal": goal, "at": goal * float(rng.uniform(0.4, 0.6)), "radius": radius,
@@ -278,8 +298,10 @@ def symmetric(rng: Generator) -> Case:
     }  # fmt: skip
     steps, dt = int(rng.integers(10, 30)), 0.1
     kind = int(rng.integers(3))
-    common: dict[str, Any] = {"numbers": numbers, "dt": dt, "steps": steps, "final": arrive}
+    common: dict[str, Any] = {"numbers": numbers, "dt": dt, "steps": steps, "final": arrive, "unit": unit}
     ends = {"x": goal, "y": 0.0} if rng.random() < 0.5 else None
+    if kind == 2:  # beside an angle of usual size, small lengths have no size of their own
+        common["unit"] = max(unit, 1.0)
     if kind == 0:
         return _case(plane, **_PLANE, **common, start=[0.0, 0.0], stage=bump, goal=ends)
     if kind == 1:
@@ -290,6 +312,10 @@ def symmetric(rng: Generator) -> Case:
         car, {"x": "m", "y": "m", "theta": "rad"}, {"v": "m/s", "w": "rad/s"}, **common, start=[0.0, 0.0, 0.0],
         stage=effort, rows=[(outside, False, False)], goal=ends,
     )  # fmt: skip
+
+
+def units(rng: Generator) -> Case:
+    return symmetric(rng, unit=float(10 ** rng.uniform(-7, 7)))
 
 
 def flat(rng: Generator) -> Case:
@@ -482,4 +508,5 @@ def numbers_size(case: Case) -> float:
 KINDS: dict[str, Callable[[Generator], Case]] = {
     "given": given, "symmetric": symmetric, "saturating": saturating, "flat": flat, "overflow": overflow,
     "scales": scales, "time": time, "contact": contact,
+    "units": units,
 }  # fmt: skip
