@@ -19,7 +19,7 @@ from sampling import rarely
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.errors import InputError
-from lqrsim.gym.episode import LARGEST
+from lqrsim.gym.environment import LARGEST
 from lqrsim.view import gl
 
 NAMES = {"lqrsim/DifferentialDrive-v0": "differential_drive", "lqrsim/Quadrotor-v0": "quadrotor"}

@@ -11,8 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_kind, check_text, excerpt
-from lqrsim.gym.environment import Environment
-from lqrsim.gym.episode import Task
+from lqrsim.gym.environment import Environment, Task
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.rollout import Rollout
 
