@@ -19,6 +19,7 @@ from scipy.stats import binom, chi2
 import lqrsim as ls
 from lqrsim.control.kalman import PLAUSIBLE, RESOLUTION, kalman_filter
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.uncertainty import triangular_root
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
@@ -357,7 +358,7 @@ def precisely(model: PlanModel, least: Array, t: int) -> tuple[Any, Any]:
     to, source = [mpmath.eye(size)], [exact(model.start_root)]
     for i in range(t):
         to = [exact(model.F[i]) * one for one in to] + [mpmath.eye(size)]
-        source.append(exact(model.process_root[i]))
+        source.append(exact(triangular_root(model.disturbing)[i]))
     # All measured numbers and z_t, as linear functions of the same independent standard normal numbers.
     seen = mpmath.zeros((t + 1) * count, (t + 1) * (size + n + count))
     last = mpmath.zeros(size, seen.cols)

@@ -12,7 +12,6 @@ from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Spaces
-from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 
 
@@ -51,9 +50,9 @@ class BeliefFeedback(Controller):
         """The plan of the mean. Its policy has the gains on the mean; the covariance is that of the plan."""
         n, solution, policy = self.belief.size, self.solution, self.solution.policy
         known = np.vecdot(policy.gain[:, :, n:], policy.nominal[:, None, n:])
-        law = AffinePolicy(
-            gain=policy.gain[:, :, :n], offset=policy.offset + known, nominal=policy.nominal[:, :n], dt=policy.dt,
-            state_coordinates=self.belief.robot.state_coordinates, control_coordinates=policy.control_coordinates,
+        law = replace(
+            policy, gain=policy.gain[:, :, :n], offset=policy.offset + known, nominal=policy.nominal[:, :n],
+            state_coordinates=self.belief.robot.state_coordinates,
         )  # fmt: skip
         trajectory = replace(solution.trajectory, states=solution.trajectory.states[:, :n])
         return replace(

@@ -28,10 +28,7 @@ from lqrsim.robots.sensors import RobotSensors
 
 
 def evaluator(policy: AffinePolicy) -> Callable[[AffinePolicy, int, Array], Array]:
-    """A function that evaluates laws: (policy, row, states (K, n)) -> controls (K, m), with this policy's coordinates.
-
-    It works like `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
-    """
+    """A function that evaluates laws with these coordinates: (policy, row, states (K, n)) -> controls (K, m)."""
     states, controls = spaces_of(policy)
     limits, turning = Limits(*controls.limits), turning_of(states)
     laws = _laws(len(states), len(controls))
@@ -206,11 +203,6 @@ class OutputFeedback(_OfPolicy):
                 f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             )
 
-    @property
-    def measures(self) -> list[int]:
-        """The indices of the measured states."""
-        return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
-
     @cached_property
     def waits(self) -> int:
         """The number of periods before the first measurement arrives: nothing moves the estimate of the state."""
@@ -230,9 +222,11 @@ class OutputFeedback(_OfPolicy):
 
 class _OutputFeedbackRun(ControllerRun):
     def __init__(self, controller: OutputFeedback, trials: int) -> None:
-        self._policy, self._measures, self._waits = controller.policy, controller.measures, controller.waits
+        self._policy, self._waits = controller.policy, controller.waits
+        states = self._policy.state_coordinates.names
+        self._measures = [states.index(name) for name in self._policy.measured_coordinates.names]
         self._z = np.tile(self._policy.start(), (trials, 1))
-        self._previous = np.full((trials, len(self._policy.state_coordinates)), np.nan)
+        self._previous = np.full((trials, len(states)), np.nan)
         self._diverged: dict[int, str] = {}
 
     def estimator_diverged(self) -> Mapping[int, str]:

@@ -291,28 +291,20 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
         arrays["nominal"][t, :size] = nominal[knot]
         places = np.clip(t + delay - np.arange(latency + delay, 0, -1), 0, steps - 1)
         arrays["nominal"][t, size:] = plan.controls[places].ravel()
-        _write_step({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
+        transition, given, commands = arrays["transition"][t], arrays["input"][t], width - size
+        transition[:size, :size] = F[knot] if t >= latency else np.eye(size)  # z waits for the first measurement
+        if t >= latency:
+            arrays["drift"][t, :size] = f[knot]
+            acting = transition[:size, size : size + m] if commands else given[:size]  # the oldest command
+            acting[:] = G[knot]
+        if commands:  # all move up, and the new one is the last
+            transition[size:-m, size + m :] = np.eye(commands - m)
+            given[-m:] = np.eye(m)
     return OutputFeedbackPolicy(
         **arrays, dt=plan.dt, state_coordinates=law.plan.policy.state_coordinates,
         control_coordinates=law.plan.policy.control_coordinates,
         measured_coordinates=_measured_coordinates(law),
     )  # fmt: skip
-
-
-def _write_step(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, started: bool) -> None:
-    """Write one period's transition, input and drift. Without `started`, z waits for the first measurement."""
-    (F, G, f), m, under_way = step, now["input"].shape[1], len(now["drift"]) > size
-    now["transition"][:size, :size] = np.eye(size)
-    if started:
-        now["transition"][:size, :size], now["drift"][:size] = F, f
-        if under_way:  # the oldest command acts
-            now["transition"][:size, size : size + m] = G
-        else:
-            now["input"][:size] = G
-    if under_way:  # all commands move up, and the new one is the last
-        count = len(now["drift"]) - size - m
-        now["transition"][size : size + count, size + m :] = np.eye(count)
-        now["input"][-m:] = np.eye(m)
 
 
 def _measured_coordinates(law: FilterLaw) -> Coordinates:

@@ -33,7 +33,6 @@ from lqrsim.control.uncertainty import (
     Unknown,
     per_entry,
     shaping_filter,
-    triangular_root,
 )
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.kernels import estimation
@@ -280,7 +279,6 @@ class PlanModel:
 
     @cached_property
     def turning(self) -> AngularStates:
-        """Flags of the states that are angles."""
         return turning_of(self.dynamics.state_coordinates)
 
     @cached_property
@@ -425,11 +423,6 @@ class PlanModel:
         std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
         at_rest = np.zeros((self.lagging, self.lagging))
         return _diagonal([np.diag(std), at_rest, *(shaping.start for shaping in self._filters)])
-
-    @cached_property
-    def process_root(self) -> Array:
-        """Square root of the covariance of w, (T, Z, Z), lower triangular."""
-        return triangular_root(self.disturbing)
 
     @cached_property
     def disturbing(self) -> Array:

@@ -18,7 +18,7 @@ from scipy.special import betaincinv
 from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Controller, turn_to_nearest
 from lqrsim.control.plan_model import Lag, PlanModel
-from lqrsim.control.uncertainty import per_entry
+from lqrsim.control.uncertainty import per_entry, triangular_root
 from lqrsim.errors import Array
 from lqrsim.kernels.records import LoopMoments
 from lqrsim.results.goal import scale_of
@@ -116,7 +116,8 @@ class _Robots:
         self.z = start + self._normal(model.size) @ model.start_root.T
         # Noise on controls is added before the limits, so it does not count as noise on states.
         self._control_std = per_entry("Uncertainty: control", uncertainty.control, model.dynamics.control_coordinates)
-        self._process_roots = replace(model, uncertainty=replace(uncertainty, control=0.0)).process_root
+        process = replace(model, uncertainty=replace(uncertainty, control=0.0))
+        self._process_roots = triangular_root(process.disturbing)
         arrived = Lag.of(uncertainty.lag, plan.dt)
         predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
         self._command = np.zeros((trials, model.m))

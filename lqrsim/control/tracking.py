@@ -17,6 +17,7 @@ If collisions are what makes a law fail, laws with an emphasis on the deviations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -280,8 +281,8 @@ def track(
         missing = "a problem without noise" if problem.noise is None else "no tolerances"
         raise InputError(f"track: risk: got {risk:g} and {missing}, want noise=Noise(...) and tolerate=, or 0")
     plan, dynamics = solution.trajectory, problem.dynamics
-    if uncertainty is not None:
-        check_kind("track: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
+    kinds, wanted = (Uncertainty, type(None)), "an Uncertainty, such as uncertainty_of(...)"
+    check_kind("track: uncertainty", uncertainty, kinds, wanted)
     command_loss = 0.0 if uncertainty is None else uncertainty.command_loss
     model = PlanModel.of(dynamics, plan, Uncertainty(command_loss=command_loss))
     efforts = effort_of(effort, dynamics)
@@ -309,14 +310,8 @@ def _policy_of(solution: Solution, law: Laws) -> AffinePolicy:
     """The policy of a law about the solution's plan. The command in force has no effect on a command that arrives."""
     plan, (gain, offset), policy = solution.trajectory, law, solution.policy
     gain = gain[..., : plan.states.shape[1]]
-    return AffinePolicy(
-        gain=gain,
-        offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),
-        nominal=plan.states[:-1].copy(),
-        dt=plan.dt,
-        state_coordinates=policy.state_coordinates,
-        control_coordinates=policy.control_coordinates,
-    )
+    offset = plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1])
+    return replace(policy, gain=gain, offset=offset, nominal=plan.states[:-1].copy(), dt=plan.dt)
 
 
 def _law(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> Laws:

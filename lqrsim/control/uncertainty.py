@@ -211,7 +211,7 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
 
 
 class ShapingFilter(NamedTuple):
-    """An unknown as the output h x of x' = F x + w, with k states: 0 for white noise, else its order."""
+    """An unknown as the output h x of x' = F x + w, with as many states k as its order."""
 
     transition: Array  # F, (k, k)
     noise: Array  # a square root of the covariance of w, (k, k)
@@ -220,14 +220,12 @@ class ShapingFilter(NamedTuple):
 
 
 def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
-    """The shaping filter of an unknown for a control period of dt seconds.
+    """The shaping filter of an unknown that is not white, for a control period of dt seconds.
 
     The second-order filter has the states p and p', with p'' + 2 p' + p = 2 w in time constants. In the stationary
     state they have variance 1 and are uncorrelated.
     """
     std, drift = unknown.std, unknown.drift
-    if unknown.white:
-        return ShapingFilter(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
     step = dt / unknown.time_constant
     decay = np.exp(-step)
     if unknown.order == 1:

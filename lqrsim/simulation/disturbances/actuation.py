@@ -22,8 +22,7 @@ _FIXED = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 @checked
 @dataclass(frozen=True)
 class MotorLag(Disturbance):
-    """Actuators follow their commands, within the limits, with a first-order lag. They begin at the plan's first
-    control.
+    """Actuators follow their commands, within the limits, with a first-order lag, from the plan's first control on.
 
     The control that is applied in a control period is the exact mean over the period.
     """
@@ -71,6 +70,8 @@ class Saturation(Disturbance):
     share: Share | None = None
     strength: NonNegative = 1.0
 
+    _scales = "strength"
+
     def __post_init__(self) -> None:
         stated = [name for name in ("lowest", "highest") if getattr(self, name) is not None]
         if bool(stated) == (self.share is not None):
@@ -82,18 +83,14 @@ class Saturation(Disturbance):
     def describe(self, plant: Plant) -> str:
         space = plant.robot.dynamics.control_coordinates
         if self.share is not None:
-            limits = f"{100 * self.share:g} % of the robot's own"
+            limits = f"to {100 * self.share:g} % of the robot's own"
         else:
             sides = {"from": self.lowest, "to": self.highest}
             limits = " ".join(
                 f"{word} {with_units(self._fit(v, space), space)}" for word, v in sides.items() if v is not None
             )
-        return f"controls limited {'to ' if self.share is not None else ''}{limits}" + (
-            f", strength {self.strength:g}" if self.strength != 1 else ""
-        )
-
-    def scaled(self, strength: float) -> "Saturation":
-        return replace(self, strength=self._times(self.strength, strength))
+        strength = f", strength {self.strength:g}" if self.strength != 1 else ""
+        return f"controls limited {limits}{strength}"
 
     def limits(self, plant: Plant) -> tuple[Array, Array]:
         """The narrowed limits, which the robot's own limits must contain."""

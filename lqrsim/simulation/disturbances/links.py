@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ class Late(Disturbance):
     periods: Index
 
     what: ClassVar[str]
+    hook: ClassVar[Literal["measure", "actuate"]]  # the field of an `Effect`
     uncertainty_field: ClassVar[str]  # the field of an Uncertainty
 
     def describe(self, plant: Plant) -> str:
@@ -35,37 +36,28 @@ class Late(Disturbance):
         """The delay with `strength` times the periods, rounded to whole periods."""
         return replace(self, periods=int(self._times(self.periods, strength) + 0.5))
 
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        under_way: list[Array] = []
+
+        def carry(step: int, values: Array) -> Array:
+            under_way.append(values.copy())
+            if len(under_way) > self.periods:
+                return under_way.pop(0)
+            return under_way[0].copy() if self.hook == "measure" else np.tile(plan.controls[step], (len(values), 1))
+
+        return replace(Effect(), **{self.hook: carry})
+
 
 class ControlDelay(Late):
     """Commands arrive late, by control periods; until the first one arrives, the plan's controls are applied."""
 
-    what, uncertainty_field = "commands", "delay"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        under_way: list[Array] = []
-
-        def actuate(step: int, controls: Array) -> Array:
-            under_way.append(controls.copy())
-            if len(under_way) > self.periods:
-                return under_way.pop(0)
-            return np.tile(plan.controls[step], (len(controls), 1))
-
-        return Effect(actuate=actuate)
+    what, hook, uncertainty_field = "commands", "actuate", "delay"
 
 
 class MeasurementLatency(Late):
     """Measurements arrive late, by control periods; until then the first one is repeated."""
 
-    what, uncertainty_field = "measurements", "latency"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        seen: list[Array] = []
-
-        def measure(step: int, states: Array) -> Array:
-            seen.append(states.copy())
-            return seen.pop(0) if len(seen) > self.periods else seen[0].copy()
-
-        return Effect(measure=measure)
+    what, hook, uncertainty_field = "measurements", "measure", "latency"
 
 
 @checked
@@ -106,10 +98,7 @@ class GilbertElliott:
 
 @dataclass(frozen=True)
 class Dropouts(Disturbance):
-    """Base class of losses on a link, of each value with a probability, independently, or of `GilbertElliott`.
-
-    The last value that arrived is repeated; at first, the plan's first one.
-    """
+    """Base class of losses on a link."""
 
     loss: float | GilbertElliott
 
@@ -125,13 +114,8 @@ class Dropouts(Disturbance):
     def describe(self, plant: Plant) -> str:
         if not isinstance(self.loss, GilbertElliott):
             return f"{100 * self.loss:g} % of {self.what} lost"
-        length = 1 / self.loss.to_good
-        share = f"{100 * self.loss.lost:.3g} % of {self.what} lost"
-        return f"{share}, in bad spells of {length:.3g} control periods on average"
-
-    @property
-    def share(self) -> float:
-        return self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
+        lost, length = f"{100 * self.loss.lost:.3g} % of {self.what} lost", 1 / self.loss.to_good
+        return f"{lost}, in bad spells of {length:.3g} control periods on average"
 
     def scaled(self, strength: float) -> Self:
         """The link with `strength` times as many losses or bad spells; at most everything is lost."""
@@ -143,25 +127,24 @@ class Dropouts(Disturbance):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The fraction that is lost, as if losses were independent."""
-        return replace(Uncertainty(), **{self.uncertainty_field: self.share})
-
-    def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
-        if isinstance(self.loss, GilbertElliott):
-            return self.loss.draw(steps, generators)
-        return uniform(generators, steps, 1)[..., 0] < self.loss
+        lost = self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
+        return replace(Uncertainty(), **{self.uncertainty_field: lost})
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         steps, first = plan.steps, plan.controls[0]
         if self.hook == "measure":
             steps, first = steps + 1, plan.states[0]
-        lost, last = self.draw(steps, generators), np.tile(first, (len(generators), 1))
+        if isinstance(self.loss, GilbertElliott):
+            lost = self.loss.draw(steps, generators)
+        else:
+            lost = uniform(generators, steps, 1)[..., 0] < self.loss
+        last = np.tile(first, (len(generators), 1))
 
         def receive(step: int, values: Array) -> Array:
             last[~lost[:, step]] = values[~lost[:, step]]
             return last.copy()
 
-        hooks: dict[str, Any] = {self.hook: receive}
-        return Effect(**hooks)
+        return replace(Effect(), **{self.hook: receive})
 
 
 class MeasurementDropouts(Dropouts):

@@ -114,10 +114,8 @@ class Mismatch(Disturbance):
                 wanted.append(Unknown(GAIN + controls[actuator], float(std)))
             elif std > 0:
                 lost.append(part)
-        known = self._unknowns(plant, wanted)
-        if not lost:
-            return known
-        return replace(known, left_out=self._left_out(plant, f"no control drives {', '.join(lost)} alone").left_out)
+        left_out = self._left_out(plant, f"no control drives {', '.join(lost)} alone", acts=bool(lost))
+        return replace(left_out, unknowns=self._unknowns(plant, wanted).unknowns)
 
 
 class MassMismatch(Mismatch):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -17,11 +17,7 @@ from lqrsim.simulation.plant import Plant
 
 
 class AddedError(GaussianDisturbance):
-    """Base class of Gaussian errors on states or controls: drawn anew at each step, or once for a whole run.
-
-    Args:
-      std: of each, in its unit: one number, one per entry, or by name or unit, such as {"m": 0.01, "rad": 0.02}.
-    """
+    """Base class of Gaussian errors on states or controls: drawn anew at each step, or once for a whole run."""
 
     what: ClassVar[str]
     hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # the field of an `Effect`
@@ -45,8 +41,7 @@ class AddedError(GaussianDisturbance):
         errors = std * normal(generators, steps, len(std))
         if self.hook == "initial_states":
             return Effect(initial_states=lambda states: _moved(plant, states, errors[:, 0]))
-        hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.constant else step]}
-        return Effect(**hooks)
+        return replace(Effect(), **{self.hook: lambda step, values: values + errors[:, 0 if self.constant else step]})
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         std = self._deviations(plant)
@@ -114,8 +109,7 @@ class WrenchNoise(GaussianDisturbance):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         vectors = self._fit(self.std, self.along) * normal(generators, plan.steps, 3)
-        hooks: dict[str, Any] = {self.kind: lambda step, states: vectors[:, step]}
-        return Effect(**hooks)
+        return replace(Effect(), **{self.kind: lambda step, states: vectors[:, step]})
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         axes = zip(self.along, self._fit(self.std, self.along).tolist(), strict=True)
