@@ -313,10 +313,8 @@ class _Inlet:
         self._topics, self._lacking = topics, {name for name, i in self._wanted.items() if states.names[i] in needed}
         known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
         if self._lacking - known:
-            raise InputError(
-                f"odometry: got no {', '.join(sorted(self._lacking - known))} in its messages, want a topic in joints="
-                " that has them, or other names="
-            )
+            lacking, wanted = ", ".join(sorted(self._lacking - known)), "a topic in joints= that has them"
+            raise InputError(f"odometry: got no {lacking} in its messages, want {wanted}, or other names=")
         self._readers = {kind: node.reader(topic, kind, reliable=reliable) for kind, topic in topics.items()}
         self._arrived, self._known = dict.fromkeys(topics, -math.inf), {kind: set[str]() for kind in topics}
         self.state, self.refused = np.zeros(len(states)), (0, "")
@@ -409,8 +407,7 @@ class _Node:
         self.second = self._ros.duration(seconds=1)
 
     def reader(self, topic: str, kind: str, *, reliable: bool = True) -> "_Reader":
-        quality = self._quality(reliable, kind)
-        return _Reader(self._ros, self._participant, self._topic(topic, kind), quality)
+        return _Reader(self._ros, self._participant, self._topic(topic, kind), self._quality(reliable, kind))
 
     def writer(self, topic: str, kind: str) -> Any:
         return self._ros.DataWriter(self._participant, self._topic(topic, kind), qos=self._quality(True, kind))

@@ -350,7 +350,7 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     *[(lambda factor=factor: of.MassMismatch(factor=factor).scaled(1e6), r"^MassMismatch: strength: got 1e\+06, want")
       for factor in (0.5, 1.5)],
     (lambda: roll(of.ThrustMismatch(0.01)),
-     "^ThrustMismatch: got robot differential_drive, whose actuators are servos"),
+     "^ThrustMismatch: got robot differential_drive with servos"),
     *[(lambda kind=kind, numbers=numbers: roll(getattr(of, kind)(*numbers)),
        f"^{kind}: got robot differential_drive, which wind cannot push without drag")
       for kind, numbers in (("MeanWind", [(1.0, 0.0, 0.0)]), ("Gusts", []), ("Dryden", []))],

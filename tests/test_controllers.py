@@ -74,7 +74,7 @@ def test_a_function_that_fails_ends_its_trials(plant: ls.Plant, drive_solution: 
 
     run = ls.simulate(plant, drive_solution, controller=failing, frames=False)
     assert run.outcome == ("error",)
-    assert run.reasons[0].startswith("controller at 1.167 s: InputError: got controls of shape (1,), want (2,)")
+    assert run.reasons[0].startswith("controller at 1.167 s: InputError: commands: got shape (1,), want (2,)")
 
 
 # Plans: given, or the controller's own.
@@ -114,7 +114,7 @@ def test_a_re_plan_is_run_as_a_solution_is(
 def test_what_is_refused(plant: ls.Plant, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
     unchecked: Any = ls.simulate
     law = ls.Replanner(differential_drive.problem, drive_solution, every=5.0)
-    no_plan = "plan: got none, want the plan that the run follows, such as smooth(problem)"
+    no_plan = "plan: got none, want one, such as smooth(problem)"
     for controller in (None, drive_solution.policy, lambda state, t: [0.1, 0.1]):
         assert refusal(lambda c=controller: unchecked(plant, controller=c)).startswith(no_plan)
     assert refusal(lambda: unchecked(plant, law)).startswith("plan: got")
@@ -151,7 +151,7 @@ def test_a_policy_with_a_filter_is_run_on_what_it_measures(
         differential_drive.problem, drive_solution, STATED, tolerate=TOLERATE, sensors=np.array([[1.0, 1.0, 0.0]])
     ).policy
     line = refusal(lambda: ls.simulate(plant, drive_solution, controller=ranging))
-    assert line.startswith("controller: got an OutputFeedbackPolicy that measures")
+    assert line.startswith("controller: got an OutputFeedbackPolicy of ")
 
 
 # Runs side by side.

@@ -215,7 +215,7 @@ def test_strengths_in_between():
         def start(self, plant, plan, generators):
             return disturbances.Effect()
 
-    with pytest.raises(InputError, match=r"^Silent: got strength 2, want a disturbance that overrides `scaled`$"):
+    with pytest.raises(InputError, match=r"^Silent: got strength 2, want one that overrides `scaled`$"):
         Silent().scaled(2)
 
 

@@ -890,9 +890,9 @@ def one_nan(shown: np.ndarray, command: np.ndarray) -> np.ndarray:
     ("how", "failed", "why"),
     [
         (raising, 3, "ZeroDivisionError: two lines"),
-        (lambda shown, command: command[:, :3], 3, "InputError: got controls of shape (3, 3), want (3, 4)"),
-        (lambda shown, command: None, 3, "InputError: got"),
-        (lambda shown, command: "none", 3, "InputError: got 'none', want controls of shape (3, 4)"),
+        (lambda shown, command: command[:, :3], 3, "InputError: commands: got shape (3, 3), want (3, 4)"),
+        (lambda shown, command: None, 3, "InputError: commands: got"),
+        (lambda shown, command: "none", 3, "InputError: commands: got 'none', want numbers of shape (3, 4)"),
         (one_nan, 1, "got nan for rotor_3, want a finite number"),
     ],
 )

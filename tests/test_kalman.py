@@ -237,7 +237,7 @@ def test_an_unknown_is_refused_if_it_moves_what_no_sensor_sees(lag: float) -> No
         options: dict[str, Any] = {"tolerate": 0.5, "effort": 2.0, "sensors": (f"s{read}",)}
         seen = second if read else first or second * coupled
         if (first or second) and not seen:
-            with pytest.raises(ls.InputError, match="unknowns: got d0, which no measurement sees"):
+            with pytest.raises(ls.InputError, match="unknowns: got d0, want one that a measurement sees"):
                 ls.OffsetFree(system.problem, system.solution, uncertainty, **options)
         else:
             ls.OffsetFree(system.problem, system.solution, uncertainty, **options)

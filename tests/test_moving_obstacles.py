@@ -143,7 +143,7 @@ class TestReplanner:
 
     def test_chances_of_collision_are_for_what_stands_still(self) -> None:
         stated = problem(ACROSS, weight=1.0)
-        with pytest.raises(ls.InputError, match="got obstacles that move, want none"):
+        with pytest.raises(ls.InputError, match="got obstacles that move, want ones that stand still"):
             ls.smooth_chance_constrained(stated, ls.disturbances.Uncertainty(start=0.01), chance=0.01)
 
 

@@ -298,7 +298,7 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ({"sensors": np.ones((2, 3))}, "sensors: got shape (2, 3), want (any, 12)"),
         ({"sensors": np.ones((0, 12))}, "sensors: got no rows"),
         ({"sensors": lambda x, u, p: []}, "which returns nothing, want at least one number that is measured"),
-        ({"replan_always": True}, "replan_always: got True without replan_every, want seconds between two solves"),
+        ({"replan_always": True}, "replan_always: got True without replan_every, want seconds for that"),
         ({"sensors": np.full((1, 12), np.nan)}, "sensors: got nan at index"),
         ({"sensors": lambda x: x}, "want a function of (x, u, p)"),
         ({"sensors": lambda x, u, p: [x[0] * u[0]]}, "u"),
@@ -316,11 +316,11 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ),
         (
             {"uncertainty": Uncertainty(unknowns=[Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
-            "OffsetFree: unknowns: got force_x, which no measurement sees (rx, ry, rz), want sensors",
+            "OffsetFree: unknowns: got force_x, want one that a measurement sees: rx, ry, rz",
         ),
         (
             {"uncertainty": Uncertainty(unknowns=[Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
-            "OffsetFree: unknowns: got wind_x and wind_y, which no measurement sees (z), want sensors",
+            "OffsetFree: unknowns: got wind_x and wind_y, want one that a measurement sees: z",
         ),
     ],
 )  # fmt: skip

@@ -110,7 +110,7 @@ def test_samples_keep_to_the_bounds_of_a_problem(low: float, high: float, most: 
     ("options", "message"),
     [
         ({"problem": swung(constraints=[ls.StateBounds(speed=(1.0, 2.0))])},
-         "around: got 0 for speed, want one within the problem's bounds, 1 to 2"),
+         "around: got 0 for speed, want one within its bounds, 1 to 2"),
         ({"problem": swung(), "around": (0.0, np.inf)}, "around: got inf"),
         ({"problem": ls.scenarios.differential_drive().problem}, "problem: got a problem with the states"),
         ({"problem": 3}, "problem: got 3, want a Problem of the robot"),

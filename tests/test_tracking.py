@@ -372,7 +372,7 @@ def test_drakes_finite_horizon_regulator_has_the_same_gains() -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"effort": 1.0}, "track: tolerate: got none, want how far"),
+        ({"effort": 1.0}, "track: tolerate: got none, want deviations"),
         ({"tolerate": {"feet": 1.0}, "effort": 1.0}, "tolerate: got 'feet', want one of: s0, s1, m"),
         ({"tolerate": {"s0": 1.0}, "effort": 1.0}, "tolerate: got none for s1, want one for each of s0, s1, by name"),
         ({"tolerate": 1.0, "effort": {}}, "effort: got none for u0, want one for each of u0, by name or unit"),

@@ -15,12 +15,12 @@ from typing import Annotated
 import numpy as np
 from scipy.special import ndtri
 
-from lqrsim.annotations import Chance, Count, Positive, TextProgress, Want, checked
+from lqrsim.annotations import Chance, Count, Finite, Positive, TextProgress, Want, checked
 from lqrsim.control.collision_chance import LARGEST_MARGIN, Spread, Surroundings, chance_of_clearances
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import InputError, check_array, check_items, keep
+from lqrsim.errors import InputError
 from lqrsim.problem.costs import weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
@@ -60,13 +60,9 @@ class SafePlan:
     controller: OffsetFree | AffinePolicy
     tube: Tube
     asked: Chance
-    rounds: tuple[tuple[float, float, float, float], ...]
+    rounds: tuple[tuple[Finite, Finite, Finite, Finite], ...]
     weight: Positive = 1.0
     instead: Annotated[Mapping[str, float], Want("a dictionary of chances")] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
-        keep(self, rounds=tuple(tuple(check_array("SafePlan: rounds", numbers, (4,)).tolist()) for numbers in rounds))
 
     @property
     def success(self) -> bool:
@@ -214,8 +210,7 @@ class _Search:
             margin = deviations * self._spread(base).std
             if second:
                 margin = np.full_like(margin, np.sqrt((margin**2).mean()))
-            clearances = self.surroundings.keep_away(margin)
-            problem = replace(problem, constraints=(*problem.constraints, *clearances))
+            problem = replace(problem, constraints=(*problem.constraints, *self.surroundings.keep_away(margin)))
             # The first plan may cut through obstacles: a solve from it would choose the route by chance.
             start = None if second else base.solution.trajectory
         solution = smooth(problem, start=start)

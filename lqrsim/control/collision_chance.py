@@ -43,9 +43,7 @@ class Surroundings:
         """The obstacles of the problem's costs and constraints, each world once."""
         terms, place = each_once(problem.kept_clear), problem.dynamics.state_coordinates.position
         if any(term.moving for term in terms):
-            raise InputError(
-                "problem: got obstacles that move, want none: chances of collision are for obstacles that stand still"
-            )
+            raise InputError("problem: got obstacles that move, want ones that stand still for a chance of collision")
         pairs = [(term, shape) for term in terms if len((shape := term.in_world(problem.dynamics)).world)]
         shapes = tuple(shape for _, shape in pairs)
         states = [shape.depends_on for shape in shapes]
@@ -110,9 +108,6 @@ class Surroundings:
         p z^2 / (2 s^2), with z = c / s and the chance p that a collision begins there. To first order, a law lowers the
         chance most if these derivatives are its weights of deviations along the normals of the obstacles. They belong
         to one law, and weights change the law, but their ratios change little.
-
-        Args:
-          states, covariance, across: as for `collision_chance`, without further axes.
         """
         emphasis = np.zeros_like(covariance)
         if not self.kept:

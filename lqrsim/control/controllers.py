@@ -15,7 +15,7 @@ import numpy.typing as npt
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_function, check_kind
+from lqrsim.errors import Array, InputError, check_function, check_kind, shaped
 from lqrsim.kernels import policy_evaluation
 from lqrsim.kernels.records import AngularStates, Limits, Policy
 from lqrsim.problem.belief import Belief
@@ -136,10 +136,7 @@ def as_controller(controller: ControllerLike | None, plan: Plan | None, dynamics
     if isinstance(controller, Controller) and (plan is None or of_belief):
         plan = check_kind(f"{type(controller).__name__}.plan", controller.plan, (Plan, type(None)), "a Plan or None")
     if plan is None:
-        raise InputError(
-            "plan: got none, want the plan that the run follows, such as smooth(problem); only"
-            " controllers with a plan of their own, such as an OffsetFree, run without"
-        )
+        raise InputError("plan: got none, want one, such as smooth(problem), or a controller with a plan of its own")
     match controller:
         case None:
             return Feedback(plan.policy), plan
@@ -198,36 +195,24 @@ class OutputFeedback(_OfPolicy):
     def __post_init__(self) -> None:
         states, names = self.policy.state_coordinates.names, self.policy.measured_coordinates.names
         if not set(names) <= set(states):
-            raise InputError(
-                f"controller: got an OutputFeedbackPolicy that measures {', '.join(names)}, want one that measures"
-                f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
-            )
-
-    @cached_property
-    def waits(self) -> int:
-        """The number of periods before the first measurement arrives: nothing moves the estimate of the state."""
-        policy, n = self.policy, len(self.policy.state_coordinates)
-        stays = (policy.transition[:, :n] == np.eye(n, policy.transition.shape[2])).all(axis=(1, 2))
-        moved = [
-            policy.correction.any(axis=(1, 2)),
-            policy.input[:, :n].any(axis=(1, 2)),
-            policy.drift[:, :n].any(axis=1),
-        ]
-        waiting = stays & ~np.any(moved, axis=0)
-        return policy.steps if waiting.all() else int(waiting.argmin())
+            wanted = f"states, some of {', '.join(states)}; or the OffsetFree that it was made from"
+            raise InputError(f"controller: got an OutputFeedbackPolicy of {', '.join(names)}, want one of {wanted}")
 
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self, trials)
+        return _OutputFeedbackRun(self.policy, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, controller: OutputFeedback, trials: int) -> None:
-        self._policy, self._waits = controller.policy, controller.waits
-        states = self._policy.state_coordinates.names
-        self._measures = [states.index(name) for name in self._policy.measured_coordinates.names]
-        self._z = np.tile(self._policy.start(), (trials, 1))
-        self._previous = np.full((trials, len(states)), np.nan)
+    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
+        self._policy, states, n = policy, policy.state_coordinates.names, len(policy.state_coordinates)
+        self._measures = [states.index(name) for name in policy.measured_coordinates.names]
+        self._z, self._previous = np.tile(policy.start(), (trials, 1)), np.full((trials, n), np.nan)
         self._diverged: dict[int, str] = {}
+        # Nothing moves the estimate of the state in the periods before the first measurement arrives.
+        moved = policy.correction.any(axis=(1, 2)) | policy.input[:, :n].any(axis=(1, 2))
+        moved |= policy.drift[:, :n].any(axis=1)
+        moved |= (policy.transition[:, :n] != np.eye(n, policy.transition.shape[2])).any(axis=(1, 2))
+        self._waits = int(moved.argmax()) if moved.any() else policy.steps
 
     def estimator_diverged(self) -> Mapping[int, str]:
         return self._diverged
@@ -259,10 +244,7 @@ class FunctionController(Controller, ControllerRun):
 
     def control(self, step: int, measured: Array) -> Array:
         t, controls = step * self.dt, self._coordinates[1]
-        commands = [np.asarray(self.function(state.copy(), t), dtype=np.float64) for state in measured]
-        for command in commands:
-            if command.shape != (len(controls),):
-                raise InputError(f"got controls of shape {command.shape}, want {(len(controls),)}")
+        commands = [shaped("commands", self.function(state.copy(), t), (len(controls),)) for state in measured]
         return controls.clip(np.array(commands))
 
     @property

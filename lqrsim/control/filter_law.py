@@ -162,7 +162,6 @@ class ReplannedRun(ControllerRun):
 
     Attributes:
       plans: the new plans of each trial, by the step at which they begin.
-      estimates, innovations: as in `FilterRun`.
     """
 
     def __init__(self, rule: ReplanRule, law: FilterLaw, trials: int, record: bool, *, always: bool) -> None:

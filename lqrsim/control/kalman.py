@@ -91,7 +91,4 @@ def check_observable(model: PlanModel) -> None:
     for unknown, group in zip(model.remembered, groups, strict=True):
         if (unknown.std or unknown.drift) and moved[group].max() > 0 and not seen[group].max() > 0:
             measured = ", ".join(model.sensor.names)
-            raise InputError(
-                f"OffsetFree: unknowns: got {unknown.name}, which no measurement sees ({measured}),"
-                " want sensors that see its effect"
-            )
+            raise InputError(f"OffsetFree: unknowns: got {unknown.name}, want one that a measurement sees: {measured}")

@@ -21,14 +21,7 @@ from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.sampled_loop import DeviationNorm
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
-from lqrsim.control.tracking import (
-    Predictions,
-    choose_tolerances,
-    narrowest,
-    predictions,
-    tolerances_to_try,
-    with_filter,
-)
+from lqrsim.control.tracking import Predictions, choose_tolerances, narrowest, tolerances_to_try, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import Uncertainty, check_seconds
 from lqrsim.errors import Array, InputError, check_kind
@@ -116,9 +109,7 @@ class OffsetFree(Controller):
     ) -> None:
         check_plan("OffsetFree", problem, solution)
         if replan_always and replan_every is None:
-            raise InputError(
-                "OffsetFree: replan_always: got True without replan_every, want seconds between two solves"
-            )
+            raise InputError("OffsetFree: replan_always: got True without replan_every, want seconds for that")
         plan = solution.trajectory
         memory = min(plan.horizon, MEMORY) if memory is None else memory
         memory = check_seconds("OffsetFree: memory", memory, above=0.0)
@@ -161,10 +152,7 @@ class OffsetFree(Controller):
         for name in ("measurement", "latency", "loss"):
             value = getattr(self.uncertainty, name)
             if np.any(list(value.values()) if isinstance(value, Mapping) else value):
-                raise InputError(
-                    f"OffsetFree: uncertainty: got a {name} of {value} with sensors of the MJCF, want none: each sensor"
-                    " has its own"
-                )
+                raise InputError(f"OffsetFree: uncertainty: got {name} {value} with sensors of the MJCF, want none")
         if replan_every is not None:
             raise InputError(f"OffsetFree: replan_every: got {replan_every:g} with sensors of the MJCF, want None")
         return SensorFilter(self.model, sensors)
@@ -287,7 +275,7 @@ def robust_to_lag(
             lost = np.asarray(~np.isfinite(moments.covariance).all(axis=(-3, -2, -1)))
         for moment in moments:
             moment[lost] = 0.0
-        finite = predictions(solution, surroundings, norm, moments)
+        finite = Predictions.of(solution, surroundings, norm, moments)
         return Predictions(*(np.where(lost, worst, value) for worst, value in zip(UNSTABLE, finite, strict=True)))
 
     outcomes = predicted(design)

@@ -25,15 +25,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import check_signature, name_of
 from lqrsim.control.controllers import turning_of
-from lqrsim.control.uncertainty import (
-    GAIN,
-    OFFSET,
-    ShapingFilter,
-    Uncertainty,
-    Unknown,
-    per_entry,
-    shaping_filter,
-)
+from lqrsim.control.uncertainty import GAIN, OFFSET, ShapingFilter, Uncertainty, Unknown, per_entry, shaping_filter
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.kernels import estimation
 from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
@@ -153,7 +145,6 @@ class PlanModel:
     def of(
         cls, dynamics: Dynamics, plan: Trajectory, uncertainty: Uncertainty, sensor: Sensor | None = None
     ) -> "PlanModel":
-        """Raises InputError if the uncertainty does not fit the dynamics."""
         uncertainty.check(dynamics)
         return cls(dynamics.disturbed, plan, uncertainty, sensor or sensor_of(None, dynamics.state_coordinates))
 
@@ -321,17 +312,14 @@ class PlanModel:
 
     @property
     def F(self) -> Array:
-        """State matrices F_t, (T, Z, Z)."""
         return self._mean_step.F
 
     @property
     def G(self) -> Array:
-        """Input matrices G_t, (T, Z, m)."""
         return self._mean_step.G
 
     @property
     def c(self) -> Array:
-        """Drift c_t, (T, Z)."""
         return self._mean_step.c
 
     @cached_property
@@ -397,7 +385,6 @@ class PlanModel:
         """The model that a filter assumes of this one, with a memory in s: see `Uncertainty.steady`. Nothing is exact.
 
         Args:
-          effort: tolerated effort of the controls, (m,).
           bypass: noise on the controls that bypasses the actuators, relative to the effort times `Lag.mean`; see
             `robust_to_lag`.
         """

@@ -22,7 +22,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.prepared import prepare
 
 Changes = Annotated[Callable[[float, Problem], Problem], Want("a function of the time and the problem")]
-MOST_PERIODS = 1e12  # that a number of control periods is rounded to; more are as many
+LONGEST = 1e12  # control periods; more count as that many
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,24 +88,23 @@ class ReplanLog:
 
     def enter(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
         """Whether the new plan of a solve is used; `late` if it came after the deadline. Counts the solve."""
-        reason = "" if replan.success else replan.status.name
-        if late:
+        status, used = replan.status.name, False
+        if not np.isfinite(replan.cost):
+            reason = "the previous law diverges by the model"
+        elif late:
             reason = "not ready in time"
         elif not replan.improved and not replan.success:
-            reason = f"{replan.status.name}, without a better plan"
-        finite = bool(np.isfinite(replan.cost))
-        used = finite and not late and (replan.success or replan.improved)
-        if not finite:
-            reason = "the previous law diverges by the model"
+            reason = f"{status}, without a better plan"
+        else:
+            used, reason = True, "" if replan.success else status
         self.solved += used
         if not used:
             self.kept[reason] += 1
-        self.records.append(
-            ReplanRecord(
-                step=step, trial=trial, status=replan.status.name, iterations=replan.iterations, seconds=replan.seconds,
-                cost=replan.cost, before=replan.before, used=used, reason=reason,
-            )
+        record = ReplanRecord(
+            step=step, trial=trial, status=status, iterations=replan.iterations, seconds=replan.seconds,
+            cost=replan.cost, before=replan.before, used=used, reason=reason,
         )  # fmt: skip
+        self.records.append(record)
         return used
 
     def summary(self, *, times: bool = False) -> str:
@@ -124,15 +123,10 @@ class ReplanLog:
         return line
 
 
-# Fields of the problem that the plan in force depends on, with the part of each that must not change.
-_FIXED: dict[str, Callable[[Problem], object]] = {
-    "dt": lambda problem: problem.dt,
-    "steps": lambda problem: problem.steps,
-    "duration": lambda problem: problem.duration,
-    "dynamics": lambda problem: ", ".join(
-        (*problem.dynamics.state_coordinates.names, *problem.dynamics.control_coordinates.names)
-    ),
-}
+def _fixed(problem: Problem) -> dict[str, object]:
+    """The parts of a problem that must not change while a plan is in force, by field."""
+    names = *problem.dynamics.state_coordinates.names, *problem.dynamics.control_coordinates.names
+    return {"dt": problem.dt, "steps": problem.steps, "duration": problem.duration, "dynamics": ", ".join(names)}
 
 
 class ReplanRule:
@@ -146,20 +140,10 @@ class ReplanRule:
     """
 
     def __init__(
-        self,
-        who: str,
-        problem: Problem,
-        solution: Plan,
-        every: float,
-        deadline: float,
-        *,
-        name: str = "every",
-        horizon: str = "shrinking",
-        predict: bool = True,
-        when: Funnel | None = None,
-        share: float = 1.0,
+        self, who: str, problem: Problem, solution: Plan, every: float, deadline: float, *, name: str = "every",
+        horizon: str = "shrinking", predict: bool = True, when: Funnel | None = None, share: float = 1.0,
         changes: Changes | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         plan, want = solution.trajectory, spaces_of(problem.dynamics)
         check_same_system(f"{who}: solution", "a plan", spaces_of(solution.policy), want, "the problem")
         if (plan.steps, plan.dt) != (problem.steps, problem.dt):
@@ -168,9 +152,9 @@ class ReplanRule:
         self.every = check_number(f"{who}: {name}", every, above=0.0)
         if self.every < 0.999 * problem.dt:
             raise InputError(f"{who}: {name}: got {self.every:g} s, want at least a control period, {problem.dt:g} s")
-        self.periods = round(min(self.every / problem.dt, MOST_PERIODS))
+        self.periods = round(min(self.every / problem.dt, LONGEST))
         self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
-        self.delay = math.ceil(min(self.deadline / problem.dt, 2 * MOST_PERIODS) - 1e-9)
+        self.delay = math.ceil(min(self.deadline / problem.dt, 2 * LONGEST) - 1e-9)
         if self.delay > self.periods:
             raise InputError(
                 f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"
@@ -197,9 +181,9 @@ class ReplanRule:
     def checked(self, who: str, problem: Problem) -> Problem:
         """The problem. Raises InputError if it cannot replace the rule's own problem while a plan is in force."""
         check_kind(who, problem, Problem, "a Problem")
-        for field, value_of in _FIXED.items():
-            got, want = value_of(problem), value_of(self.problem)
-            if got != want:
+        wanted = _fixed(self.problem)
+        for field, got in _fixed(problem).items():
+            if got != (want := wanted[field]):
                 raise InputError(f"{who}: {field}: got {got}, want {want}: it cannot change while a re-planner runs")
         return self.solver.check(problem)
 
@@ -230,8 +214,7 @@ class ReplanRule:
     ) -> SolveRequest:  # fmt: skip
         """The solve for a period, of a state (n,) measured `late` s after it began; `sent` (m,) is the last command."""
         plan, first = active.plan, step + self.delay
-        row = active.row(step)
-        here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
+        here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[active.row(step)])
         if self.delay and (self.predict or problem.control_rate is not None):
             predicted, command = self._predicted(active, step, here, problem, late)
             here, sent = predicted if self.predict else here, sent if command is None else command

@@ -13,15 +13,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Bounds, Index, Want, checked
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
-from lqrsim.control.replan_rule import (
-    MOST_PERIODS,
-    ActivePlan,
-    Changes,
-    ReplanLog,
-    ReplanRule,
-    SolveRequest,
-    within_rates,
-)
+from lqrsim.control.replan_rule import LONGEST, ActivePlan, Changes, ReplanLog, ReplanRule, SolveRequest, within_rates
 from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
@@ -32,6 +24,7 @@ from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.solution_parts import Horizon
 from lqrsim.solvers.parallel import workers
 
+Clock = Annotated[Callable[[], float], Want("a function that returns seconds")]
 SPARE = 0.5e-3  # s, time between the end of a solve and its deadline, for handing over the answer
 
 
@@ -63,18 +56,9 @@ class LiveReplanner:
     _prefix = "Replanner.live: "
 
     @checked
-    def __init__(
-        self,
-        rule: ReplanRule,
-        *,
-        interpolate: bool,
-        clock: Annotated[Callable[[], float], Want("a function that returns seconds")],
-    ) -> None:
+    def __init__(self, rule: ReplanRule, *, interpolate: bool, clock: Clock) -> None:
         if not rule.delay:
-            raise InputError(
-                "Replanner.live: deadline: got 0 s, want more: a solve takes time, during which the previous law"
-                " continues"
-            )
+            raise InputError("Replanner.live: deadline: got 0 s, want more: a solve takes time")
         self._rule, self._clock, self._interpolate = rule, clock, interpolate
         self.problem, self.active, self.log = rule.problem, ActivePlan(rule.solution, 0), ReplanLog()
         self._asked = -1  # the step at which a solve was last due
@@ -116,13 +100,11 @@ class LiveReplanner:
     def step(self, state: npt.ArrayLike, t: float) -> Array:
         """The control (m,) to apply in a measured state (n,), `t` seconds after the start."""
         if self._thread is None or not self._thread.is_alive():
-            raise InputError(
-                "LiveReplanner: got a step without its thread, want it within `with replanner.live() as live:`"
-            )
+            raise InputError("LiveReplanner: got a step without its thread, want `with replanner.live() as live:`")
         t = check_number("t", t, at_least=0.0)
         state = check_array("state", state, (len(self.active.plan.policy.state_coordinates),))
         dt = self.problem.dt
-        step = int(min(t / dt, MOST_PERIODS) + 1e-9)
+        step = int(min(t / dt, LONGEST) + 1e-9)
         self._adopt_answer(step)
         if self._solve is None and self._rule.due(step, self._asked):
             self._ask(state, t, step)

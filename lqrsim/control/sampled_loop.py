@@ -70,11 +70,7 @@ def sample_loop(
     model: PlanModel, controller: Controller, limits: tuple[Array, Array], surroundings: Surroundings,
     norm: DeviationNorm, trials: int, seed: int,
 ) -> SampledLoop:  # fmt: skip
-    """Run K trials of a controller about its plan.
-
-    Args:
-      model: the true system. limits: of the controls, (m,) each. surroundings: the obstacles.
-    """
+    """Run K trials of a controller about its plan, in the true system `model`."""
     plan, n = model.plan, model.n
     robots, run = _Robots(model, limits, trials, np.random.default_rng(seed)), controller.start(trials)
     displaced = surroundings.displacements(robots.rng, trials)

@@ -242,10 +242,7 @@ class SensorRun(FilterRun):
         """Run the filter again, with the readings (K, Y) that arrive at a step."""
         shape, sensors = (self._trials, len(self._filter.sensors.names)), self._filter.sensors
         if measured.shape != shape:
-            raise InputError(
-                f"OffsetFree: got measurements of shape {measured.shape}, want readings {shape} of {sensors}, which"
-                " `simulate` has"
-            )
+            raise InputError(f"OffsetFree: got measurements of shape {measured.shape}, want {shape} of {sensors}")
         self._acting[step] = np.tile(self.model.plan.controls[0], (self._trials, 1))  # before the first period
         if step:
             self._acting[step] = self._commands.pop(0)

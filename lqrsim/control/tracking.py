@@ -70,6 +70,18 @@ class Predictions(NamedTuple):
     width: Array
     saturation: Array
 
+    @classmethod
+    def of(
+        cls, solution: Solution, surroundings: Surroundings, norm: DeviationNorm, moments: LoopMoments
+    ) -> "Predictions":
+        """The predictions for laws with these moments of the states, (..., T+1, n) and so on."""
+        mean, covariance = moments.mean, moments.covariance
+        collide = collision_chance(solution.trajectory.states + mean, covariance, moments.across, surroundings)[1]
+        squares = _squares(norm, covariance) + norm(mean) ** 2
+        width = np.sqrt(squares.mean(axis=-1))
+        miss = _chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
+        return cls(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
+
     def scores(self, least: float) -> Array:
         """What a choice of laws minimises: the chance of failure, plus terms for saturation and for wide tubes.
 
@@ -87,7 +99,6 @@ def choose_tolerances(
 
     Args:
       call: name of the user's call, for warnings.
-      at_end: as in `track`.
       moments: predicts the states' moments under C laws.
       truth: model with the unknowns, for trials of laws that act on the measured state itself.
     """
@@ -97,7 +108,7 @@ def choose_tolerances(
     limits = solution.policy.control_coordinates.limits
     laws = tracking_laws(model, tried)
     loop_moments = moments(laws)
-    predicted = predictions(solution, surroundings, norm, loop_moments)
+    predicted = Predictions.of(solution, surroundings, norm, loop_moments)
     least = narrowest(model, predicted.width)
     scores = predicted.scores(least)
 
@@ -134,7 +145,7 @@ def choose_tolerances(
     stressing = chosen[0].stressing(emphasis, EMPHASIS)
     laws = tracking_laws(model, stressing)
     loop_moments = moments(laws)
-    stressed = predictions(solution, surroundings, norm, loop_moments).scores(least)
+    stressed = Predictions.of(solution, surroundings, norm, loop_moments).scores(least)
     i = int(np.argmin(stressed))
     better = stressed[i] < scores[best] and lost(loop_moments, laws, i) <= runs[best]
     return (stressing.pick(i), laws.pick(i)) if better else chosen
@@ -155,18 +166,6 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     return Weights(
         np.array([choice.state for choice in choices]), choices[0].control, np.array([choice.end for choice in choices])
     )
-
-
-def predictions(
-    solution: Solution, surroundings: Surroundings, norm: DeviationNorm, moments: LoopMoments
-) -> Predictions:
-    """The predictions for laws with these moments of the states, (..., T+1, n) and so on."""
-    mean, covariance = moments.mean, moments.covariance
-    collide = collision_chance(solution.trajectory.states + mean, covariance, moments.across, surroundings)[1]
-    squares = _squares(norm, covariance) + norm(mean) ** 2
-    width = np.sqrt(squares.mean(axis=-1))
-    miss = _chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
-    return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
 
 
 def runs_lost(
@@ -289,10 +288,7 @@ def track(
     if tolerate is not None:
         law = _law(problem, solution, model, Weights.of(tolerate, efforts, dynamics, at_end=at_end), risk)
     elif uncertainty is None:
-        raise InputError(
-            "track: tolerate: got none, want how far each state may be off, such as {'m': 0.05, 'm/s': 0.2}, or"
-            " uncertainty=, from which it is chosen"
-        )
+        raise InputError("track: tolerate: got none, want deviations, such as {'m': 0.05, 'm/s': 0.2}, or uncertainty=")
     else:
         truth = PlanModel.of(dynamics, plan, uncertainty)
 
@@ -333,6 +329,5 @@ def _law(problem: Problem, solution: Solution, model: PlanModel, weights: Weight
     while high - low > 1e-6 * high:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if law_of(middle) is None else (middle, high)
-    raise InputError(
-        f"track: risk: got {risk:g}, want at most {low * (1 - 1e-5):.5g}: with more the expected cost is infinite"
-    )
+    most = low * (1 - 1e-5)
+    raise InputError(f"track: risk: got {risk:g}, want at most {most:.5g}: with more the expected cost is infinite")

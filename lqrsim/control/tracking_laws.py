@@ -166,8 +166,6 @@ def check_plan(who: str, problem: Problem, solution: Solution) -> None:
     plan, want = solution.trajectory, spaces_of(problem.dynamics)
     check_same_system(f"{who}: solution", "a plan", spaces_of(solution.policy), want, "the problem")
     if plan.dt != problem.dt:
-        raise InputError(
-            f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's, {problem.dt:g} s"
-        )
+        raise InputError(f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's {problem.dt:g} s")
     if not plan.finite:
         raise InputError(f"{who}: solution: got a plan that is not finite ({solution.status.name}), want one that is")

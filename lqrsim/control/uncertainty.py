@@ -10,19 +10,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from lqrsim.annotations import Bounds, NonNegative, Share, Want, checked
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_kind,
-    check_name,
-    check_number,
-    check_text,
-    excerpt,
-    keep,
-    real,
-)
+from lqrsim.annotations import LINE, Bounds, NonNegative, Share, Want, check_string, checked
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_name, check_number, excerpt, keep, real
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates, PerEntry
 
@@ -62,7 +51,7 @@ class Unknown:
         if not shares:
             raise InputError("Unknown: of: got no name, want at least one")
         for name, share in shares.items():
-            check_text("Unknown: of", name, "the name of a parameter")
+            check_string("Unknown: of", name, LINE)
             check_number(f"Unknown: of: {name}", share)
         keep(self, time_constant=check_seconds("Unknown: time_constant", self.time_constant, at_least=0.0))
         if self.order == 2 and not 0 < self.time_constant < np.inf:
@@ -256,24 +245,20 @@ def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
     for part in parts:
         numbers = {name: _added(name, getattr(total, name), getattr(part, name)) for name in SUMMED}
         total = Uncertainty(
-            unknowns=(*total.unknowns, *part.unknowns),
-            **numbers,
+            unknowns=(*total.unknowns, *part.unknowns), left_out=(*total.left_out, *part.left_out), **numbers,
             lag=total.lag + part.lag,  # approximately right for two lags in series
-            delay=total.delay + part.delay,
-            latency=total.latency + part.latency,
+            delay=total.delay + part.delay, latency=total.latency + part.latency,
             loss=1 - (1 - total.loss) * (1 - part.loss),
             command_loss=1 - (1 - total.command_loss) * (1 - part.command_loss),
             obstacles=float(np.hypot(total.obstacles, part.obstacles)),
-            left_out=(*total.left_out, *part.left_out),
-        )
+        )  # fmt: skip
     return total
 
 
 def _added(name: str, first: PerEntry, second: PerEntry) -> PerEntry:
     """Standard deviations of the sum of two noises."""
-    for noise, other in ((first, second), (second, first)):
-        if not isinstance(noise, Mapping) and np.ndim(noise) == 0 and noise == 0:
-            return other
+    if first == 0 or second == 0:
+        return second if first == 0 else first
     if isinstance(first, Mapping) or isinstance(second, Mapping):
         raise InputError(f"Uncertainty: {name}: got two dictionaries, {excerpt(first)} and {excerpt(second)}, want one")
     one, another = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)

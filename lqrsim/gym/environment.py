@@ -1,7 +1,4 @@
-"""Scenarios as Gymnasium environments, one or many at once, and controllers as agents.
-
-`Task` is what is the same in all episodes, and `Episode` the closed loop of `simulate`, one period at a time.
-"""
+"""Scenarios as Gymnasium environments, one or many at once, and controllers as agents."""
 
 import logging
 import os
@@ -59,13 +56,9 @@ class Task:
 
     @checked
     def __init__(
-        self,
-        scenario: str | Scenario,
-        solution: Solution | str | os.PathLike[str] | None,
-        disturbances: Disturbances,
-        strength: float,
-        actions: Actions,
-    ) -> None:
+        self, scenario: str | Scenario, solution: Solution | str | os.PathLike[str] | None, disturbances: Disturbances,
+        strength: float, actions: Actions,
+    ) -> None:  # fmt: skip
         if not isinstance(scenario, Scenario):
             kinds = "a Scenario, or a reference to one, such as 'quadrotor,query=3'"
             scenario = resolve(check_kind("scenario", scenario, str, kinds))
@@ -76,16 +69,14 @@ class Task:
         self._given = None if solution is None else check_solution(self.scenario, solution)
         for remark in [] if self._given is None else remarks(self.scenario, self._given):
             _log.warning("the given solution %s", remark)
-        space = self.plant.robot.dynamics.control_coordinates
+        space = robot.dynamics.control_coordinates
         self.low, self.high = space.limits
         for name, low, high in zip(space.names, space.low, space.high, strict=True):
             if not np.isfinite(high - low):
                 raise InputError(f"scenario: got control {name} within {low:g} to {high:g}, want finite limits")
         self._disturbances = self.disturbances_of(disturbances, strength)
         if strength != 1 and not self._disturbances:
-            raise InputError(
-                f"strength: got {strength:g} without disturbances, want it with these, or in reset's options"
-            )
+            raise InputError(f"strength: got {strength:g} without disturbances, want it with these, or in a reset")
         if scenario.problem.duration is not None:  # the control period is part of the solution
             self.scenario = scenario.with_duration_of(self.solution)
             self.plant = self.scenario.plant()
@@ -109,7 +100,6 @@ class Task:
         return Box(-1.0, 1.0, self.low.shape, dtype=np.float64)
 
     def observation_space(self) -> Box:
-        """The observation space of one environment, (n + 1,)."""
         most = np.full(len(self.plant.robot.dynamics.state_coordinates), LARGEST)
         return Box(np.append(-most, 0.0), np.append(most, 1.0), dtype=np.float64)
 

@@ -128,15 +128,13 @@ def _episodes(task: Task, rollout: Rollout) -> Iterator[tuple[int, dict[str, Any
         rewards[row, count - 1] -= task.costs.final(last[None], applied[row, count - 1][None])[0]
         terminated = outcome in ("collided", "diverged")
         at_end, clearance = np.arange(1, count + 1) == count, rollout.clearance[row, : count + 1]
-        yield (
-            row,
-            {
-                "observations": observations[row, : count + 1],
-                "actions": actions[row, :count],
-                "rewards": rewards[row, :count],
-                "terminations": at_end & terminated,
-                "truncations": at_end & (not terminated),
-                # A list: Minari 0.5.4 writes arrays (t+1,) of infos to Arrow's format, but cannot read them.
-                "infos": {"state": states[row, : count + 1], "clearance": clearance.tolist()},
-            },
-        )
+        arrays = {
+            "observations": observations[row, : count + 1],
+            "actions": actions[row, :count],
+            "rewards": rewards[row, :count],
+            "terminations": at_end & terminated,
+            "truncations": at_end & (not terminated),
+            # A list: Minari 0.5.4 writes arrays (t+1,) of infos to Arrow's format, but cannot read them.
+            "infos": {"state": states[row, : count + 1], "clearance": clearance.tolist()},
+        }
+        yield row, arrays

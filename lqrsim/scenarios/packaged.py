@@ -136,25 +136,19 @@ def differential_drive() -> Scenario:
     start, goal, nominal = (0.0, -2.5, np.pi), (0.0, 2.5, np.pi), (0.25, 0.25)
     weight = (5000.0, 5000.0, 50.0)
     problem = Problem(
-        dynamics=robot.dynamics,
-        dt=1 / 6,
-        steps=150,
+        dynamics=robot.dynamics, dt=1 / 6, steps=150,
         initial=QuadraticCost(weight, about=start),
         stage_cost=ControlCost((60.0, 60.0), about=nominal)
         + ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0),
         final_cost=QuadraticCost(weight, about=goal),
-    )
+    )  # fmt: skip
     return Scenario(
-        name="differential_drive",
-        summary="the iRobot Create through an arena of pillars (Fig. 2)",
-        robot=robot,
-        scene=scene,
-        problem=problem,
-        tracking_bound=0.01,
+        name="differential_drive", summary="the iRobot Create through an arena of pillars (Fig. 2)",
+        robot=robot, scene=scene, problem=problem, tracking_bound=0.01,
         disturbances=(ControlNoise(0.05), ForceNoise((3.0, 3.0, 0.0)), MeasurementNoise((0.01, 0.01, 0.02))),
         # Facing the goal keeps the first linearisations sensible; the start faces sideways.
         paper_start=InitialPrior((0.0, 0.0, 0.4), about=(0.0, 0.0, np.pi / 2), iterations=2),
-    )
+    )  # fmt: skip
 
 
 @checked
@@ -168,30 +162,20 @@ def quadrotor(query: Annotated[int, Bounds(at_least=0, at_most=999_999)] = 0, se
     robot, scene = Quadrotor(), load_scene("cage")
     weight = np.full(12, 500.0)
     problem = Problem(
-        dynamics=robot.dynamics,
-        dt=1 / 30,
-        steps=150,
+        dynamics=robot.dynamics, dt=1 / 30, steps=150,
         initial=QuadraticCost(weight, about=starts[query]),
         stage_cost=ControlCost(np.full(4, 20.0), about=np.full(4, robot.hover_force))
         + ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0),
         final_cost=QuadraticCost(weight, about=goals[query]),
-    )
+    )  # fmt: skip
+    noise = MeasurementNoise(np.repeat((0.01, 0.02, 0.01, 0.02), 3).tolist())
     return Scenario(
-        name="quadrotor",
-        summary="the quadrotor through a cage of beams (Fig. 3)",
-        robot=robot,
-        scene=scene,
-        problem=problem,
-        tracking_bound=1e-6,
-        disturbances=(
-            ControlNoise(0.05),
-            ForceNoise(0.1),
-            MeasurementNoise(np.repeat((0.01, 0.02, 0.01, 0.02), 3).tolist()),
-            Push((0.2, 0.0, 0.0), at=3.0),
-        ),
+        name="quadrotor", summary="the quadrotor through a cage of beams (Fig. 3)",
+        robot=robot, scene=scene, problem=problem, tracking_bound=1e-6,
+        disturbances=(ControlNoise(0.05), ForceNoise(0.1), noise, Push((0.2, 0.0, 0.0), at=3.0)),
         # Upright keeps the first linearisations sensible.
         paper_start=InitialPrior(np.repeat((0.0, 0.0, 0.3, 0.0), 3), about=np.zeros(12)),
-    )
+    )  # fmt: skip
 
 
 @checked

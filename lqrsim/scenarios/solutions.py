@@ -52,10 +52,8 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
     if isinstance(stored, FailureCertificate):
         stored = stored.solution
     if isinstance(stored, OutputFeedbackPolicy):
-        raise InputError(
-            f"start: got {path}, a policy with an estimator, want a solution, a policy of the state, a rollout or a"
-            " funnel"
-        )
+        wanted = "a solution, a policy of the state, a rollout or a funnel"
+        raise InputError(f"start: got {path}, a policy with an estimator, want {wanted}")
     if isinstance(stored, Solution | AffinePolicy):
         policy = stored if isinstance(stored, AffinePolicy) else stored.policy
         _check_fits("start", path, scenario, spaces_of(policy), len(policy.gain))
@@ -83,14 +81,10 @@ def check_solution(scenario: Scenario, solution: Solution | str | os.PathLike[st
     goals = zip(*(none if goal is None else goal for goal in (loaded.goal, problem.weighed_goal)), strict=True)
     for name, (got, want) in zip(names, goals, strict=True):
         if got != want and not (np.isnan(got) and np.isnan(want)):
-            raise InputError(
-                f"solution: got {label} with the goal {name} = {got:.9g}, want {want:.9g} (nan: none), as"
-                f" {scenario.name} has it"
-            )
+            wanted = f"{want:.9g} (nan: none), as {scenario.name} has it"
+            raise InputError(f"solution: got {label} with the goal {name} = {got:.9g}, want {wanted}")
     if not np.isfinite(plan.states).all():
-        raise InputError(
-            f"solution: got {label}, whose plan is not finite ({loaded.status.name}), want one that can be run"
-        )
+        raise InputError(f"solution: got {label}, whose plan is not finite ({loaded.status.name}), want a finite one")
     return replace(loaded, goal_radius=scenario.target_radius(target=loaded.target))
 
 

@@ -12,21 +12,10 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Count, Index, Progress, Seed, Want, checked
+from lqrsim.annotations import LINE, Count, Index, Progress, Seed, Want, check_string, checked
 from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, as_controller, turn_to_nearest
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_items,
-    check_kind,
-    check_memory,
-    check_text,
-    excerpt,
-    format_error,
-)
+from lqrsim.errors import Array, InputError, check_array, check_items, check_kind, check_memory, format_error, shaped
 from lqrsim.problem.belief import Belief
-from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
@@ -264,7 +253,11 @@ class ClosedLoop:
         self._target = Target(self.state_coordinates, self.remaining_plan.goal, self.trajectory.states)
         self._radius = self._target.radius(plant.robot.radius, self.goal_radius, self.goal_tolerance)
         substeps = plant.substeps(dt)
-        passing = None if self.moving is None else _shape_among(plant, self.moving.moved(self.knot * dt))
+        passing = None
+        if self.moving is not None:
+            if twice := sorted({*self.moving.names} & {*plant.obstacles, *plant.world.names}):
+                raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")
+            passing = plant.robot.among(self.moving.moved(self.knot * dt))
         _check_size(plant, self.trajectory, substeps, trials, frames=self.frames)
         numbers = range(self.first_trial, self.first_trial + trials)
         self.effects = Effects(plant, full, self.active_disturbances, numbers, self.generators or seeded(self.seed))
@@ -275,8 +268,8 @@ class ClosedLoop:
             self.physics = MujocoPhysics(plant, trials, substeps, contacts=self.contacts, threads=threads)
         self.physics.place(self.effects.initial_states(np.tile(full.states[0], (trials, 1)), self.starts))
         self.physics.prepare(altered=self.effects.alter_models(self.physics))
-        name = f"{type(self.law).__name__}.start"
-        self.controller_run = check_kind(name, self.law.start(trials), ControllerRun, "a ControllerRun returned")
+        name, run = f"{type(self.law).__name__}.start", self.law.start(trials)
+        self.controller_run = check_kind(name, run, ControllerRun, "a ControllerRun returned")
         self.records = Records(self.trajectory, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
@@ -345,7 +338,7 @@ class ClosedLoop:
         if self._readings is not None:
             observed = self._readings.arriving(knot, self.states, measured, None if step else self._held(knot))
         try:
-            commands = _checked_commands(self.controller_run.control(knot, observed), shape)
+            commands = shaped("commands", self.controller_run.control(knot, observed), shape)
             failed = _not_finite(commands)
             first = np.argmin(np.isfinite(commands), axis=1)
             reasons = {
@@ -469,55 +462,22 @@ class ClosedLoop:
         records.turn_to_plan(self.state_coordinates)
         frames = records.finish(parts, all_frames=self.frames)
         return Rollout(
-            robot=plant.robot.name,
-            body=plant.robot.body,
-            scene=plant.scene.name,
-            model=plant.scene.xml,
-            plan=plan,
-            policy_digest=self.law.digest,
-            state_coordinates=self.state_coordinates,
-            control_coordinates=self.control_coordinates,
-            goal=goal,
-            goal_radius=radius,
-            radius=plant.robot.radius,
-            states=records.states,
-            measured=records.measured,
-            commanded=records.commanded,
-            applied=records.applied,
-            forces=records.wrench[..., :3],
-            torques=records.wrench[..., 3:],
-            displaced=self.effects.displaced,
-            clearance=records.clearance,
-            contacts=records.contacts,
-            collided_at=collisions.at,
-            obstacles=tuple(collisions.obstacles),
-            diverged_at=records.time_of(records.lost_since),
-            failed_at=records.time_of(records.failed_since),
-            reasons=tuple(records.reasons),
-            frame_times=np.arange(frames.shape[1]) * (plan.dt / parts),
-            frames=frames,
-            disturbances=(*described, *begun, *passing, *changed),
-            seed=self.seed,
-            first_trial=self.first_trial,
+            robot=plant.robot.name, body=plant.robot.body, radius=plant.robot.radius, scene=plant.scene.name,
+            model=plant.scene.xml, plan=plan, policy_digest=self.law.digest, state_coordinates=self.state_coordinates,
+            control_coordinates=self.control_coordinates, goal=goal, goal_radius=radius, states=records.states,
+            measured=records.measured, commanded=records.commanded, applied=records.applied,
+            forces=records.wrench[..., :3], torques=records.wrench[..., 3:], displaced=self.effects.displaced,
+            clearance=records.clearance, contacts=records.contacts, collided_at=collisions.at,
+            obstacles=tuple(collisions.obstacles), diverged_at=records.time_of(records.lost_since),
+            failed_at=records.time_of(records.failed_since), reasons=tuple(records.reasons), frames=frames,
+            frame_times=np.arange(frames.shape[1]) * (plan.dt / parts), seed=self.seed, first_trial=self.first_trial,
+            disturbances=(*described, *begun, *passing, *changed), controller_run=self.controller_run,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
             balls=plant.record_of_balls(plan.states, records.states) if self.frames else None,
-            obstacle_geoms=plant.obstacle_geoms,
+            obstacle_geoms=plant.obstacle_geoms, undisturbed=undisturbed,
             warnings=self.physics.warnings if plant.simulator is None else None,
-            undisturbed=undisturbed,
             moving=MovingObstacles.of(self.moving.moved(self.knot * plan.dt)) if self.moving else None,
-            controller_run=self.controller_run,
-        )
-
-
-def _checked_commands(commands: Any, shape: tuple[int, int]) -> Array:
-    """The commands that a controller returned. Raises InputError unless they are (K, m) numbers."""
-    try:
-        command = np.asarray(commands, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"got {excerpt(commands)}, want controls of shape {shape}") from None
-    if command.shape != shape:
-        raise InputError(f"got controls of shape {command.shape}, want {shape}")
-    return command
+        )  # fmt: skip
 
 
 def _not_finite(rows: Array) -> Mask:
@@ -528,40 +488,29 @@ def _not_finite(rows: Array) -> Mask:
     return ~np.all(finite, axis=1)
 
 
-def _shape_among(plant: Plant, moving: World) -> ShapeInWorld:
-    """The robot's shape among obstacles that MuJoCo does not have."""
-    if twice := sorted({*moving.names} & {*plant.obstacles, *plant.world.names}):
-        raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")
-    return plant.robot.among(moving)
-
-
 def _coordinates_of(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
     """The coordinates of the controller's states and controls.
 
     Raises:
       InputError: they or the plan's do not match the plant's, or the plan is not finite.
     """
-    dynamics = plant.robot.dynamics
-    kind = type(controller).__name__
-    check_text(f"{kind}.digest", controller.digest, "a hash as text")
+    dynamics, kind = plant.robot.dynamics, type(controller).__name__
+    check_string(f"{kind}.digest", controller.digest, LINE)
     wanted_kind = "Coordinates of states and of controls"
     spaces = check_items(f"{kind}.coordinates", controller.coordinates, Coordinates, wanted_kind)
     if len(spaces) != 2:
         raise InputError(f"{kind}.coordinates: got {len(spaces)}, want two: of the states, of the controls")
-    check_same_system(
-        "controller", "a policy", (spaces[0], spaces[1]), spaces_of(dynamics), f"robot {plant.robot.name}"
-    )
+    robot = f"robot {plant.robot.name}"
+    check_same_system("controller", "a policy", (spaces[0], spaces[1]), spaces_of(dynamics), robot)
     meant, moves = spaces[0], dynamics.state_coordinates
     if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
-        raise InputError(
-            f"controller: got a policy for a position {_place(meant)}, want the position of robot {plant.robot.name}:"
-            f" {_place(moves)}"
-        )
+        whose = f"the position of {robot}: {_place(moves)}"
+        raise InputError(f"controller: got a policy for a position {_place(meant)}, want {whose}")
     trajectory = plan.trajectory
-    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    if trajectory.states.shape[1] != n or trajectory.controls.shape[1] != m:
-        shapes = f"{trajectory.states.shape[1]} states and {trajectory.controls.shape[1]} controls"
-        raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
+    sizes, wanted = (trajectory.states.shape[1], trajectory.controls.shape[1]), (len(spaces[0]), len(spaces[1]))
+    if sizes != wanted:
+        got, want = (f"{n} states and {m} controls" for n, m in (sizes, wanted))
+        raise InputError(f"plan: got {got}, want {want}, as the robot has")
     if not trajectory.finite:
         raise InputError(f"plan: got a plan that is not finite ({plan.status.name}), want one that can be run")
     # A command that the robot clips is at a limit, whatever limits the policy assumed.
@@ -572,11 +521,9 @@ def _coordinates_of(controller: Controller, plan: Plan, plant: Plant) -> tuple[C
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
     """Raise InputError for a run that takes too many physics steps or too much memory."""
-    if plan.steps * substeps > MOST_STEPS:
-        raise InputError(
-            f"plan: got {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
-            f" physics steps, want at most {MOST_STEPS}"
-        )
+    if (count := plan.steps * substeps) > MOST_STEPS:
+        periods = f"{plan.steps} control periods of {plan.dt:g} s"
+        raise InputError(f"plan: got {periods}, which takes {count} physics steps, want at most {MOST_STEPS}")
     n, m = plan.states.shape[1], plan.controls.shape[1]
     pictures = plan.steps * (substeps // steps_per_frame(plant, substeps)) + 1 if frames else 1
     numbers = (plan.steps + 1) * 3 * (2 * n + 2 * m + 6 + 1) + 2 * pictures * plant.model.nq + 3 * len(plant.world)

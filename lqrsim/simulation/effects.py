@@ -1,7 +1,7 @@
 """The effects of a run's disturbances, one after the other, with checks of the values they return; and readings."""
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from lqrsim.problem.belief import Belief
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import RobotSensors
 from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.disturbances.sensors import DEVIATIONS, READINGS
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.plant import Plant
@@ -22,31 +21,17 @@ MakeGenerator = Annotated[
 ]
 
 
-class _ForceHook(NamedTuple):
-    """A hook for a force, a torque or a wind."""
-
-    label: str  # for messages
-    hook: Hook
-    entries: slice  # of force, torque and wind, (9,) together, to which it adds
-    factor: float  # times this
-
-
 class Effects:
     """The effects of disturbances on K trials, started; `displaced` are the obstacles, by (K, obstacles, 3) m."""
 
     def __init__(
-        self,
-        plant: Plant,
-        plan: Trajectory,
-        disturbances: Sequence[Disturbance],
-        trials: range,
-        generators: MakeGenerator,
+        self, plant: Plant, plan: Trajectory, disturbances: Sequence[Disturbance], trials: range, make: MakeGenerator
     ) -> None:
         self._effects: list[tuple[str, Effect]] = []
         for stream, disturbance in enumerate(disturbances):
             name = type(disturbance).__name__
             disturbance.check(plant)
-            effect = disturbance.start(plant, plan, _Streams(generators, trials, stream))
+            effect = disturbance.start(plant, plan, _Streams(make, trials, stream))
             self._effects.append((name, check_kind(f"{name}.start", effect, Effect, "an Effect")))
         self.displaced = np.zeros((len(trials), len(plant.world), 3))
         for name, effect in self._effects:
@@ -59,10 +44,11 @@ class Effects:
         winds = [(slice(6, 9), 1.0)] if plant.has_medium else []
         if plant.simulator is None or not plant.has_medium:  # an MJCF may have a drag beside its fluid
             winds.append((slice(0, 3), plant.robot.drag))
-        self._pushes = [_ForceHook(*hook, slice(3, 6), 1.0) for hook in self._hooks("torque")]
+        # Label, hook, the entries of force, torque and wind, (9,) together, to which it adds, and a factor.
+        self._pushes = [(*hook, slice(3, 6), 1.0) for hook in self._hooks("torque")]
         for named in self._effects:
-            self._pushes += [_ForceHook(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [named])]
-            self._pushes += [_ForceHook(*hook, *wind) for hook in self._hooks("wind", [named]) for wind in winds]
+            self._pushes += [(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [named])]
+            self._pushes += [(*hook, *wind) for hook in self._hooks("wind", [named]) for wind in winds]
 
     def _hooks(self, kind: str, effects: Sequence[tuple[str, Effect]] | None = None) -> list[tuple[str, Any]]:
         """The hooks of one kind, of all effects or these, each with its label for messages."""
@@ -77,10 +63,7 @@ class Effects:
                 continue
             states = shaped(f"{name}: initial_states: returned", effect.initial_states(states.copy()), planned.shape)
             if given is not None and not np.array_equal(states, planned):
-                raise InputError(
-                    f"disturbances: got {name}, which changes the start of a run, want others: the runs begin in given"
-                    " states"
-                )
+                raise InputError(f"disturbances: got {name}, which changes the start, want others: states are given")
         states = states if given is None else given
         if not np.isfinite(states).all():
             raise InputError("disturbances: got an infinite first state, want finite numbers")
@@ -109,8 +92,8 @@ class Effects:
             measure(step, states.copy())
         for _, actuate in self._actuations:
             actuate(step, controls.copy())
-        for push in self._pushes:
-            push.hook(step, states)
+        for _, push, _, _ in self._pushes:
+            push(step, states)
         for _, kick in self._kicks:
             kick(step, states, controls)
 
@@ -139,8 +122,8 @@ class Effects:
     def push(self, step: int, states: Array) -> tuple[Array, Array]:
         """Forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3), in world axes, at states (K, n)."""
         pushed = np.zeros((len(states), 9))
-        for push in self._pushes:
-            pushed[:, push.entries] += push.factor * shaped(push.label, push.hook(step, states), (len(states), 3))
+        for label, push, entries, factor in self._pushes:
+            pushed[:, entries] += factor * shaped(label, push(step, states), (len(states), 3))
         return pushed[:, :6], pushed[:, 6:]
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:
@@ -232,9 +215,7 @@ class _Streams(Sequence[np.random.Generator]):
             generator = self._make(trial, self._stream)
             for draw in ("standard_normal", "random"):  # TrialScore uses objects that draw but are no Generators
                 if not callable(getattr(generator, draw, None)):
-                    raise InputError(
-                        f"generators: got {excerpt(generator)}, want a numpy.random.Generator of each trial"
-                    )
+                    raise InputError(f"generators: got {excerpt(generator)}, want a numpy.random.Generator")
             self._made[trial] = generator
         return self._made[trial]
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array
 from lqrsim.machine import processors
 from lqrsim.results.rollout import WARNINGS
 from lqrsim.robots.base import Indices
@@ -54,7 +54,6 @@ class Physics(abc.ABC):
         self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
 
     def drawn(self, period: Period) -> list[Array]:
-        """The frames that are needed for drawing."""
         return period.frames[self._every - 1 :: self._every]
 
     @abc.abstractmethod
@@ -83,9 +82,6 @@ class MujocoPhysics(Physics):
 
     Until then a simulation is bit-identical with and without later contacts. If the robot can touch something at a
     clearance above 0, contacts are sensed without a force.
-
-    Args:
-      contacts: whether obstacles may become solid; without them a run takes a quarter less time.
 
     Attributes:
       simulations: MuJoCo's simulations. solid: (K,) whether the obstacles of each are solid.
@@ -270,15 +266,11 @@ class SimulatorPhysics(Physics):
         self._states = states
 
     def multiply(self, parameter: str, factors: Array) -> None:
-        if parameter not in self._simulator.parameters:
-            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, want one that has this")
+        self.plant.check_simulator(parameter, parameter)
         self._factors[parameter] = self._factors.get(parameter, 1.0) * factors
 
     def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
-        raise InputError(
-            f"{name}: got a plant simulated by {self._simulator.name}, want one that MuJoCo simulates: it"
-            " changes MuJoCo's models"
-        )
+        self.plant.check_simulator(name)
 
     def displace(self, displaced: Array) -> None:
         """Do nothing: collisions are computed from the positions of the obstacles."""
@@ -329,16 +321,9 @@ def steps_per_frame(plant: Plant, substeps: int) -> int:
 
 
 def _quaternions(plant: Plant) -> list[int]:
-    """The indices at which quaternions begin in the robot's own qpos."""
-    starts, first = [], 0
-    for name in plant.robot.joints:
-        joint = plant.model.joint(name)
-        if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
-            starts.append(first)
-        elif joint.type[0] == mujoco.mjtJoint.mjJNT_FREE:
-            starts.append(first + 3)
-        first += joint.qpos0.size
-    return starts
+    """The indices at which quaternions begin in the robot's own qpos: the last four numbers of ball and free joints."""
+    sizes = [plant.model.joint(name).qpos0.size for name in plant.robot.joints]
+    return [end - 4 for end, size in zip(np.cumsum(sizes).tolist(), sizes, strict=True) if size >= 4]
 
 
 def _turned(after: Array, before: Array, now: Array) -> Array:

@@ -88,8 +88,7 @@ class Plant(OneVersion):
         ids = {name: geom for geom, name in self._scenery}
         self.obstacle_geoms: npt.NDArray[np.int64] = np.array([ids[name] for name in self.world.names], dtype=np.int64)
         self.body = root
-        jointed = (int(scene.model.joint(name).bodyid[0]) for name in robot.joints)
-        attached = {root, *jointed}
+        attached = {root, *(int(scene.model.joint(name).bodyid[0]) for name in robot.joints)}
         for body in range(scene.model.nbody):  # parents come before their children
             if scene.model.body_parentid[body] in attached:
                 attached.add(body)
@@ -112,10 +111,7 @@ class Plant(OneVersion):
         plant_validation.check_maps(robot, scene, self.model, self.shape, clips=simulator is None)
         if simulator is not None:
             if self.obstacles != self.world.names:
-                raise InputError(
-                    f"simulator: got {simulator.name} for robot {robot.name}, which has neither a position nor balls to"
-                    f" find its collisions by, want a robot that has one"
-                )
+                raise InputError(f"simulator: got robot {robot.name}, want one with a position or balls, which collide")
             simulator.check(robot)
 
     @property
@@ -350,9 +346,7 @@ def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs
         others = np.setdiff1d(touching_pairs(model, [fixed])[:, 0], apart[apart[:, 1] == fixed, 0])
         if (same := tuple(others.tolist())) not in of_others:
             if not free:
-                raise InputError(
-                    "obstacles: got an MJCF that uses all bits of contype and conaffinity, want a free one"
-                )
+                raise InputError("obstacles: got an MJCF with all bits of contype and conaffinity, want a free one")
             of_others[same] = free.pop()
             for other in same:
                 geoms[other].conaffinity |= of_others[same]

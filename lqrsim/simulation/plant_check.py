@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import special
 
 from lqrsim.annotations import Bounds, Count, Line, NonNegative, Positive, Seed, Want, checked
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number
+from lqrsim.errors import Array, InputError, check_array, check_count
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.plan import Plan
@@ -110,7 +110,7 @@ def check_plant(
     around: npt.ArrayLike | None = None,
     spread: NonNegative | None = None,
     controls: Limits | None = None,
-    settle: float | None = None,
+    settle: NonNegative | None = None,
     samples: Annotated[int, Bounds(at_least=1, at_most=100_000)] = 50,
     tolerance: Positive = 0.02,
     seed: Seed = 0,
@@ -147,12 +147,10 @@ def check_plant(
     rng = np.random.default_rng(seed)
     if settle is None:
         settle = 0.5 if simulator is None and 2 * len(plant.qvel) > n else 0.0
-    settling = check_number("settle", settle, at_least=0.0) / plant.timestep
-    if not samples * (settling + substeps) <= MOST_STEPS:
-        raise InputError(
-            f"samples: got {samples}, which take {samples * (settling + substeps):.3g} physics steps, want at most"
-            f" {MOST_STEPS}: fewer samples, or a shorter period or time to settle"
-        )
+    settling = settle / plant.timestep
+    if not (steps := samples * (settling + substeps)) <= MOST_STEPS:
+        most = f"at most {MOST_STEPS}: fewer samples, or a shorter period or time to settle"
+        raise InputError(f"samples: got {samples}, which take {steps:.3g} physics steps, want {most}")
     compared, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
@@ -169,7 +167,7 @@ def check_plant(
 class _Sample(NamedTuple):
     """One control period: the state (n,) before it, the control (m,), and the states (n,) after it."""
 
-    before: Array
+    state: Array
     control: Array
     simulated: Array
     predicted: Array
@@ -244,9 +242,7 @@ def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> Array:
             within[:, i] = max(within[0, i], np.min(least)), min(within[1, i], np.max(most))
     for name, least, mean, most in zip(names, within[0], middle, within[1], strict=True):
         if not least <= mean <= most:
-            raise InputError(
-                f"around: got {mean:g} for {name}, want one within the problem's bounds, {least:g} to {most:g}"
-            )
+            raise InputError(f"around: got {mean:g} for {name}, want one within its bounds, {least:g} to {most:g}")
     return within
 
 
@@ -325,19 +321,16 @@ def _worst_of(
 ) -> PlantCheck:
     """The result over all samples, with the sample in which the worst state has its largest error."""
     errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in samples])
-    changes = np.array([np.abs(sample.predicted - sample.before) for sample in samples])
-    space, first = plant.robot.dynamics.state_coordinates, samples[0]
+    changes = np.array([np.abs(sample.predicted - sample.state) for sample in samples])
+    space = plant.robot.dynamics.state_coordinates
     check = PlantCheck(
         names=space.names, units=space.units, errors=errors.max(axis=0), changes=changes.max(axis=0), period=period,
-        state=first.before, control=first.control, simulated=first.simulated, predicted=first.predicted,
-        tolerance=tolerance, samples=len(samples),
+        **samples[0]._asdict(), tolerance=tolerance, samples=len(samples),
         contacts=tuple((*pair, count) for pair, count in touching.most_common()),
         simulator="MuJoCo" if plant.simulator is None else plant.simulator.name,
     )  # fmt: skip
     worst = samples[int(errors[:, check.names.index(check.worst)].argmax())]
-    return replace(
-        check, state=worst.before, control=worst.control, simulated=worst.simulated, predicted=worst.predicted
-    )
+    return replace(check, **worst._asdict())
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:

@@ -43,16 +43,12 @@ def check_names(robot: Robot, scene: Scene) -> None:
         if isinstance(names, str) or not all(isinstance(name, str) and name for name in names):
             raise InputError(f"robot {robot.name}: {field}: got {excerpt(names)}, want names of the MJCF in a tuple")
         if len(set(names)) != len(names):
-            raise InputError(
-                f"robot {robot.name}: {field}: got a name twice in {', '.join(names)}, want different ones"
-            )
+            raise InputError(f"robot {robot.name}: {field}: got a name twice in {', '.join(names)}, want each once")
         elements = [getattr(model, kind)(number).name for number in range(count)]
         for name in names:
             if name not in elements:
-                raise InputError(
-                    f"scene {scene.name}: got no robot {robot.name} in it, want its {kind} {name!r};"
-                    f" it has: {_present(kind, elements)}"
-                )
+                wanted_name = f"its {kind} {name!r}; it has: {_present(kind, elements)}"
+                raise InputError(f"scene {scene.name}: got no robot {robot.name} in it, want {wanted_name}")
 
 
 def _present(kind: str, names: list[str]) -> str:

@@ -43,22 +43,17 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
 
 
 def tube_under(
-    problem: Problem,
-    solution: Solution,
-    plant: Plant,
-    disturbances: Sequence[Disturbance],
+    problem: Problem, solution: Solution, plant: Plant, disturbances: Sequence[Disturbance],
     controller: ControllerLike | None = None,
-) -> tuple[Tube | None, str]:
-    """Predict the tube of a run if possible. Returns the tube, and a line that lists what the tube leaves out, or says
-    why there is no tube.
+) -> tuple[Tube | None, str]:  # fmt: skip
+    """The predicted tube of a run, if there is one, and a line on what it leaves out, or why there is none.
 
     Without disturbances there is neither a tube nor a line.
     """
     if not disturbances:
         return None, ""
     try:
-        belief = isinstance(problem.dynamics, Belief)
-        uncertainty = None if belief else uncertainty_of(plant, disturbances)
+        uncertainty = None if isinstance(problem.dynamics, Belief) else uncertainty_of(plant, disturbances)
         if not problem.dynamics.state_coordinates.position:
             raise InputError("the robot has no position")
         with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop overflows; it is refused below

@@ -71,10 +71,8 @@ class Crazyflow(Simulator):
         limits, parameters = robot.dynamics.control_coordinates, numbers_of(self.drone)
         low, high = parameters["thrust_min"], parameters["thrust_max"]
         if min(limits.low) < low - 1e-12 or max(limits.high) > high + 1e-12:
-            raise InputError(
-                f"crazyflow: got a robot with rotors of {min(limits.low):g} to {max(limits.high):g} N, want at most"
-                f" {low:g} to {high:g} N, beyond which it limits them itself"
-            )
+            rotors = f"rotors of {min(limits.low):g} to {max(limits.high):g} N"
+            raise InputError(f"crazyflow: got a robot with {rotors}, want at most {low:g} to {high:g} N")
 
     def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> "_Drones":
         frequency, trials = round(1 / timestep), len(states)

@@ -61,10 +61,8 @@ class RotorPy(Simulator):
         for key in ("rotor_speed_min", "k_d"):
             check_number(f"RotorPy: vehicle: {key}", vehicle.get(key, 0.0), at_least=0.0)
         if noise := check_number("RotorPy: vehicle: motor_noise_std", vehicle.get("motor_noise_std", 0.0)):
-            raise InputError(
-                f"RotorPy: vehicle: got motor_noise_std {noise:g}, want 0: its generator is shared by all trials; use"
-                " ControlNoise"
-            )
+            # Its generator is shared by all trials.
+            raise InputError(f"RotorPy: vehicle: got motor_noise_std {noise:g}, want 0, and ControlNoise instead")
         keep(self, vehicle=dict(vehicle))
         _ = self._frame
 

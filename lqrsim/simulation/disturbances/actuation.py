@@ -107,17 +107,12 @@ class Saturation(Disturbance):
         wrong = (wanted != np.clip(wanted, *full)).any(axis=0) | (wanted[0] > wanted[1])
         if wrong.any():
             i = int(wrong.argmax())
-            raise InputError(
-                f"Saturation: got {wanted[0, i]:g} to {wanted[1, i]:g} for {space.names[i]}, want a range within that"
-                f" of {plant.robot.name}, {full[0, i]:g} to {full[1, i]:g}"
-            )
+            own = f"a range within that of {plant.robot.name}, {full[0, i]:g} to {full[1, i]:g}"
+            raise InputError(f"Saturation: got {wanted[0, i]:g} to {wanted[1, i]:g} for {space.names[i]}, want {own}")
         if self.strength != 1:
             moved = wanted != full
             if not np.isfinite(full[moved]).all():
-                raise InputError(
-                    f"Saturation: strength: got {self.strength:g} for robot {plant.robot.name}, which has no limits of"
-                    " its own to interpolate from, want 1"
-                )
+                raise InputError(f"Saturation: strength: got {self.strength:g} for a robot without limits, want 1")
             by = np.zeros_like(full)
             by[moved] = wanted[moved] - full[moved]
             closing, width = by[0] - by[1], full[1] - full[0]
@@ -177,10 +172,8 @@ class ActuatorLoss(Disturbance):
         # A time within rounding of a knot counts as that knot.
         period = int(np.ceil(min(self.at / plan.dt, plan.steps) - 1e-9))
         if period >= plan.steps:
-            raise InputError(
-                f"ActuatorLoss: at: got {self.at:g} s, want a time before the last control period of the plan, which"
-                f" ends at {plan.horizon:g} s"
-            )
+            last = f"the last control period of the plan, which ends at {plan.horizon:g} s"
+            raise InputError(f"ActuatorLoss: at: got {self.at:g} s, want a time before {last}")
         if self.actuator is None:
             lost = plant.actuators[[int(generator.integers(len(plant.actuators))) for generator in generators]]
         else:
@@ -205,7 +198,5 @@ def check_gains(disturbance: Disturbance, plant: Plant) -> None:
     """Raise InputError unless the forces of the robot's actuators are proportional to their gains and biases."""
     for name, number in zip(plant.robot.actuators, plant.actuators, strict=True):
         if plant.model.actuator_gaintype[number] not in _FIXED or plant.model.actuator_biastype[number] not in (0, 1):
-            raise InputError(
-                f"{type(disturbance).__name__}: got robot {plant.robot.name}, whose actuator {name!r} has a gain or"
-                " bias that is neither fixed nor affine, want fixed or affine ones"
-            )
+            got = f"robot {plant.robot.name}, whose actuator {name!r} has another gain or bias"
+            raise InputError(f"{type(disturbance).__name__}: got {got}, want fixed or affine ones")

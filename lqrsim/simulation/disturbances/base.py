@@ -14,21 +14,9 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from mujoco import batch
 
-from lqrsim.annotations import Want, checked
+from lqrsim.annotations import LINE, Want, check_string, checked
 from lqrsim.control.uncertainty import Uncertainty, Unknown, per_entry, possible_unknowns
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_name,
-    check_number,
-    check_text,
-    excerpt,
-    keep,
-    real,
-    shaped,
-    without_addresses,
-)
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, keep, real, without_addresses
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
@@ -76,7 +64,7 @@ class Effect:
     torque: Hook | None = None
     wind: Hook | None = None
     kick: Kick | None = None
-    displaced: Array | None = None
+    displaced: Annotated[Array, "K obstacles 3"] | None = None
 
     def __post_init__(self) -> None:
         if self.factors is not None:
@@ -87,8 +75,6 @@ class Effect:
                 if not (factors[name] > 0).all():
                     raise InputError(f"Effect: factors: {name}: got {factors[name].min():g}, want numbers > 0")
             keep(self, factors=factors)
-        if self.displaced is not None:
-            keep(self, displaced=shaped("Effect: displaced", self.displaced, (None, None, 3)))
 
 
 class Disturbance(abc.ABC):
@@ -111,9 +97,8 @@ class Disturbance(abc.ABC):
         if self._scales:
             disturbance: Any = self
             return replace(disturbance, **{self._scales: self._times(getattr(self, self._scales), strength)})
-        raise InputError(
-            f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
-        )
+        got = f"{type(self).__name__}: got strength {self._strength(strength):g}"
+        raise InputError(f"{got}, want one that overrides `scaled`")
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise an InputError for a plant that cannot have this disturbance; called before each `start`."""
@@ -156,7 +141,7 @@ class Disturbance(abc.ABC):
                 raise InputError(f"{field}: got numbers by name, want one number, or one for each component in order")
             if not numbers:
                 raise InputError(f"{field}: got no numbers, want at least one")
-            keys = [check_text(f"{field}: name", key, "a name or a unit") for key in numbers]
+            keys = [check_string(f"{field}: name", key, LINE) for key in numbers]
             return {key: check_number(f"{field}: {key}", numbers[key], at_least=lowest) for key in keys}
         if real(field, numbers).ndim == 0:
             return check_number(field, numbers, at_least=lowest)
@@ -180,7 +165,6 @@ class Disturbance(abc.ABC):
         return np.broadcast_to(values, len(names))
 
     def _strength(self, strength: float) -> float:
-        """The argument of `scaled`."""
         return check_number(f"{type(self).__name__}: strength", strength, at_least=0.0)
 
     def _times(self, numbers: PerEntry, strength: float) -> Any:
@@ -237,6 +221,5 @@ def with_units(values: Array, coordinates: Coordinates) -> str:
 
 def words(numbers: PerEntry) -> str:
     """Numbers in order as text: 0.1, or (0.1, 0.2)."""
-    values = np.atleast_1d(np.asarray(numbers))
-    text = ", ".join(f"{value:g}" for value in values)
+    text = ", ".join(f"{value:g}" for value in np.atleast_1d(np.asarray(numbers)))
     return text if np.ndim(np.asarray(numbers)) == 0 else f"({text})"

@@ -117,6 +117,10 @@ class Dropouts(Disturbance):
         lost, length = f"{100 * self.loss.lost:.3g} % of {self.what} lost", 1 / self.loss.to_good
         return f"{lost}, in bad spells of {length:.3g} control periods on average"
 
+    @property
+    def share(self) -> float:
+        return self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
+
     def scaled(self, strength: float) -> Self:
         """The link with `strength` times as many losses or bad spells; at most everything is lost."""
         strength, loss = self._strength(strength), self.loss
@@ -127,18 +131,18 @@ class Dropouts(Disturbance):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The fraction that is lost, as if losses were independent."""
-        lost = self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
-        return replace(Uncertainty(), **{self.uncertainty_field: lost})
+        return replace(Uncertainty(), **{self.uncertainty_field: self.share})
+
+    def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
+        if isinstance(self.loss, GilbertElliott):
+            return self.loss.draw(steps, generators)
+        return uniform(generators, steps, 1)[..., 0] < self.loss
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         steps, first = plan.steps, plan.controls[0]
         if self.hook == "measure":
             steps, first = steps + 1, plan.states[0]
-        if isinstance(self.loss, GilbertElliott):
-            lost = self.loss.draw(steps, generators)
-        else:
-            lost = uniform(generators, steps, 1)[..., 0] < self.loss
-        last = np.tile(first, (len(generators), 1))
+        lost, last = self.draw(steps, generators), np.tile(first, (len(generators), 1))
 
         def receive(step: int, values: Array) -> Array:
             last[~lost[:, step]] = values[~lost[:, step]]

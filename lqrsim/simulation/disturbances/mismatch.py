@@ -192,10 +192,7 @@ class ThrustMismatch(Mismatch):
         super().check(plant)
         check_gains(self, plant)
         if plant.model.actuator_biastype[plant.actuators].any():
-            raise InputError(
-                f"ThrustMismatch: got robot {plant.robot.name}, whose actuators are servos, want one whose actuators"
-                " exert forces"
-            )
+            raise InputError(f"ThrustMismatch: got robot {plant.robot.name} with servos, want actuators of forces")
 
     def parts(self, plant: Plant) -> Sequence[str]:
         return plant.robot.actuators
@@ -217,10 +214,8 @@ class WheelMismatch(Mismatch):
     def check(self, plant: Plant) -> None:
         plant.check_simulator(type(self).__name__)
         if not plant.robot.wheels:
-            raise InputError(
-                f"{type(self).__name__}: got robot {plant.robot.name}, which has no wheels, want one with the geoms of"
-                " its wheels in `wheels`"
-            )
+            robot = f"robot {plant.robot.name}, which has no wheels"
+            raise InputError(f"{type(self).__name__}: got {robot}, want one with their geoms in `wheels`")
 
 
 class WheelRadiusMismatch(WheelMismatch):

@@ -142,10 +142,8 @@ class DisplacedObstacles(GaussianDisturbance):
 
     def check(self, plant: Plant) -> None:
         if not any(obstacle.kind != "plane" for obstacle in plant.world.obstacles):
-            raise InputError(
-                f"DisplacedObstacles: got scene {plant.scene.name}, where robot {plant.robot.name} has no obstacles but"
-                " planes, want one with other obstacles"
-            )
+            scene = f"scene {plant.scene.name}, where robot {plant.robot.name} has no obstacles but planes"
+            raise InputError(f"DisplacedObstacles: got {scene}, want one with other obstacles")
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         displaced = self._fit(self.std, self.along) * normal(generators, len(plant.world), 3)

@@ -28,10 +28,9 @@ class Wind(Disturbance):
 
     def check(self, plant: Plant) -> None:
         if not plant.robot.drag > 0 and not plant.has_medium:
-            raise InputError(
-                f"{type(self).__name__}: got robot {plant.robot.name}, which wind cannot push without drag, want one"
-                " with a `drag` in N s/m, or an MJCF with the density or viscosity of a fluid"
-            )
+            wanted = "one with a `drag` in N s/m, or an MJCF with the density or viscosity of a fluid"
+            robot = f"robot {plant.robot.name}, which wind cannot push without drag"
+            raise InputError(f"{type(self).__name__}: got {robot}, want {wanted}")
 
     def blow(self, wind: Array) -> Effect:
         """The effect of winds (K, T, 3) in m/s, held over each control period."""
@@ -175,8 +174,7 @@ class Dryden(Wind):
             {name: float(share) for name, share in zip(("wind_x", "wind_y"), shares, strict=True) if abs(share) > 1e-12}
             for shares in ((cosine, sine), (-sine, cosine))
         )
-        processes = (along, 1), (across, 2), ("wind_z", 2)
-        parts = zip(processes, self.std, constants, strict=True)
+        parts = zip(((along, 1), (across, 2), ("wind_z", 2)), self.std, constants, strict=True)
         return self._unknowns(plant, [Unknown(of, std, constant, order) for (of, order), std, constant in parts])
 
 
