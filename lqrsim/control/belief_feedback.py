@@ -22,10 +22,6 @@ class BeliefFeedback(Controller):
     plan's first belief. States that the belief takes as known are measured exactly. `ReadingErrors` are the errors of
     the readings in a run; the belief's `process` is the noise on the state that the filter assumes. A rollout's
     `controller_run` has `beliefs`, (T, K, N) at the knots at which there is a control.
-
-    Args:
-      problem: a problem whose dynamics are a `Belief`.
-      solution: its solution.
     """
 
     @checked

@@ -25,9 +25,7 @@ from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork,
 def moments_of(loops: LoopArrays, stated: int, count: int | None, lost: float = 0.0) -> LoopMoments:
     """The moments of the first entries of y, or of all, in each of L systems under each of C laws, (L, C, ...).
 
-    Args:
-      stated: number of the first entries of y that are the system's own; with losses, the last m of these are a.
-      lost: fraction of the commands that get lost.
+    The first `stated` entries of y are the system's own; with losses, the last m of these are a.
     """
     (steps, laws, m, width), (systems, size) = loops.K.shape, loops.F.shape[1:3]
     first = size if count is None else count

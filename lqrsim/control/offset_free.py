@@ -188,10 +188,7 @@ class OffsetFree(Controller):
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
     def loop(self, uncertainty: Uncertainty | None = None) -> LinearLoop:
-        """Return the closed loop about the plan as matrices.
-
-        Args:
-          uncertainty: uncertainty of the run; by default the one for which the law was designed.
+        """Return the closed loop about the plan as matrices, by default under the uncertainty of the design.
 
         Raises:
           InputError: with `replan_every`, which leads to other plans; with sensors of the MJCF, as gains depend on what

@@ -384,9 +384,7 @@ class PlanModel:
     def assumed(self, memory: float, effort: Array, bypass: float = 0.0) -> "PlanModel":
         """The model that a filter assumes of this one, with a memory in s: see `Uncertainty.steady`. Nothing is exact.
 
-        Args:
-          bypass: noise on the controls that bypasses the actuators, relative to the effort times `Lag.mean`; see
-            `robust_to_lag`.
+        `bypass` is noise on controls that bypasses the actuators, relative to effort times `Lag.mean`: `robust_to_lag`.
         """
         stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
         steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss

@@ -156,10 +156,9 @@ class ReplanRule:
         self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
         self.delay = math.ceil(min(self.deadline / problem.dt, 2 * LONGEST) - 1e-9)
         if self.delay > self.periods:
-            raise InputError(
-                f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"
-                f" {name}={self.every:g} s, {self.periods} control periods: one solve at a time"
-            )
+            got = f"{self.deadline:g} s, {self.delay} control periods"
+            most = f"{name}={self.every:g} s, {self.periods} control periods: one solve at a time"
+            raise InputError(f"{who}: deadline: got {got}, want at most {most}")
         if when is not None and not np.array_equal(when.plan.states, plan.states):
             raise InputError(f"{who}: when: got a funnel of another plan, want a funnel of the solution")
         if when is not None and horizon != "shrinking":

@@ -312,12 +312,10 @@ class ReplannerRun(ControllerRun):
         computing = self._of.computing
         if computing == MEASURED:
             took = replan.seconds
-        elif isinstance(computing, float):
-            took = computing
-        else:
+        elif callable(computing):
             # Seeded by the state of this trial, so that other trials do not change its draws.
-            drawn = int.from_bytes(bytes.fromhex(sha256(state)[:16]), "big")
-            assert callable(computing)
-            seconds = computing(np.random.default_rng([self._of.seed, step, drawn]))
-            took = check_number("Replanner: computing", seconds, at_least=0.0)
+            rng = np.random.default_rng([self._of.seed, step, int(sha256(state)[:16], 16)])
+            took = check_number("Replanner: computing", computing(rng), at_least=0.0)
+        else:
+            took = float(computing)
         return took > self._rule.delay * self._rule.problem.dt + 1e-9

@@ -102,11 +102,7 @@ class SensorFilter:
 
     @cached_property
     def H(self) -> Array:
-        """Output matrices of (z, b), (T+1, Y, Z+B).
-
-        Raises:
-          InputError: a sensor reads the same whatever the state and the unknowns are.
-        """
+        """Output matrices of (z, b), (T+1, Y, Z+B)."""
         model, (states, controls, wrench) = self.model, self._slopes
         knots, count, first = len(states), len(self.sensors.names), model.n + model.lagging
         H = np.zeros((knots, count, model.size + len(self.biased)))
@@ -117,10 +113,8 @@ class SensorFilter:
         H[:, :, first : model.size] = effects @ model.output
         for sensor, at in zip(self.sensors.sensors, self.sensors.columns, strict=True):
             if np.abs(H[:, at, : model.size]).max(initial=0.0) < _SILENT:
-                raise InputError(
-                    f"OffsetFree: sensors: got {sensor.name!r}, whose reading is the same in all states near the plan,"
-                    " want sensors that see the robot"
-                )
+                got = f"{sensor.name!r}, whose reading is the same in all states near the plan"
+                raise InputError(f"OffsetFree: sensors: got {got}, want sensors that see the robot")
         H[:, self.biased, model.size + np.arange(len(self.biased))] = 1.0
         return H
 

@@ -83,11 +83,7 @@ class Predictions(NamedTuple):
         return cls(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
 
     def scores(self, least: float) -> Array:
-        """What a choice of laws minimises: the chance of failure, plus terms for saturation and for wide tubes.
-
-        Args:
-          least: width of the narrowest tube.
-        """
+        """What a choice of laws minimises: chance of failure, and terms for saturation and tubes wider than `least`."""
         return self.chance + FRAGILE * self.saturation**2 + NARROW * np.maximum(self.width / least, 1.0)
 
 

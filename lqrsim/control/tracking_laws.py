@@ -101,8 +101,7 @@ class Averse:
     def worst(self, t: int, S: Array, s: Array) -> tuple[Array, Array]:
         """Hessian and gradient of the cost-to-go at t + 1 under the worst noise: S + S Y S and s + S Y s.
 
-        Raises:
-          np.linalg.LinAlgError: the risk is too high.
+        Raises LinAlgError if the risk is too high.
         """
         M = np.zeros((len(S), self.matrices.shape[2]))
         M[: self.matrices.shape[1]] = self.matrices[t]

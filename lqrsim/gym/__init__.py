@@ -47,8 +47,6 @@ def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasi
 for _name, _scenario in {**SCENARIOS, ANY_SCENARIO: None}.items():
     if _name not in gymnasium.registry:
         gymnasium.register(
-            _name,
-            entry_point="lqrsim.gym:Environment",
-            vector_entry_point="lqrsim.gym:VectorEnvironment",
+            _name, entry_point="lqrsim.gym:Environment", vector_entry_point="lqrsim.gym:VectorEnvironment",
             kwargs={} if _scenario is None else {"scenario": _scenario},
-        )
+        )  # fmt: skip

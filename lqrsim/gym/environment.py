@@ -18,13 +18,13 @@ from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun
 from lqrsim.errors import (
     Array,
     InputError,
+    check_array,
     check_items,
     check_kind,
     check_name,
     check_number,
     check_seed,
     excerpt,
-    shaped,
     vectors_of,
 )
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
@@ -105,9 +105,7 @@ class Task:
 
     def controls_of(self, actions: Any, trials: int) -> Array:
         """Convert actions (K, m) to controls (K, m). Raises InputError unless they are finite and have this shape."""
-        actions = shaped("action", actions, (trials, len(self.low)))
-        if not np.isfinite(actions).all():
-            raise InputError(f"action: got {excerpt(actions)}, want finite numbers")
+        actions = check_array("action", actions, (trials, len(self.low)))
         if self._actions == "controls":
             return actions
         return self.low + (actions + 1) / 2 * (self.high - self.low)
@@ -467,7 +465,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
             raise InputError(f"seed: got {len(seed)} seeds, want one: the episodes are its trials 0, 1, 2, ...")
         seed, options = None if seed is None else check_seed("seed", seed), reset_options(options)
         mask = options.pop("reset_mask", None)
-        if mask is not None and not shaped("options: reset_mask", mask, (self.num_envs,)).all():
+        if mask is not None and not check_array("options: reset_mask", mask, (self.num_envs,)).all():
             raise InputError("options: reset_mask: got a part of the episodes, want all: they begin together")
         super().reset(seed=seed)
         episode = self._begin(seed, self.np_random, options)

@@ -74,8 +74,7 @@ class Scenario(OneVersion):
     ) -> float:
         """The distance from the goal within which it counts as reached, in `Target.unit`.
 
-        Args:
-          target: target of a plan; by default, of a plan that starts at the problem's start.
+        The default target is that of a plan that starts at the problem's start.
         """
         if target is None:
             space, start = self.problem.dynamics.state_coordinates, self.problem.start
@@ -186,9 +185,6 @@ def quadrotor_queries(
 
     A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
     jitter of +-0.01 m; its goal is the antipode.
-
-    Returns:
-      Starts and goals, each (count, 12).
     """
     rng = np.random.default_rng(seed)
     goals = np.zeros((count, 12))

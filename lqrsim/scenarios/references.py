@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     """The scenario that `reference` names; see the top of this file for its forms.
 
-    Args:
-      registered_only: refuse users' functions. For references from a file, which must not choose the code that runs.
+    With `registered_only`, users' functions are refused: a reference from a file must not choose the code that runs.
     """
     from lqrsim.scenarios.packaged import Scenario
 
@@ -74,10 +73,8 @@ def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]
     disturbances = scenario.disturbances if set_name == "scenario" else tuple(preset(set_name, scenario.plant()))
     if not disturbances:
         why = f"scenario {scenario.name} states none" if set_name == "scenario" else "the robot has none of them"
-        raise InputError(
-            f"disturbances: got {name!r}, but {why}, want a set with disturbances: a preset, such as --sweep light (of"
-            " lqrsim simulate: --disturbances light)"
-        )
+        wanted = "a preset, such as --sweep light (of lqrsim simulate: --disturbances light)"
+        raise InputError(f"disturbances: got {name!r}, but {why}, want a set with disturbances: {wanted}")
     if not colon:
         return disturbances
     kinds = dict.fromkeys(type(disturbance).__name__ for disturbance in disturbances)

@@ -43,11 +43,7 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
 
 
 def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution | AffinePolicy | Trajectory:
-    """Load a start for a solve of the scenario from a file.
-
-    Args:
-      path: path of a solution, of a policy, of a certificate, or of a rollout or funnel, for its plan.
-    """
+    """Load a start for a solve: a solution, a policy, that of a certificate, or the plan of a rollout or funnel."""
     stored = load(path)
     if isinstance(stored, FailureCertificate):
         stored = stored.solution

@@ -489,11 +489,7 @@ def _not_finite(rows: Array) -> Mask:
 
 
 def _coordinates_of(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
-    """The coordinates of the controller's states and controls.
-
-    Raises:
-      InputError: they or the plan's do not match the plant's, or the plan is not finite.
-    """
+    """The coordinates of the controller's states and controls, which have to match the plant's, as has the plan."""
     dynamics, kind = plant.robot.dynamics, type(controller).__name__
     check_string(f"{kind}.digest", controller.digest, LINE)
     wanted_kind = "Coordinates of states and of controls"

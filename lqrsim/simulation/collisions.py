@@ -20,10 +20,7 @@ MOST_STEPS = 1000  # along a line
 
 
 class Collisions:
-    """The first collisions of K trials.
-
-    Args:
-      passing: the robot's shape among further obstacles, which move; they are where they are at the time 0 of the run.
+    """The first collisions of K trials; `passing` is the robot's shape among obstacles that move, at the run's start.
 
     Attributes:
       at: (K,) times in s; infinite without a collision. obstacles: names of the obstacles; empty without one.

@@ -171,15 +171,11 @@ class Plant(OneVersion):
             whose, larger, other = self.simulator.name, "a larger one", ""
         if steps > MOST_SUBSTEPS:
             count = f"{steps:,.0f}" if steps < 1e12 else f"{steps:.3g}"
-            raise InputError(
-                f"control period: got {period:g} s, {count} physics steps of {whose},"
-                f" want at most {MOST_SUBSTEPS:,}: {larger} than {self.timestep:g} s"
-            )
+            got, most = f"{period:g} s, {count} physics steps of {whose}", f"at most {MOST_SUBSTEPS:,}"
+            raise InputError(f"control period: got {got}, want {most}: {larger} than {self.timestep:g} s")
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
-            raise InputError(
-                f"control period: got {period:g} s, want a multiple of the physics step of {whose},"
-                f" {self.timestep:g} s: plant.for_period({period:g}){other}"
-            )
+            step, remedy = f"the physics step of {whose}, {self.timestep:g} s", f"plant.for_period({period:g}){other}"
+            raise InputError(f"control period: got {period:g} s, want a multiple of {step}: {remedy}")
         return round(steps)
 
     @cached_property
@@ -212,7 +208,6 @@ class Plant(OneVersion):
         """The signed distance (...) in m to the nearest obstacle minus the radius; of balls or geoms, the least.
 
         Args:
-          states: (..., n).
           displaced: (K, obstacles, 3), displacements of the obstacles in each trial, along the world's axes; states are
             then (K, k, n).
         """

@@ -286,11 +286,9 @@ def _sample(
         pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
         touched |= {(_name(model, a), _name(model, b)) for a, b in pairs if of_robot[a] or of_robot[b]}
     if any(data.warning[kind].number for kind in UNSTABLE):
-        raise InputError(
-            f"scene {plant.scene.name}: got a simulation that becomes unstable from"
-            f" x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)},"
-            " want a smaller timestep, other states (around, spread) or other controls"
-        )
+        at = f"x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)}"
+        wanted = "a smaller timestep, other states (around, spread) or other controls"
+        raise InputError(f"scene {plant.scene.name}: got a simulation that becomes unstable from {at}, want {wanted}")
     predicted = robot.dynamics.step(before, control, period)
     simulated = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=predicted)
     return _Sample(before, control, simulated, predicted), touched
@@ -306,10 +304,8 @@ def _in_simulator(
             simulator.step(running, control[None], np.zeros((1, 6)), np.zeros((1, 3)), steps)
         (after,) = states_of(simulator, running, (1, len(state)))
         if not np.isfinite(after).all():
-            raise InputError(
-                f"{simulator.name}: got a state that is not finite, from x = {np.array2string(state, precision=3)},"
-                f" u = {np.array2string(control, precision=3)}, want a finite state after each step"
-            )
+            at = f"x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)}"
+            raise InputError(f"{simulator.name}: got a state that is not finite, from {at}, want finite states")
         states.append(after)
     before = dynamics.state_coordinates.nearest(states[1], state)
     predicted = dynamics.step(before, control, period)

@@ -65,8 +65,7 @@ def _present(kind: str, names: list[str]) -> str:
 def check_maps(robot: Robot, scene: Scene, model: mujoco.MjModel, shape: ShapeInWorld, *, clips: bool) -> None:
     """Raise InputError unless the robot's maps fit the model, and its body and balls are where its states say.
 
-    Args:
-      clips: whether MuJoCo applies the controls, and clips those that exceed an actuator's ctrlrange.
+    With `clips`, MuJoCo applies the controls, and clips those that exceed an actuator's ctrlrange.
     """
     in_qpos, in_qvel, in_ctrl = indices_in(robot, model)
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
@@ -113,10 +112,9 @@ def _check_limits(robot: Robot, scene: Scene, model: mujoco.MjModel) -> None:
         row, k = (int(place) for place in np.argwhere(exceeds)[0])
         controls = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
         name = scene.mjcf.controls[ctrl[k]].name
-        raise InputError(
-            f"robot {robot.name}: control_limits: got controls ({controls}), for which actuation() commands"
-            f" {commands[row, k]:g} of actuator {name!r}, want its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"
-        )
+        got = f"controls ({controls}), for which actuation() commands {commands[row, k]:g} of actuator {name!r}"
+        own = f"its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"
+        raise InputError(f"robot {robot.name}: control_limits: got {got}, want {own}")
 
 
 def _check_position(robot: Robot, model: mujoco.MjModel) -> None:
@@ -188,10 +186,9 @@ def _check_sites(robot: Robot, model: mujoco.MjModel, balls: CollisionSpheres, *
             if in_plane and robot.dynamics.state_coordinates.from_above:
                 off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
-                raise InputError(
-                    f"{who}: got {balls.ball_names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
-                    f" MuJoCo has {site!r} at {_point(position)} m; want them in the same place"
-                )
+                got = f"{balls.ball_names[k]!r} at {_point(centres[k])} m in the state {_point(state)}"
+                there = f"where MuJoCo has {site!r} at {_point(position)} m"
+                raise InputError(f"{who}: got {got}, {there}; want them in the same place")
 
 
 def _remedy(robot: Robot, names: list[str], jacobian: Array) -> str:

@@ -77,7 +77,5 @@ def package(module: str, extra: str) -> Any:
     except RuntimeError as error:
         if "SCIPY_ARRAY_API" not in str(error):
             raise
-        raise InputError(
-            f"{name}: got SciPy imported without SCIPY_ARRAY_API, want SCIPY_ARRAY_API=1 in the environment from the"
-            " start"
-        ) from None
+        wanted = "SCIPY_ARRAY_API=1 in the environment from the start"
+        raise InputError(f"{name}: got SciPy imported without SCIPY_ARRAY_API, want {wanted}") from None

@@ -49,9 +49,8 @@ class RotorPy(Simulator):
             try:
                 vehicle = package(f"rotorpy.vehicles.{vehicle}_params", "rotorpy").quad_params
             except (InputError, AttributeError):
-                raise InputError(
-                    f"RotorPy: vehicle: got {excerpt(vehicle)}, want 'hummingbird', 'crazyflie' or its quad_params"
-                ) from None
+                wanted = "'hummingbird', 'crazyflie' or its quad_params"
+                raise InputError(f"RotorPy: vehicle: got {excerpt(vehicle)}, want {wanted}") from None
         if not isinstance(vehicle, Mapping):
             raise InputError(f"RotorPy: vehicle: got {excerpt(vehicle)}, want a name, or RotorPy's quad_params")
         if missing := [key for key in (*POSITIVE, "rotor_pos", "rotor_directions") if key not in vehicle]:
@@ -68,12 +67,10 @@ class RotorPy(Simulator):
 
     @cached_property
     def _frame(self) -> Frame:
-        places = check_kind("RotorPy: vehicle: rotor_pos", self._numbers["rotor_pos"], Mapping, "name -> place")
-        return Frame.of(
-            "RotorPy: vehicle",
-            check_array("RotorPy: vehicle: rotor_pos", [*places.values()], (4, 3)),
-            check_array("RotorPy: vehicle: rotor_directions", self._numbers["rotor_directions"], (4,)),
-        )
+        named = check_kind("RotorPy: vehicle: rotor_pos", self._numbers["rotor_pos"], Mapping, "name -> place")
+        places = check_array("RotorPy: vehicle: rotor_pos", [*named.values()], (4, 3))
+        turning = check_array("RotorPy: vehicle: rotor_directions", self._numbers["rotor_directions"], (4,))
+        return Frame.of("RotorPy: vehicle", places, turning)
 
     @property
     def _numbers(self) -> Mapping[str, Any]:

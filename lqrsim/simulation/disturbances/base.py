@@ -180,13 +180,9 @@ class Disturbance(abc.ABC):
 
 @dataclass(frozen=True)
 class GaussianDisturbance(Disturbance):
-    """Base class of disturbances that are drawn from normal distributions of mean zero.
+    """Base class of disturbances that are drawn from normal distributions of mean zero."""
 
-    Args:
-      std: standard deviation; one number, or one per component.
-    """
-
-    std: PerEntry
+    std: PerEntry  # one number, or one for each component
 
     _scales = "std"
     along: ClassVar[str] = ""  # the components, if they are the same for every plant

@@ -134,12 +134,9 @@ class MassMismatch(Mismatch):
 @checked
 @dataclass(frozen=True)
 class Payload(Disturbance):
-    """A load at the centre of mass of one body, unknown to the plan. For example, a gripper holds something.
+    """A load in kg at the centre of mass of one body, unknown to the plan. For example, a gripper holds something.
 
     The load is the same in all trials. The body's inertia about its centre of mass does not change.
-
-    Args:
-      mass: mass of the load in kg.
     """
 
     mass: NonNegative

@@ -131,8 +131,7 @@ class TorqueNoise(WrenchNoise):
 class DisplacedObstacles(GaussianDisturbance):
     """Obstacles are displaced from the plan's; planes are not. Heights stay if the robot is seen from above.
 
-    Args:
-      std: standard deviation in m; one number, or three along the world's axes.
+    `std` in m is one number, or three along the world's axes.
     """
 
     along = "xyz"

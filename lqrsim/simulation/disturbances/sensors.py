@@ -98,7 +98,6 @@ class ReadingErrors(Disturbance):
     """Noise of the sensors of a belief, as strong as these are in the true state. Without it, readings are exact.
 
     Args:
-      belief: the belief.
       loss: chance that a reading is lost, each by itself.
       strength: factor of the standard deviations and of the chance of a loss.
     """
