@@ -88,9 +88,7 @@ class SafePlan:
         if (strays := 100 * (self.tube.strays or 0.0)) > 100 * self.asked:
             lines.append(f"  {strays:.3g} % of the trials leave the plan by over six standard deviations")
         if self.weight != 1:
-            lines.append(
-                f"  with {self.weight:g} times the weight of obstacles, without which it costs {self.cost:.6g}"
-            )
+            lines.append(f"  with {self.weight:g} times the weight of obstacles; without, it costs {self.cost:.6g}")
         if self.instead:
             chances = ", ".join(f"{chance:.3g} with {change}" for change, chance in self.instead.items())
             lines.append(f"  on this plan {chances}")

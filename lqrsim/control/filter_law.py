@@ -262,23 +262,22 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     size, width = model.size, model.size + (latency + delay) * m
     F, G, nominal = model.F, model.G, law.nominal
     f = nominal[1:] + model.c - np.einsum("tij,tj->ti", F, nominal[:-1]) - np.einsum("tij,tj->ti", G, plan.controls)
-    arrays = {
-        "gain": np.zeros((steps, m, width)), "offset": np.zeros((steps, m)),
-        "correction": np.zeros((steps, width, model.sensor.size)),
-        "sensor": np.empty((steps, model.sensor.size, model.n)), "sensor_offset": np.empty((steps, model.sensor.size)),
-        "transition": np.zeros((steps, width, width)), "input": np.zeros((steps, width, m)),
-        "drift": np.zeros((steps, width)), "nominal": np.empty((steps, width)),
-    }  # fmt: skip
     measured = np.empty((steps + 1, model.sensor.size))  # h of y = H x + h
     model.compiled.measurements(len(measured), in_c_order(plan.states), model.compiled_sensor, measured)
     measured -= np.einsum("tij,tj->ti", model.H, plan.states)
-    for t in range(steps):
-        knot = max(t - latency, 0)  # the knot of z
+    knots = np.maximum(np.arange(steps) - latency, 0)  # of z
+    sent = np.clip(np.arange(steps)[:, None] + delay - np.arange(latency + delay, 0, -1), 0, steps - 1)
+    arrays = {
+        "gain": np.empty((steps, m, width)), "offset": np.empty((steps, m)),
+        "correction": np.zeros((steps, width, model.sensor.size)),
+        "sensor": model.H[knots], "sensor_offset": measured[knots],
+        "transition": np.zeros((steps, width, width)), "input": np.zeros((steps, width, m)),
+        "drift": np.zeros((steps, width)),
+        "nominal": np.concatenate([nominal[knots], plan.controls[sent].reshape(steps, -1)], axis=1),
+    }  # fmt: skip
+    for t, knot in enumerate(knots):
         under_way = min(t, latency) + delay  # commands, the newest last
         first = width - under_way * m
-        arrays["sensor"][t], arrays["sensor_offset"][t] = model.H[knot], measured[knot]
-        if t >= latency:
-            arrays["correction"][t, :size] = law.filter.gain[knot]
         # The prediction with the commands under way: z ahead = onto (z, commands) + constant.
         onto, constant = np.eye(size, width), np.zeros(size)
         for i in range(under_way):
@@ -287,13 +286,10 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
             onto[:, first + i * m : first + (i + 1) * m] += G[j]
         at = min(t + delay, steps - 1)
         arrays["gain"][t], arrays["offset"][t] = law.gain[at] @ onto, law.gain[at] @ constant + law.offset[at]
-        arrays["nominal"][t, :size] = nominal[knot]
-        places = np.clip(t + delay - np.arange(latency + delay, 0, -1), 0, steps - 1)
-        arrays["nominal"][t, size:] = plan.controls[places].ravel()
         transition, given, commands = arrays["transition"][t], arrays["input"][t], width - size
         transition[:size, :size] = F[knot] if t >= latency else np.eye(size)  # z waits for the first measurement
         if t >= latency:
-            arrays["drift"][t, :size] = f[knot]
+            arrays["correction"][t, :size], arrays["drift"][t, :size] = law.filter.gain[knot], f[knot]
             acting = transition[:size, size : size + m] if commands else given[:size]  # the oldest command
             acting[:] = G[knot]
         if commands:  # all move up, and the new one is the last

@@ -228,11 +228,9 @@ class ReplanRule:
         policy, dt = active.plan.policy, problem.dt
         rows, controls = [active.row(step + i) for i in range(self.delay)], None
         if late > 1e-9 * dt:
-            remainder, now = problem.dynamics.period_near(dt - late), rows.pop(0)
-            if remainder > 0:
-                states, controls = compiled.rollout(
-                    problem, policy.gain[[now]], policy.offset[[now]], state, dt=remainder
-                )
+            rest, now = problem.dynamics.period_near(dt - late), rows.pop(0)
+            if rest > 0:
+                states, controls = compiled.rollout(problem, policy.gain[[now]], policy.offset[[now]], state, dt=rest)
                 state = states[-1]
         if rows:
             states, controls = compiled.rollout(problem, policy.gain[rows], policy.offset[rows], state)

@@ -179,9 +179,7 @@ def _tube_of_belief(belief: Belief, problem: Problem, solution: Solution) -> Tub
     """
     n, plan, policy = belief.size, solution.trajectory, solution.policy
     knots = zip(plan.states[:-1], plan.controls, strict=True)
-    A, B = (
-        np.array(matrices) for matrices in zip(*(belief.linearize(x, u, plan.dt)[:2] for x, u in knots), strict=True)
-    )
+    A, B = map(np.array, zip(*(belief.linearize(x, u, plan.dt)[:2] for x, u in knots), strict=True))
     closed, known = A + B @ policy.gain, belief.covariance(plan.states)
     pushed = belief.innovations.matrices(belief, plan.states[:-1], plan.controls)
     pushed = pushed @ pushed.swapaxes(1, 2)

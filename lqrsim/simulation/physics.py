@@ -101,9 +101,7 @@ class MujocoPhysics(Physics):
         self._act = self.simulations.bind("act") if plant.robot.activations else np.zeros((trials, 0))
         # Velocity of the medium, to which winds are added.
         self._medium = self.simulations.expand("opt.wind") if plant.has_medium else None
-        self._in_qpos, self._in_qvel, self._in_ctrl = (
-            _span(indices) for indices in (plant.qpos, plant.qvel, plant.ctrl)
-        )
+        self._in_qpos, self._in_qvel, self._in_ctrl = map(_span, (plant.qpos, plant.qvel, plant.ctrl))
         self.solid = np.zeros(trials, dtype=bool)
         self._before = self.simulations.state
         self._inactive: list[tuple[Array, npt.NDArray[np.intp], Array]] = []

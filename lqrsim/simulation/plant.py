@@ -111,7 +111,7 @@ class Plant(OneVersion):
         plant_validation.check_maps(robot, scene, self.model, self.shape, clips=simulator is None)
         if simulator is not None:
             if self.obstacles != self.world.names:
-                raise InputError(f"simulator: got robot {robot.name}, want one with a position or balls, which collide")
+                raise InputError(f"simulator: got robot {robot.name} without position and balls, want one with either")
             simulator.check(robot)
 
     @property

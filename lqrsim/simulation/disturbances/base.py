@@ -207,11 +207,9 @@ def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) ->
     return np.stack([generator.random((steps, size)) for generator in generators])
 
 
-def with_units(values: Array, coordinates: Coordinates) -> str:
+def with_units(values: Array, space: Coordinates) -> str:
     """One number for each entry, grouped by unit; a group is one number if all are the same: `0.01 m, 0.02 rad`."""
-    of_unit = {
-        unit: [v for v, u in zip(values, coordinates.units, strict=True) if u == unit] for unit in coordinates.units
-    }
+    of_unit = {unit: [v for v, u in zip(values, space.units, strict=True) if u == unit] for unit in space.units}
     return ", ".join(f"{words(v if len(set(v)) > 1 else v[0])} {unit}".rstrip() for unit, v in of_unit.items())
 
 

@@ -93,9 +93,7 @@ class Mismatch(Disturbance):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         parts = self.parts(plant)
         if self.factor is None:
-            factors = 1 + (self.std or 0.0) * np.array(
-                [[cut_normal(generator) for _ in parts] for generator in generators]
-            )
+            factors = 1 + (self.std or 0.0) * np.array([[cut_normal(rng) for _ in parts] for rng in generators])
         else:
             factors = np.tile(self._fit(self.factor, parts, "factor"), (len(generators), 1))
         return self.effect(plant, factors)
@@ -189,7 +187,7 @@ class ThrustMismatch(Mismatch):
         super().check(plant)
         check_gains(self, plant)
         if plant.model.actuator_biastype[plant.actuators].any():
-            raise InputError(f"ThrustMismatch: got robot {plant.robot.name} with servos, want actuators of forces")
+            raise InputError(f"ThrustMismatch: got robot {plant.robot.name} with servos, want ones that exert forces")
 
     def parts(self, plant: Plant) -> Sequence[str]:
         return plant.robot.actuators
