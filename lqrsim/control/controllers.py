@@ -198,14 +198,19 @@ class OutputFeedback(_OfPolicy):
             wanted = f"states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             raise InputError(f"controller: got an OutputFeedbackPolicy of {', '.join(names)}, want one of {wanted}")
 
+    @property
+    def measures(self) -> list[int]:
+        """The indices of the measured states."""
+        return [self.policy.state_coordinates.names.index(name) for name in self.policy.measured_coordinates.names]
+
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self.policy, trials)
+        return _OutputFeedbackRun(self, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
-        self._policy, states, n = policy, policy.state_coordinates.names, len(policy.state_coordinates)
-        self._measures = [states.index(name) for name in policy.measured_coordinates.names]
+    def __init__(self, controller: OutputFeedback, trials: int) -> None:
+        policy, n = controller.policy, len(controller.policy.state_coordinates)
+        self._policy, self._measures = policy, controller.measures
         self._z, self._previous = np.tile(policy.start(), (trials, 1)), np.full((trials, n), np.nan)
         self._diverged: dict[int, str] = {}
         # Nothing moves the estimate of the state in the periods before the first measurement arrives.

@@ -2,8 +2,7 @@
 
 To add one, subclass `Disturbance` and implement `start`. It is called once per run, and returns an `Effect`: functions
 that the closed loop calls in every control period for all trials at once. They may use the state (wind that depends on
-the position) or remember the past (a delay). `scaled` returns a stronger or weaker disturbance, for sweeps. `check`
-refuses plants that cannot have the disturbance. `uncertainty` describes it to filters, tracking laws and tubes.
+the position) or remember the past (a delay).
 """
 
 import abc
