@@ -185,6 +185,9 @@ def quadrotor_queries(
 
     A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
     jitter of +-0.01 m; its goal is the antipode.
+
+    Returns:
+      Starts and goals, each (count, 12).
     """
     rng = np.random.default_rng(seed)
     goals = np.zeros((count, 12))
