@@ -151,7 +151,7 @@ def test_a_policy_with_a_filter_is_run_on_what_it_measures(
         differential_drive.problem, drive_solution, STATED, tolerate=TOLERATE, sensors=np.array([[1.0, 1.0, 0.0]])
     ).policy
     line = refusal(lambda: ls.simulate(plant, drive_solution, controller=ranging))
-    assert line.startswith("controller: got an OutputFeedbackPolicy of ")
+    assert line.startswith("controller: got an OutputFeedbackPolicy that measures ")
 
 
 # Runs side by side.

@@ -209,7 +209,7 @@ def test_a_lost_actuator_is_the_one_that_is_named() -> None:
     np.testing.assert_array_equal(plant.ctrl[2:], [2])
     assert [robot.scene.model.actuator(int(one)).name for one in plant.actuators] == ["servo", "push"]
     plan = ls.smooth(robot.problem(robot.at(), robot.at(), steps=2), threads=1)
-    with pytest.raises(InputError, match="actuator 'servo' has another gain or bias, want fixed or affine ones"):
+    with pytest.raises(InputError, match="actuator 'servo' has a gain or bias of another type, want fixed or affine"):
         ls.simulate(plant, plan, disturbances=[ls.disturbances.ActuatorLoss("push")])
 
 

@@ -298,7 +298,7 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ({"sensors": np.ones((2, 3))}, "sensors: got shape (2, 3), want (any, 12)"),
         ({"sensors": np.ones((0, 12))}, "sensors: got no rows"),
         ({"sensors": lambda x, u, p: []}, "which returns nothing, want at least one number that is measured"),
-        ({"replan_always": True}, "replan_always: got True without replan_every, want seconds for that"),
+        ({"replan_always": True}, "replan_always: got True without replan_every, want seconds between solves"),
         ({"sensors": np.full((1, 12), np.nan)}, "sensors: got nan at index"),
         ({"sensors": lambda x: x}, "want a function of (x, u, p)"),
         ({"sensors": lambda x, u, p: [x[0] * u[0]]}, "u"),

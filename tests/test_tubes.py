@@ -283,7 +283,9 @@ def test_the_error_of_the_estimate_is_the_filters_where_that_is_told_the_truth()
 def test_moments_of_what_is_late_need_samples(field: str) -> None:
     system = double_integrator(steps=5)
     late = Uncertainty(**{field: 2})  # type: ignore[arg-type]
-    with pytest.raises(ls.InputError, match=f"samples: got 0, want more for a {field} of 2 control periods"):
+    with pytest.raises(
+        ls.InputError, match=f"samples: got 0, want more: moments leave out a {field} of 2 control periods"
+    ):
         ls.predict_tube(system.problem, system.solution, late, samples=0)
 
 

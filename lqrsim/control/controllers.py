@@ -195,8 +195,8 @@ class OutputFeedback(_OfPolicy):
     def __post_init__(self) -> None:
         states, names = self.policy.state_coordinates.names, self.policy.measured_coordinates.names
         if not set(names) <= set(states):
-            wanted = f"states, some of {', '.join(states)}; or the OffsetFree that it was made from"
-            raise InputError(f"controller: got an OutputFeedbackPolicy of {', '.join(names)}, want one of {wanted}")
+            wanted = f"one of states, some of {', '.join(states)}, or the OffsetFree that it was made from"
+            raise InputError(f"controller: got an OutputFeedbackPolicy that measures {', '.join(names)}, want {wanted}")
 
     @property
     def measures(self) -> list[int]:

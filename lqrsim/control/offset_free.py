@@ -109,7 +109,7 @@ class OffsetFree(Controller):
     ) -> None:
         check_plan("OffsetFree", problem, solution)
         if replan_always and replan_every is None:
-            raise InputError("OffsetFree: replan_always: got True without replan_every, want seconds for that")
+            raise InputError("OffsetFree: replan_always: got True without replan_every, want seconds between solves")
         plan = solution.trajectory
         memory = min(plan.horizon, MEMORY) if memory is None else memory
         memory = check_seconds("OffsetFree: memory", memory, above=0.0)
@@ -152,7 +152,8 @@ class OffsetFree(Controller):
         for name in ("measurement", "latency", "loss"):
             value = getattr(self.uncertainty, name)
             if np.any(list(value.values()) if isinstance(value, Mapping) else value):
-                raise InputError(f"OffsetFree: uncertainty: got {name} {value} with sensors of the MJCF, want none")
+                got = f"a {name} of {value} with sensors of the MJCF"
+                raise InputError(f"OffsetFree: uncertainty: got {got}, want none: each sensor has its own")
         if replan_every is not None:
             raise InputError(f"OffsetFree: replan_every: got {replan_every:g} with sensors of the MJCF, want None")
         return SensorFilter(self.model, sensors)

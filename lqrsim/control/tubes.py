@@ -147,7 +147,8 @@ def predict_tube(
     if samples and surroundings.by_mujoco:
         raise InputError(f"predict_tube: samples: got {samples} for distances by MuJoCo, want 0: trials lack them")
     if late and not samples:
-        raise InputError(f"predict_tube: samples: got 0, want more for a {' and a '.join(late)} control periods")
+        late_by = " and a ".join(late)
+        raise InputError(f"predict_tube: samples: got 0, want more: moments leave out a {late_by} control periods")
     norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     trials = sample_loop(loop.model, law, loop.limits, surroundings, norm, samples, seed) if samples else None
     moments, estimate = trials.moments if late and trials else loop.moments(), None

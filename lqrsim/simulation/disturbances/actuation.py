@@ -198,5 +198,5 @@ def check_gains(disturbance: Disturbance, plant: Plant) -> None:
     """Raise InputError unless the forces of the robot's actuators are proportional to their gains and biases."""
     for name, number in zip(plant.robot.actuators, plant.actuators, strict=True):
         if plant.model.actuator_gaintype[number] not in _FIXED or plant.model.actuator_biastype[number] not in (0, 1):
-            got = f"robot {plant.robot.name}, whose actuator {name!r} has another gain or bias"
-            raise InputError(f"{type(disturbance).__name__}: got {got}, want fixed or affine ones")
+            got = f"robot {plant.robot.name}, whose actuator {name!r} has a gain or bias of another type"
+            raise InputError(f"{type(disturbance).__name__}: got {got}, want fixed or affine")

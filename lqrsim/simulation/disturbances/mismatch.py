@@ -187,7 +187,9 @@ class ThrustMismatch(Mismatch):
         super().check(plant)
         check_gains(self, plant)
         if plant.model.actuator_biastype[plant.actuators].any():
-            raise InputError(f"ThrustMismatch: got robot {plant.robot.name} with servos, want ones that exert forces")
+            raise InputError(
+                f"ThrustMismatch: got robot {plant.robot.name} with servos, want actuators that exert forces"
+            )
 
     def parts(self, plant: Plant) -> Sequence[str]:
         return plant.robot.actuators
