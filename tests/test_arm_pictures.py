@@ -17,7 +17,7 @@ from lqrsim.errors import Array
 from lqrsim.results.rollout import BallRecord
 from lqrsim.view import style, viewer
 from lqrsim.view.plots import MOMENTS, _of_balls
-from lqrsim.view.viewer_base import Viewer
+from lqrsim.view.viewer import Viewer
 
 FLAT = {"size": (640, 480), "fps": 4}
 

@@ -24,7 +24,7 @@ from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.scenes.world import KINDS, PLANES
 from lqrsim.simulation.disturbances import Effect
 from lqrsim.view import cameras, gl, plots, viewer
-from lqrsim.view.viewer_base import Viewer
+from lqrsim.view.viewer import Viewer
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SIDES = '<geom name="beside" type="plane" size="1 1 1" pos="0 0.9 0" zaxis="0 -1 0"/>'

@@ -26,9 +26,9 @@ from lqrsim.cli import main
 from lqrsim.errors import InputError
 from lqrsim.results import save_load
 from lqrsim.simulation.disturbances import ForceNoise
-from lqrsim.view import viewer, viewer_base
+from lqrsim.view import viewer
 from lqrsim.view.browser import Browser
-from lqrsim.view.viewer_base import PUSHES
+from lqrsim.view.viewer import PUSHES
 
 PORT = 18650 + os.getpid() % 1000  # of our own, also where tests run side by side
 
@@ -157,7 +157,7 @@ def test_a_run_takes_its_time(rollout: ls.Rollout, monkeypatch: pytest.MonkeyPat
     clock = SimpleNamespace(
         perf_counter=lambda: sum(slept), monotonic=lambda: sum(slept), sleep=lambda seconds: slept.append(seconds)
     )
-    monkeypatch.setattr(viewer_base, "clock", clock)
+    monkeypatch.setattr(viewer, "clock", clock)
     screen = Recorder(rollout.frames.shape[1], **viewer.arguments_for_rollout(rollout, 0))
     screen.speed = 5.0
     viewer.play(rollout, screen)
@@ -375,8 +375,8 @@ def test_a_page_gets_the_run_to_the_last_bit(served: int, rollout: ls.Rollout) -
 @pytest.mark.long
 def test_keys_and_the_mouse_reach_the_robot(tmp_path: Path) -> None:
     """In the browser: an arrow key pushes the robot, and Ctrl with the right mouse button drags it."""
-    before = """import lqrsim.view.viewer as viewer, lqrsim.view.viewer_base as viewer_base
-push, drag = viewer_base.Viewer.push, viewer_base.Viewer.drag
+    before = """import lqrsim.view.viewer as viewer
+push, drag = viewer.Viewer.push, viewer.Viewer.drag
 def pushed(self, direction, azimuth):
     push(self, direction, azimuth)
     print("pushed", *direction, flush=True)
@@ -384,7 +384,7 @@ def pulled(self, wrenches):
     drag(self, wrenches)
     if self.wrench.any():
         print("pulled", *self.wrench, flush=True)
-viewer_base.Viewer.push, viewer_base.Viewer.drag = pushed, pulled"""
+viewer.Viewer.push, viewer.Viewer.drag = pushed, pulled"""
     with viewing(tmp_path, "quadrotor", "--port", str(PORT + 3), "--speed", "0.3", before=before) as process:
         said(process, "Ctrl-C ends it")
         with browsing.browser(f"http://127.0.0.1:{PORT + 3}/", tmp_path / "profile", size=(500, 400)) as page:

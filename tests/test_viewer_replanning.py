@@ -22,8 +22,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.view import viewer
 from lqrsim.view.overlays import colour_of
-from lqrsim.view.viewer import MovableGoal, model_with_goal
-from lqrsim.view.viewer_base import PUSHES
+from lqrsim.view.viewer import PUSHES, MovableGoal, model_with_goal
 
 PORT = 19700 + os.getpid() % 1000  # of our own, also where tests run side by side
 FREE = np.zeros(3)  # a metre from all beams: closer to them, what they cost keeps the robot from staying
@@ -383,8 +382,8 @@ needs_browser = pytest.mark.skipif(not browsing.CHROMIUM, reason="there is no br
 @pytest.mark.long
 def test_keys_and_the_mouse_move_the_goal(tmp_path: Path) -> None:
     """In the browser: after Enter an arrow key moves it, and Ctrl with the right mouse button drags it."""
-    before = """import lqrsim.view.viewer_base as viewer_base
-move, press, key = viewer_base.Viewer.move_goal, viewer_base.Viewer.push, []
+    before = """import lqrsim.view.viewer as viewer
+move, press, key = viewer.Viewer.move_goal, viewer.Viewer.push, []
 def moved(self, place):
     before = self.goal
     move(self, place)
@@ -394,7 +393,7 @@ def pressed(self, direction, azimuth):
     key.append(self.holds_goal)
     press(self, direction, azimuth)
     key.clear()
-viewer_base.Viewer.move_goal, viewer_base.Viewer.push = moved, pressed"""
+viewer.Viewer.move_goal, viewer.Viewer.push = moved, pressed"""
     with viewing(tmp_path, "quadrotor", "--port", str(PORT), "--replan", "30", before=before) as process:
         text = said(process, "Ctrl-C ends it")
         assert "plans again every 0.03333 s, 30 times a second" in text

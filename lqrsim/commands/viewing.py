@@ -25,8 +25,7 @@ from lqrsim.commands.options import (
 from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.view.viewer import MovableGoal
-    from lqrsim.view.viewer_base import Viewer
+    from lqrsim.view.viewer import MovableGoal, Viewer
 
 
 @dataclass(frozen=True, kw_only=True)

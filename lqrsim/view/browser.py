@@ -32,7 +32,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 
 from lqrsim.errors import InputError
-from lqrsim.view.viewer_base import PUSHES, Viewer
+from lqrsim.view.viewer import PUSHES, Viewer
 
 TESTED_VERSION = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
@@ -177,17 +177,14 @@ class Browser(Viewer):
                 self._handle.close()
                 raise
         self._handle.set_model(self.model, data=self.data)
+        self.instructions = (
+            f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
+            f"  ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE\n"
+            "No other machine can reach it; other users of this one can. Ctrl-C ends it."
+        )
 
     def __exit__(self, *_: object) -> None:
         self._handle.close()
-
-    @property
-    def instructions(self) -> str:
-        tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
-        return (
-            f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
-            f"  {tunnel}\nNo other machine can reach it; other users of this one can. Ctrl-C ends it."
-        )
 
     def refresh(self) -> bool:
         if self._handle.is_running():

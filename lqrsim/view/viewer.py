@@ -1,19 +1,21 @@
-"""Runs in MuJoCo's own viewer: recorded runs, and live runs in which a person pushes the robot or moves its goal."""
+"""MuJoCo's own viewer, in a window or a browser: recorded runs, and live runs with a person at the viewer."""
 
+import abc
 import contextlib
+import copy
 import os
 import sys
 import threading
+import time as clock
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import mujoco
 import numpy as np
 
 from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun
-from lqrsim.control.replan_rule import ActivePlan
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError, free_name
 from lqrsim.problem.constraints import goals_of
@@ -22,150 +24,235 @@ from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, spaces_of
-from lqrsim.results.rollout import Rollout
+from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
 from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
-from lqrsim.view.browser import Browser
-from lqrsim.view.geoms import appending_to
-from lqrsim.view.recorded_trial import POINT, model_of
-from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
+from lqrsim.view import geoms
+from lqrsim.view.overlays import Line, MovingBody, rgba_of
+from lqrsim.view.recorded_trial import POINT, floor_below, interpolated, model_of, place_of, robot_body
 
-LONGEST_RUN = 600.0  # s, after which a run restarts, because the whole run is kept in memory
-RECENT = 100  # number of solves in the median of the caption
-GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # differs from the colours of plan and trace
-GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
-
-
-class MovableGoal:
-    """The goal position of a problem's final cost, which can be moved. There must be exactly one."""
-
-    def __init__(self, problem: Problem) -> None:
-        space = problem.dynamics.state_coordinates
-        self._position = list(space.position)
-        if not self._position:
-            raise InputError("goal: got a robot without a position, want one with a position to move its goal")
-        held = [space.names[i] for i in goals_of(problem.constraints, problem.dynamics) if i in self._position]
-        if held:
-            raise InputError(f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost")
-        self._dynamics, self._cost = problem.dynamics, problem.final_cost
-        references = references_of(self._cost, self._dynamics)
-        of_position = [(term, reference) for term, reference in references if reference.weight[self._position].any()]
-        if len(of_position) != 1:
-            raise InputError(f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one")
-        ((self._drawing, self._reference),) = of_position
-        self.place = self._reference.about[self._position]  # (2 or 3,)
-
-    def cost_at(self, place: Array) -> Cost:
-        """The final cost with its goal at another place (2 or 3,)."""
-        about = self._reference.about.copy()
-        about[self._position] = place
-        moved = self._drawing.moved_to(about, self._dynamics)
-        terms = tuple(moved if term is self._drawing else term for term in terms_of(self._cost))
-        return terms[0] if len(terms) == 1 else CostSum(terms)
+GHOST_OPACITY = 0.25
+TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
+SEGMENTS = 60  # number of segments of the plan; the trace has twice as many
+LIFT = 0.008  # m, height of lines above the floor
+STRONGEST_DRAG = 2.0  # largest force of a drag, relative to the robot's weight
+GOAL_STEP = 0.1  # m, step of the goal for each key press
+MOST_DELAY = 0.2  # s, largest delay that is caught up on a slow machine
+# The direction of each key, seen from the camera: right, away, up.
+PUSHES = {
+    "LeftArrow": (-1.0, 0.0, 0.0),
+    "RightArrow": (1.0, 0.0, 0.0),
+    "UpArrow": (0.0, 1.0, 0.0),
+    "DownArrow": (0.0, -1.0, 0.0),
+    "PageUp": (0.0, 0.0, 1.0),
+    "PageDown": (0.0, 0.0, -1.0),
+}
 
 
-def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:
-    """The plant's model with a body for the goal, which a mouse can drag and nothing collides with; and its name."""
-    spec = plant.scene.mjcf.spec()
-    space = plant.robot.dynamics.state_coordinates
-    radius = GOAL_SIZE * (plant.robot.radius or POINT * float(plant.model.stat.extent))
-    name = free_name("goal", [body.name for body in spec.bodies])
-    body = spec.worldbody.add_body(name=name, mocap=True, pos=space.in_world(goal.place))
-    flat = space.from_above
-    kind = mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE
-    size = np.array([radius, 0.1 * radius if flat else 0.0, 0.0])
-    body.add_geom(type=kind, size=size, rgba=GOAL_RGBA, contype=0, conaffinity=0)
-    return compiled(spec), name
+class ViewerClosed(Exception):
+    """The viewer was closed, or its time is over."""
 
 
-class ViewedReplanner(Controller):
-    """A live re-planner as the controller of a run that a viewer shows.
+class RestartRequested(Exception):
+    """The person asks for a restart."""
 
-    Its decisions depend on the speed of this machine.
+
+class Viewer(abc.ABC):
+    """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
+
+    Args:
+      balls: with their planned positions, for a robot without a position.
+      goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
+      push: velocity that a key adds, in m/s.
+      speed: of the time shown; 1 is real time.
+      seconds: after which the viewer closes; never by default.
     """
 
-    def __init__(self, live: LiveReplanner, plant: Plant, viewer: Viewer, goal: MovableGoal | None) -> None:
-        self.live, self.plant, self.viewer, self.goal = live, plant, viewer, goal
+    instructions: str  # for the person
 
-    def start(self, trials: int) -> ControllerRun:
-        return _ViewedRun(self)
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        plan: Trajectory,
+        space: Coordinates,
+        body: str,
+        *,
+        radius: float,
+        balls: BallRecord | None = None,
+        goal: str | None = None,
+        push: float = 0.3,
+        speed: float = 1.0,
+        seconds: float | None = None,
+    ) -> None:
+        if not space.position and balls is None:
+            wanted = "the 2 or 3 states that are the position, or balls"
+            raise InputError(f"state_coordinates.position: got none, want {wanted}")
+        # A copy, because a viewer has sliders for gravity and other settings.
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)  # that is shown, with a caption whose last lines are the remark
+        self.space, self.robot = space, robot_body(model, body)
+        self.radius, self.speed, self.paused, self.caption, self.remark = radius, speed, False, "", ""
+        self.goal_body, self.holds_goal = 0 if goal is None else robot_body(model, goal), False
+        self._balls = None if space.position else balls
+        self.wrench = np.zeros(6)  # of a drag
+        self._mass = float(model.body_subtreemass[self.robot])
+        self._push, self._impulse = push * self._mass, np.zeros(3)
+        if self._balls is not None:
+            _ = self._balls.tracked  # raises an exception if no site is named
+        self.follow(plan, self._balls)
+        self._trace_spacing = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
+        self._time, self._overrun, self._restart = 0.0, 0.0, False
+        self._until = np.inf if seconds is None else clock.monotonic() + seconds
+        self._trace: list[Array] = []
+        self._floor = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    @abc.abstractmethod
+    def refresh(self) -> bool:
+        """Draw the current state and read the person's input; returns whether the viewer is still open."""
+
+    def show(self, time: float, qpos: Array) -> Array:
+        """Wait until `time`, show the model at `qpos`, and return the place of the robot, (3,).
+
+        Raises:
+          ViewerClosed, RestartRequested: the person asked for it.
+        """
+        begins = time <= self._time or not self._trace
+        self._wait(max(time - self._time, 0.0))
+        self._time, self.data.time, self.data.qpos[:] = time, time, qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
+        place = place_of(self.data, self.robot, self._balls).copy()
+        if begins:
+            self._trace.clear()
+            self._floor = floor_below(self.model, self.data, self.robot)
+        on_floor = self._on_floor(self.of_world(place))
+        if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > self._trace_spacing:
+            self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
+        self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.planned_position()):.0f} mm from the plan"
+        if self.remark:
+            self.caption += f"\n{self.remark}"
+        if self.goal_body:
+            self.move_goal(self.goal)  # puts back a goal that was dragged off the floor, or turned
+        return place
+
+    def follow(self, plan: Trajectory, balls: BallRecord | None, *, begins: float = 0.0) -> None:
+        """Show this plan, which begins at a given time, with its balls if the robot has no position."""
+        self._times, self._places = begins + plan.times, plan.states[:, list(self.space.position)]
+        if not self.space.position and balls is not None:
+            self._places = balls.planned[:, -1]
 
     @property
-    def digest(self) -> str:
-        """Hash of the problem; the decisions also depend on the clock."""
-        return sha256(f"live {self.live.problem.digest}")[:16]
+    def goal(self) -> Array:
+        """The position of the movable goal, in the coordinates of the plan's position, (2 or 3,)."""
+        return self.space.of_world(self.data.mocap_pos[self.model.body_mocapid[self.goal_body]])
 
-    @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        return spaces_of(self.live.active.plan.policy)
+    def move_goal(self, place: Array) -> None:
+        number = self.model.body_mocapid[self.goal_body]
+        self.data.mocap_pos[number], self.data.mocap_quat[number] = self._on_floor(place), (1.0, 0.0, 0.0, 0.0)
 
+    def of_world(self, points: Array) -> Array:
+        """Points (..., 3) in the coordinates of the plan's position, (..., 2 or 3)."""
+        return self.space.of_world(points) if self._balls is None else points
 
-class _ViewedRun(ControllerRun):
-    """A run, which begins with the goal and the plan of the problem."""
+    def wait(self, seconds: float) -> None:
+        """Stand still for a while. Raises exceptions as `show` does."""
+        self._wait(seconds * self.speed)
 
-    def __init__(self, controller: ViewedReplanner) -> None:
-        self._controller, goal = controller, controller.goal
-        self._planned_goal = np.zeros(0) if goal is None else goal.place
-        if goal is not None:
-            controller.viewer.move_goal(goal.place)
-        self._show(controller.live.active)
+    def hold(self, selected: int) -> int:
+        """Note which body the person selected (0: none); returns the body to select: the goal or the robot."""
+        if selected:
+            self.holds_goal = selected == self.goal_body
+        return selected or (self.goal_body if self.holds_goal else self.robot)
 
-    def control(self, step: int, measured: Array) -> Array:
-        live, viewer, goal = self._controller.live, self._controller.viewer, self._controller.goal
-        t, before = step * live.problem.dt, live.active
-        if goal is not None and not np.array_equal(viewer.goal, self._planned_goal):  # the person has moved it
-            self._planned_goal = viewer.goal
-            live.change(final_cost=goal.cost_at(viewer.goal))
-        command = live.step(measured[0], t)
-        if live.active is not before:
-            self._show(live.active)
-        viewer.remark = caption(live, t)
-        return command[None]
+    def other(self) -> int:
+        """The body that Enter selects: the robot or the goal, whichever is not held."""
+        return self.robot if self.holds_goal or not self.goal_body else self.goal_body
 
-    def summary(self) -> str:
-        return self._controller.live.summary()
+    def push(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
+        """Push the robot, or move a goal that is held, as seen from a camera that looks along `azimuth`, in degrees."""
+        (right, away, up), along = right_away_up, np.radians(azimuth)
+        x = right * np.sin(along) + away * np.cos(along)
+        y = away * np.sin(along) - right * np.cos(along)
+        direction = np.array([x, y, up])  # along the world's axes
+        if self.holds_goal:
+            self.move_goal(self.goal + self.space.of_world(GOAL_STEP * direction))
+        else:
+            self._impulse += self._push * direction
 
-    def _show(self, active: ActivePlan) -> None:
-        plan = active.plan.trajectory
-        balls = self._controller.plant.record_of_balls(plan.states, plan.states[None])
-        self._controller.viewer.follow(plan, balls, begins=active.first * plan.dt)
+    def drag(self, wrenches: Array) -> None:
+        """Drag the robot with the sum of forces and torques (nbody, 6), up to the strongest drag."""
+        wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), STRONGEST_DRAG * 9.81 * self._mass
+        for entries, largest in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
+            if (size := float(np.linalg.norm(wrench[entries]))) > largest:
+                wrench[entries] *= largest / size
+        self.wrench = wrench
 
+    def request_restart(self) -> None:
+        self._restart = True
 
-def caption(live: LiveReplanner, t: float) -> str:
-    """The plan in force and its age, and statistics of the solves, as lines."""
-    begun, log = live.active.first * live.problem.dt, live.log
-    took, missed = [1e3 * record.seconds for record in log.records[-RECENT:]], log.kept
-    if not took:
-        solves = "no solve yet"
-    else:
-        solves = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {log.solved} used"
-    if missed:
-        reasons = "; ".join(f"{count} {why}" for why, count in missed.most_common())
-        for status in Status:
-            reasons = reasons.replace(status.name, status.value)  # in words
-        solves += f"\n{missed.total()} missed: {reasons}"
-    name = f"plan of {begun:.1f} s" if live.active.first else "first plan"
-    return f"in force: {name}, {t - begun:.1f} s old\n{solves}"
+    def pop_wrench(self, dt: float) -> Array:
+        """Mean force and torque (6,) of the person over the next `dt` seconds; pushes are used up."""
+        push, self._impulse = np.append(self._impulse / dt, np.zeros(3)), np.zeros(3)
+        return self.wrench + push
 
+    def planned_position(self) -> Array:
+        """The planned place now, (3,)."""
+        return self._on_floor(interpolated(self._places, self._times, self._time))
 
-def lengthened(solution: Solution) -> Solution:
-    """The solution with its end repeated up to the longest run, for `simulate`; the control is the re-planner's."""
-    plan, policy = solution.trajectory, solution.policy
-    more = max(int(LONGEST_RUN / plan.dt) - plan.steps, 0)
+    def draw_overlays(self, new: geoms.NewGeom) -> None:
+        """Draw the plan, the trace and the planned place; `new` returns a new geom."""
+        knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
+        plan = np.array([self._on_floor(self._places[knot]) for knot in knots])
+        width, flat = 0.002 * float(self.model.stat.extent), self.space.from_above
+        radius = self.radius if self._balls is None else float(self._balls.radii[-1])
+        kind, size = "cylinder" if flat else "sphere", np.array([radius, LIFT, 0.0])
+        place, now = self.planned_position()[None], np.zeros(1)
+        for drawable in (
+            Line("plan", rgba_of("plan"), "", plan, (0.6 * width, 0.6 * width)),
+            Line("trace", TRACE_RGBA, "", np.array(self._trace), (width, width)),
+            MovingBody("ghost", rgba_of("ghost", GHOST_OPACITY), "", kind, size, np.eye(3), now, place),
+        ):
+            geoms.draw(drawable, self._time, new, emission=0.0)
 
-    def stays(array: Array) -> Array:
-        return np.concatenate([array, np.repeat(array[-1:], more, axis=0)])
+    def aim_camera(self, camera: mujoco.MjvCamera) -> None:
+        """Aim a free camera as the scene's `overview` camera, if it has one."""
+        mujoco.mjv_defaultFreeCamera(self.model, camera)
+        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
+        if number >= 0:
+            sight = np.array(self.model.stat.center) - self.model.cam_pos[number]
+            lenses = np.radians([self.model.cam_fovy[number], self.model.vis.global_.fovy])
+            camera.distance = np.linalg.norm(sight) * np.divide(*np.tan(lenses / 2))
+            camera.azimuth = np.degrees(np.arctan2(sight[1], sight[0]))
+            camera.elevation = np.degrees(np.arctan2(sight[2], np.hypot(sight[0], sight[1])))
 
-    laws = {name: stays(getattr(policy, name)) for name in ("gain", "offset", "nominal")}
-    return replace(
-        solution, trajectory=Trajectory(stays(plan.states), stays(plan.controls), plan.dt),
-        policy=replace(policy, **laws), inverse_policy=None, cost_to_go=None, cost_to_come=None, clearance=None,
-        multipliers=(), candidates=(),
-    )  # fmt: skip
+    def _on_floor(self, place: Array) -> Array:
+        return place if self._balls is not None else self.space.in_world(place, height=self._floor + LIFT)
+
+    def _wait(self, left: float) -> None:
+        """Wait until `left` seconds of the time shown have passed."""
+        left = max(left - self._overrun, -MOST_DELAY)
+        before = clock.perf_counter()
+        while True:
+            if clock.monotonic() > self._until or not self.refresh():
+                raise ViewerClosed
+            if self._restart:
+                self._restart = False
+                raise RestartRequested
+            now = clock.perf_counter()
+            left -= 0.0 if self.paused else (now - before) * self.speed
+            before = now
+            if left <= 0 and not self.paused:
+                break
+            clock.sleep(float(np.clip(left / self.speed, 0.001, 0.01)))
+        self._overrun = -left
 
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
@@ -225,14 +312,165 @@ class Window(Viewer):
         place, scene = super().show(time, qpos), self._viewer.user_scn
         with self._viewer.lock():
             scene.ngeom = 0
-            self.draw_overlays(appending_to(scene))
+            self.draw_overlays(geoms.appending_to(scene))
         self._viewer.set_texts((None, None, self.caption, None))
         return place
 
 
-def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Window | Browser:
+def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Viewer:
     """Open a `window` or a `browser`, to be used with `with`; the options are a Viewer's."""
-    return Window(**options) if kind == "window" else Browser(port=port, title=title, **options)
+    if kind == "window":
+        return Window(**options)
+    from lqrsim.view.browser import Browser
+
+    return Browser(port=port, title=title, **options)
+
+
+def has_display() -> bool:
+    """Whether there is a screen to open a window on."""
+    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+def _check_window_opens() -> None:
+    """Raises InputError if no window can be opened: MuJoCo's viewer would wait forever."""
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        usable = glfw.init()
+        if usable:
+            glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+            window = glfw.create_window(64, 64, "lqrsim", None, None)
+            usable = bool(window)
+            glfw.terminate()
+    if not usable:
+        raise InputError("window: the display opens no window, want one with OpenGL; or use --viewer browser")
+
+
+LONGEST_RUN = 600.0  # s, after which a run restarts, because the whole run is kept in memory
+RECENT = 100  # number of solves in the median of the caption
+GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # differs from the colours of plan and trace
+GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
+
+
+class MovableGoal:
+    """The goal position of a problem's final cost, which can be moved. There must be exactly one."""
+
+    def __init__(self, problem: Problem) -> None:
+        space = problem.dynamics.state_coordinates
+        self._position = list(space.position)
+        if not self._position:
+            raise InputError("goal: got a robot without a position, want one with a position to move its goal")
+        held = [space.names[i] for i in goals_of(problem.constraints, problem.dynamics) if i in self._position]
+        if held:
+            raise InputError(f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost")
+        self._dynamics, self._cost = problem.dynamics, problem.final_cost
+        references = references_of(self._cost, self._dynamics)
+        of_position = [(term, reference) for term, reference in references if reference.weight[self._position].any()]
+        if len(of_position) != 1:
+            raise InputError(f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one")
+        ((self._drawing, self._reference),) = of_position
+        self.place = self._reference.about[self._position]  # (2 or 3,)
+
+    def cost_at(self, place: Array) -> Cost:
+        """The final cost with its goal at another place (2 or 3,)."""
+        about = self._reference.about.copy()
+        about[self._position] = place
+        moved = self._drawing.moved_to(about, self._dynamics)
+        terms = tuple(moved if term is self._drawing else term for term in terms_of(self._cost))
+        return terms[0] if len(terms) == 1 else CostSum(terms)
+
+
+def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:
+    """The plant's model with a body for the goal, which a mouse can drag and nothing collides with; and its name."""
+    spec = plant.scene.mjcf.spec()
+    space = plant.robot.dynamics.state_coordinates
+    radius = GOAL_SIZE * (plant.robot.radius or POINT * float(plant.model.stat.extent))
+    name = free_name("goal", [body.name for body in spec.bodies])
+    body = spec.worldbody.add_body(name=name, mocap=True, pos=space.in_world(goal.place))
+    flat = space.from_above
+    kind = mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE
+    size = np.array([radius, 0.1 * radius if flat else 0.0, 0.0])
+    body.add_geom(type=kind, size=size, rgba=GOAL_RGBA, contype=0, conaffinity=0)
+    return compiled(spec), name
+
+
+class ViewedReplanner(Controller, ControllerRun):
+    """A live re-planner as the controller of the one run that a viewer shows.
+
+    Its decisions depend on the speed of this machine.
+    """
+
+    def __init__(self, live: LiveReplanner, plant: Plant, viewer: Viewer, goal: MovableGoal | None) -> None:
+        self.live, self.plant, self.viewer, self.goal = live, plant, viewer, goal
+        self._planned_goal = np.zeros(0) if goal is None else goal.place
+
+    def start(self, trials: int) -> ControllerRun:
+        if self.goal is not None:
+            self.viewer.move_goal(self.goal.place)
+        self._show_plan()
+        return self
+
+    @property
+    def digest(self) -> str:
+        """Hash of the problem; the decisions also depend on the clock."""
+        return sha256(f"live {self.live.problem.digest}")[:16]
+
+    @property
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+        return spaces_of(self.live.active.plan.policy)
+
+    def control(self, step: int, measured: Array) -> Array:
+        t, before, goal = step * self.live.problem.dt, self.live.active, self.goal
+        if goal is not None and not np.array_equal(self.viewer.goal, self._planned_goal):  # the person has moved it
+            self._planned_goal = self.viewer.goal
+            self.live.change(final_cost=goal.cost_at(self.viewer.goal))
+        command = self.live.step(measured[0], t)
+        if self.live.active is not before:
+            self._show_plan()
+        self.viewer.remark = caption(self.live, t)
+        return command[None]
+
+    def summary(self) -> str:
+        return self.live.summary()
+
+    def _show_plan(self) -> None:
+        plan = self.live.active.plan.trajectory
+        balls = self.plant.record_of_balls(plan.states, plan.states[None])
+        self.viewer.follow(plan, balls, begins=self.live.active.first * plan.dt)
+
+
+def caption(live: LiveReplanner, t: float) -> str:
+    """The plan in force and its age, and statistics of the solves, as lines."""
+    begun, log = live.active.first * live.problem.dt, live.log
+    took, missed = [1e3 * record.seconds for record in log.records[-RECENT:]], log.kept
+    if not took:
+        solves = "no solve yet"
+    else:
+        solves = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {log.solved} used"
+    if missed:
+        reasons = "; ".join(f"{count} {why}" for why, count in missed.most_common())
+        for status in Status:
+            reasons = reasons.replace(status.name, status.value)  # in words
+        solves += f"\n{missed.total()} missed: {reasons}"
+    name = f"plan of {begun:.1f} s" if live.active.first else "first plan"
+    return f"in force: {name}, {t - begun:.1f} s old\n{solves}"
+
+
+def lengthened(solution: Solution) -> Solution:
+    """The solution with its end repeated up to the longest run, for `simulate`; the control is the re-planner's."""
+    plan, policy = solution.trajectory, solution.policy
+    more = max(int(LONGEST_RUN / plan.dt) - plan.steps, 0)
+
+    def stays(array: Array) -> Array:
+        return np.concatenate([array, np.repeat(array[-1:], more, axis=0)])
+
+    laws = {name: stays(getattr(policy, name)) for name in ("gain", "offset", "nominal")}
+    return replace(
+        solution, trajectory=Trajectory(stays(plan.states), stays(plan.controls), plan.dt),
+        policy=replace(policy, **laws), inverse_policy=None, cost_to_go=None, cost_to_come=None, clearance=None,
+        multipliers=(), candidates=(),
+    )  # fmt: skip
 
 
 def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
@@ -334,24 +572,3 @@ def live(
                 ended(once())
                 viewer.wait(PAUSE_SECONDS)
             run += 1
-
-
-def has_display() -> bool:
-    """Whether there is a screen to open a window on."""
-    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
-
-
-def _check_window_opens() -> None:
-    """Raises InputError if no window can be opened: MuJoCo's viewer would wait forever."""
-    import glfw
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        usable = glfw.init()
-        if usable:
-            glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
-            window = glfw.create_window(64, 64, "lqrsim", None, None)
-            usable = bool(window)
-            glfw.terminate()
-    if not usable:
-        raise InputError("window: the display opens no window, want one with OpenGL; or use --viewer browser")

@@ -14,7 +14,7 @@ import numpy as np
 
 from lqrsim.codegen import disk_cache
 from lqrsim.errors import Array
-from lqrsim.view.viewer_base import Viewer
+from lqrsim.view.viewer import Viewer
 
 
 class Recorder(Viewer):
