@@ -17,7 +17,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.scenes.mjcf_text import model_from_xml
 from lqrsim.simulation.disturbances import Push
-from lqrsim.view import rerun_file
+from lqrsim.view import exports
 from lqrsim.view.recorded_trial import RecordedTrial
 
 Columns = dict[str, np.ndarray]
@@ -80,7 +80,7 @@ def test_what_moves_is_where_mujoco_has_it(run: Path, tmp_path: Path, capsys: py
 def test_numbers_plan_and_tube_are_those_of_the_run(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
     rollout, path = ls.load(run, ls.Rollout), tmp_path / "run.rrd"
-    rerun_file.write(rollout, path)
+    exports.write_rerun(rollout, path)
     found = read(path)
     assert rollout.tube is not None
     assert rollout.collision_chance is not None
@@ -122,7 +122,7 @@ def test_the_command_that_ended_a_trial_is_recorded(how: str, at: int, quadrotor
         TimeColumn=lambda name, duration: duration,
         send_columns=lambda path, index, columns, recording: sent.update({path: (index[0], columns)}),
     )  # fmt: skip
-    rerun_file._Recording(stub, None, RecordedTrial(rollout, 0)).draw_numbers()
+    exports._Recording(stub, None, RecordedTrial(rollout, 0)).draw_numbers()
     for name, values in (
         ("states/z (m)", rollout.states[0, :, 2]),
         ("commanded/rotor_1 (N)", rollout.commanded[0, :, 0]),
@@ -169,7 +169,7 @@ def test_every_shape_is_drawn(run: Path, tmp_path: Path) -> None:
       <geom name="hills" type="hfield" hfield="hills" contype="0" conaffinity="0"/></worldbody>"""
     rollout, path = ls.load(run, ls.Rollout), tmp_path / "shapes.rrd"
     xml = rollout.model.replace("<worldbody>", f"{assets}<worldbody>", 1).replace("</worldbody>", geoms, 1)
-    rerun_file.write(replace(rollout, model=xml), path)
+    exports.write_rerun(replace(rollout, model=xml), path)
     model = model_from_xml(xml, "model")
     found = {name.rpartition(" ")[2]: one for name, one in read(path).items()}
     start = int(model.mesh("wedge").vertadr[0])

@@ -76,7 +76,7 @@ class Render:
 
     def run(self) -> int:
         from lqrsim.results.funnel import Funnel
-        from lqrsim.view import html_file, rerun_file
+        from lqrsim.view import exports
 
         if not self.rollouts:
             raise ls.InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
@@ -95,9 +95,9 @@ class Render:
         content = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
         match out.suffix.lower():
             case ".html":
-                html_file.render_html(drawn, out, trial=self.trial, **content)
+                exports.render_html(drawn, out, trial=self.trial, **content)
             case ".rrd":
-                rerun_file.write(drawn, out, trial=rows, funnel=funnel)
+                exports.write_rerun(drawn, out, trial=rows, funnel=funnel)
             case _:
                 with console.progress("rendering", "frame") as progress:
                     options = {**content, "trial": rows, "insets": self.inset, "titles": self.title}

@@ -1,6 +1,6 @@
 """Overlays of a trial, as lines, dots, tubes, bodies and an arrow in the scene over time; and its readings as text.
 
-Each is drawn by MuJoCo (`geoms.py`), by a page in a browser (`html_file.py`) and by Rerun (`rerun_file.py`).
+Each is drawn by MuJoCo (`geoms.py`), and by a page in a browser and by Rerun (`exports.py`).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,11 +1,12 @@
-"""Trials as one HTML file that any browser plays, without a network: scene, robot, plan, path, tubes and a time line.
+"""Trials for programs other than MuJoCo's: a page that any browser plays, and a recording for Rerun's viewer.
 
-The page is `html_file.html`, which draws with WebGL 2 and loads nothing. Its data are JSON, and the arrays whose places
-the JSON has.
+The page is `page.html`, which draws with WebGL 2 and loads nothing. Its data are JSON, and the arrays whose places the
+JSON has. Rerun is the package `rerun-sdk`, in the extra `rerun`.
 """
 
 import gzip
 import html
+import importlib
 import json
 import math
 import os
@@ -21,27 +22,30 @@ import numpy.typing as npt
 
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_path
-from lqrsim.results.archive import replacing
+from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.mjcf_kinematics import quaternion_of
 from lqrsim.view.cameras import camera_view
-from lqrsim.view.options import OVERLAYS
+from lqrsim.view.ellipsoids import Ellipsoids
+from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import (
     Arrow,
     Dots,
+    Drawable,
     DrawnTube,
     Line,
     MovingBody,
     Overlays,
     Shown,
     check_drawn,
+    colour_of,
     common_scale,
     error_colours,
     legend_entries,
 )
-from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms, in_bytes, rows_of
+from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, Triangles, drawn_geoms, in_bytes, rows_of
 
 ASPECTS = 1.6, 0.6  # of a screen and of a telephone; the page begins with the overview for the nearer one
 LEVELS = np.iinfo(np.uint16).max
@@ -84,7 +88,7 @@ def render_html(
         "geoms": [_of_geom(arrays, geom) for geom in geoms],
         "trials": [_of_trial(arrays, overlays_of(row), geoms) for row in rows],
     }
-    page = packaged("lqrsim.view").joinpath("html_file.html").read_text(encoding="utf-8")
+    page = packaged("lqrsim.view").joinpath("page.html").read_text(encoding="utf-8")
     page = page.replace("{{data}}", arrays.text(described)).replace("{{title}}", html.escape(described["title"]))
     with replacing(path) as unfinished:
         unfinished.write_text(page, encoding="utf-8")
@@ -249,3 +253,168 @@ def _without_jumps(poses: Array) -> Array:
     signs = np.where(np.sum(turns[1:] * turns[:-1], axis=2) < 0, -1.0, 1.0)
     turns[1:] *= np.cumprod(signs, axis=0)[:, :, None]
     return poses
+
+
+TIMELINE = "time"
+GHOST_OPACITY = 0.6  # of a ball without shading
+FLAT = 1e-4  # m, half thickness of flat shapes
+# The tube is shown at its time, as wide as it is, and texts are the numbers.
+RERUN_OVERLAYS: tuple[Overlay, ...] = ("plan", "trace", "ghost", "measured", "forces")
+ENTITIES = {
+    "trace": ["path"], "ghost": ["planned"], "forces": ["force"],
+    "funnel": ["funnel", "certified"], "interpolated": ["funnel", "interpolated"],
+}  # fmt: skip
+
+
+def write_rerun(
+    rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None
+) -> None:
+    """Write a trial as FILE.rrd, with a funnel about its plan. Raises InputError if the package is missing."""
+    path = check_path("path", path, "the path of a file")
+    try:
+        rerun = importlib.import_module("rerun")
+    except ImportError as error:
+        wanted = "the package rerun-sdk: pip install 'lqrsim[rerun]'"
+        raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
+    recorded = RecordedTrial(rollout, trial)
+    shown = RERUN_OVERLAYS if funnel is None else (*RERUN_OVERLAYS, "funnel")
+    steps = rollout.plan.steps
+    overlays = Overlays(recorded, shown, common_scale([recorded]), funnel=funnel, segments=steps)
+    with replacing(path) as unfinished:
+        stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
+        stream.save(unfinished)
+        stream.send_recording_name(f"{rollout.robot} in {rollout.scene}, trial {rollout.first_trial + trial}")
+        recording = _Recording(rerun, stream, recorded)
+        recording.draw_model()
+        for drawable in overlays.drawables:
+            recording.draw(drawable)
+        recording.draw_tube()
+        recording.draw_numbers()
+        stream.disconnect()
+
+
+class _Recording:
+    def __init__(self, rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
+        self.rerun, self.stream, self.recorded = rerun, stream, recorded
+
+    def draw_model(self) -> None:
+        """Draw the geoms of the model: fixed ones once, moving ones at each recorded frame."""
+        recorded, data = self.recorded, mujoco.MjData(self.recorded.model)
+        places, turns = [], []
+        for time in recorded.frame_times:
+            recorded.pose(data, float(time))
+            places.append(data.geom_xpos.copy())
+            turns.append([_scalar_last(matrix) for matrix in data.geom_xmat])
+        for geom in drawn_geoms(recorded.model):
+            i, entity = geom.number, ["world", "model", f"{geom.number} {geom.name}"]
+            self._log(entity, self._shape(geom.kind, geom.size, geom.colour, geom.triangles))
+            if geom.moves:
+                pose = {"translation": [place[i] for place in places], "quaternion": [turn[i] for turn in turns]}
+                self._send(entity, recorded.frame_times, self.rerun.Transform3D.columns(**pose))
+            else:
+                self._log(entity, self.rerun.Transform3D(translation=places[0][i], quaternion=turns[0][i]))
+
+    def _shape(self, kind: str, size: Array, colour: npt.ArrayLike, triangles: Triangles | None = None) -> Any:
+        rerun, colours = self.rerun, [in_bytes(colour)]
+        solid = {"colors": colours, "fill_mode": "solid"}
+        if kind == "plane":
+            return rerun.Boxes3D(half_sizes=[[*size[:2], FLAT]], centers=[[0, 0, -FLAT]], **solid)
+        if kind == "box":
+            return rerun.Boxes3D(half_sizes=[size], **solid)
+        if kind in ("sphere", "ellipsoid"):
+            return rerun.Ellipsoids3D(half_sizes=[size if kind == "ellipsoid" else [size[0]] * 3], **solid)
+        if kind == "cylinder":
+            return rerun.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **solid)
+        if kind == "capsule":  # Rerun's capsule begins at its origin
+            lower = [[0, 0, -size[1]]]
+            return rerun.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=lower, **solid)
+        assert triangles is not None
+        vertices, faces = triangles
+        return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colours[0])
+
+    def draw(self, drawable: Drawable) -> None:
+        """Draw an overlay: lines and a funnel as a whole, everything else at its times."""
+        rerun, entity = self.rerun, ["world", *ENTITIES.get(drawable.name, [drawable.name])]
+        match drawable:
+            case Line():
+                colour, thin = in_bytes(drawable.rgba), 0.002 * self.recorded.model.stat.extent
+                self._log(entity, rerun.LineStrips3D([drawable.points], colors=[colour], radii=[thin]))
+            case Dots():
+                self._points(entity, drawable.times, drawable.points, drawable.rgba, drawable.half_sizes[0])
+            case MovingBody(name="ghost"):
+                colour = (*drawable.rgba[:3], GHOST_OPACITY)
+                self._points(entity, drawable.times, drawable.places, colour, drawable.size[0])
+            case MovingBody():
+                self._log(entity, self._shape(drawable.kind, drawable.size, drawable.rgba))
+                times = self.recorded.frame_times
+                turns = [_scalar_last(drawable.rotation)] * len(times)
+                pose = rerun.Transform3D.columns(translation=drawable.at(times), quaternion=turns)
+                self._send(entity, times, pose)
+            case DrawnTube():
+                ellipsoids = self._ellipsoids(drawable.centres, drawable.half_axes, drawable.rotations)
+                self._log(entity, rerun.Ellipsoids3D(**ellipsoids, colors=[in_bytes(drawable.rgba[:3])]))
+            case Arrow():
+                times = self.recorded.times[self.recorded.times < self.recorded.end]
+                forces = np.array([self.recorded.force_at(float(time)) for time in times])
+                arrows = rerun.Arrows3D.columns(
+                    vectors=forces * drawable.metres_per_newton,
+                    origins=self.recorded.driven(times),
+                    colors=[in_bytes(drawable.rgba)] * len(times),
+                )
+                self._send(entity, times, arrows)
+
+    def draw_tube(self) -> None:
+        """Draw the ellipsoid of the predicted tube at each knot, however wide it is."""
+        run = self.recorded.rollout
+        if run.tube is not None and run.state_coordinates.position:
+            axes = run.in_world(np.eye(run.tube.shape[1])) - run.in_world(np.zeros(run.tube.shape[1]))
+            plan = self.recorded.planned(run.times)
+            half_axes, rotations = Ellipsoids(plan, axes.T @ run.tube @ axes).axes()
+            ellipsoids = self._ellipsoids(plan, np.maximum(half_axes, FLAT), rotations)
+            columns = self.rerun.Ellipsoids3D.columns(**ellipsoids, colors=[in_bytes(colour_of("tube"))] * len(plan))
+            self._send(["world", "tube"], run.times, columns)
+
+    def draw_numbers(self) -> None:
+        """Draw states, controls, tracking error, clearance and chance of collision over time."""
+        recorded, run, trial = self.recorded, self.recorded.rollout, self.recorded.trial
+        known = len(recorded.times)
+        numbers = {("error", f"tracking error, {run.tracking_unit}"): recorded.error}
+        if np.isfinite(recorded.clearance).all():
+            numbers["clearance", "clearance, m"] = recorded.clearance
+        if run.collision_chance is not None:
+            numbers["chance", "chance of collision"] = run.collision_chance[:known]
+        for i, label in enumerate(run.state_coordinates.labels):
+            numbers["states", label] = recorded.states[:, i]
+            numbers["plan", label] = run.plan.states[:known, i]
+        for i, label in enumerate(run.control_coordinates.labels):
+            numbers["commanded", label] = run.commanded[trial, :known, i]  # the last one ended the trial, if it ended
+            numbers["applied", label] = run.applied[trial, :known, i]
+        for entity, values in numbers.items():
+            finite = np.isfinite(values)
+            if finite.any():
+                times = recorded.times[: len(values)][finite]
+                self._send(["numbers", *entity], times, self.rerun.Scalars.columns(scalars=values[finite]))
+
+    def _points(self, entity: list[str], times: Array, points: Array, colour: npt.ArrayLike, radius: float) -> None:
+        count = len(points)
+        columns = self.rerun.Points3D.columns(
+            positions=points, colors=[in_bytes(colour)] * count, radii=[radius] * count
+        )
+        self._send(entity, times, columns)
+
+    @staticmethod
+    def _ellipsoids(centres: Array, half_axes: Array, rotations: Array) -> dict[str, Any]:
+        quaternions = [_scalar_last(rotation) for rotation in rotations]
+        return {"centers": centres, "half_sizes": half_axes, "quaternions": quaternions}
+
+    def _log(self, entity: list[str], shape: Any) -> None:
+        self.stream.log(entity, shape, static=True)
+
+    def _send(self, entity: list[str], times: Array, columns: Any) -> None:
+        path, index = self.rerun.new_entity_path(entity), self.rerun.TimeColumn(TIMELINE, duration=times.tolist())
+        self.rerun.send_columns(path, [index], columns, recording=self.stream)
+
+
+def _scalar_last(rotation: Array) -> Array:
+    """The quaternion of a rotation as Rerun wants it."""
+    return np.roll(quaternion_of(rotation), -1)
