@@ -155,7 +155,7 @@ def test_a_funnel(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     np.testing.assert_allclose(sizes, 0.25 * (1 - nearest[:, None] / 200) * np.ones(3), rtol=0.02)
     capsys.readouterr()
     assert main(["render", str(run), "--out", str(path), "--funnel", str(kept), str(kept)]) == 2
-    assert "at most one --funnel" in capsys.readouterr().err
+    assert "funnel: got 2 with run.rrd, want one" in capsys.readouterr().err
 
 
 def test_every_shape_is_drawn(run: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_kinematics import Equalities
+from lqrsim.scenes.mjcf_kinematics import Equalities, placed
 from lqrsim.scenes.mjcf_model import MjcfModel, ranges
 from lqrsim.scenes.mujoco_log import unlogged
 
@@ -478,9 +478,7 @@ def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
 
 def falling(model: mujoco.MjModel, qpos: Array) -> dict[int, Array | float]:
     """The joints by which bases fall, free joints and vertical slides, each with what it moves for a metre down."""
-    data, gravity = mujoco.MjData(model), model.opt.gravity
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
+    data, gravity = placed(model, qpos), model.opt.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), mujoco.mjMINVAL)
     falls = dict[int, Array | float]()
     for joint in np.flatnonzero(model.body_parentid[model.jnt_bodyid] == 0).tolist():

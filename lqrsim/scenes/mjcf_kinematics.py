@@ -38,6 +38,12 @@ def posed(
         yield data
 
 
+def driven_trees(model: mujoco.MjModel, body: int) -> set[int]:
+    """The kinematic trees that actuators move, and the tree of a body."""
+    data = next(posed(model, [model.qpos0], mujoco.mj_fwdPosition))
+    return {int(model.body_treeid[body]), *model.dof_treeid[data.moment_colind].tolist()}
+
+
 @unlogged()
 def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
     """The names of the bodies that touch, each pair once."""

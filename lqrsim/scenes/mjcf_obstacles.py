@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Finite, checked
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_kinematics import colliding, placed, posed
+from lqrsim.scenes.mjcf_kinematics import colliding, driven_trees, placed, posed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -78,9 +78,7 @@ def link_pairs(model: mujoco.MjModel, body: int) -> Pairs:
     MJCF. Pairs that touch in every position of the joints are left out. Links are the bodies of kinematic trees that
     actuators move, and of the tree of `body`, and what carries them: what the robot handles is none.
     """
-    data, welds = placed(model), model.body_weldid
-    mujoco.mj_fwdPosition(model, data)  # which also finds what actuators move
-    trees = [model.body_treeid[body], *model.dof_treeid[data.moment_colind]]
+    welds, trees = model.body_weldid, [*driven_trees(model, body)]
     geoms = np.flatnonzero((welds[model.geom_bodyid] != 0) & np.isin(model.body_treeid[model.geom_bodyid], trees))
     pairs = np.stack([geoms[places] for places in np.triu_indices(len(geoms), 1)], axis=1).astype(np.int64)
     first, second = welds[model.geom_bodyid[pairs]].T

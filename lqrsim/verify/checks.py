@@ -20,11 +20,11 @@ from lqrsim.results.coordinates import spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.mjcf_kinematics import posed
-from lqrsim.verify.verdict import Criterion, Verification, compare, positions_at
+from lqrsim.verify.verdict import Criterion, Verification, compare
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.geoms import RIM
-from lqrsim.view.recorded_trial import drawn_size, model_of, place_of, robot_body, tracked_balls
+from lqrsim.view.recorded_trial import drawn_size, interpolated, model_of, place_of, robot_body, tracked_balls
 from lqrsim.view.video_metadata import Pane
 
 
@@ -68,7 +68,7 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
     body = robot_body(model, rollout.body)
     balls = tracked_balls(rollout)
     places = [place_of(data, body, balls).copy() for data in posed(model, rollout.frames[trial, good])]
-    return positions_at(rollout.frame_times[good], rollout.of_world(places), times)
+    return interpolated(rollout.of_world(places), rollout.frame_times[good], times)
 
 
 def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
@@ -163,7 +163,7 @@ def verify_run(
         times,
         seen=places - rollout.of_world(offsets),
         actual=state_positions(rollout, trial, times),
-        planned=positions_at(rollout.times, rollout.planned_places, times),
+        planned=interpolated(rollout.planned_places, rollout.times, times),
         apart=apart,
         bound=bound,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
@@ -182,7 +182,7 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
     while above := int(model.body_parentid[above]):
         carriers.append(above)
     nearness = {int(model.body_weldid[carrier]): level for level, carrier in reversed([*enumerate(carriers)])}
-    best: tuple[tuple[bool, int, bool, float], int] | None = None
+    ranked = list[tuple[tuple[bool, int, bool, float], int]]()
     for geom in np.flatnonzero(np.isin(model.geom_type, [kind.value for kind in SYMMETRIC_KINDS])).tolist():
         owner, welded = int(model.geom_bodyid[geom]), int(model.body_weldid[model.geom_bodyid[geom]])
         if owner != body and (welded == 0 or model.body_rootid[owner] != model.body_rootid[body]):
@@ -190,12 +190,10 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
         followed = place is not None and owner == body and np.allclose(model.geom_pos[geom], place, rtol=0, atol=1e-9)
         collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
         level = 0 if owner == body else 1 + nearness.get(welded, len(carriers))
-        rank = (not followed, level, not collides, -float(model.geom_rbound[geom]))
-        if best is None or (rank, geom) < best:
-            best = rank, geom
-    if best is None:
+        ranked.append(((not followed, level, not collides, -float(model.geom_rbound[geom])), geom))
+    if not ranked:
         raise InputError("rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box")
-    return best[1]
+    return min(ranked)[1]
 
 
 def _corners(model: mujoco.MjModel, geom: int, frames: Array) -> Array:
@@ -398,7 +396,7 @@ def verify_video(
         times,
         seen=seen,
         actual=frame_positions(rollout, trial, model, times),
-        planned=positions_at(rollout.times, rollout.planned_places, times),
+        planned=interpolated(rollout.planned_places, rollout.times, times),
         apart=apart,
         bound=VIDEO_BOUND * _size(rollout, model),
         interval=metadata.speed * (1 / float(metadata.rate)),

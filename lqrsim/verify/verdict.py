@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import LINE, Line, checked
 from lqrsim.errors import Array, InputError
+from lqrsim.view.recorded_trial import interpolated
 
 FEW_FRAMES = 4  # up to this number, each wrong frame is named
 
@@ -23,7 +24,7 @@ def diagnose(
     """
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
     error = where - truth
-    wrong = np.flatnonzero(_lengths(error) > bound)
+    wrong = np.flatnonzero(np.linalg.norm(error, axis=1) > bound)
     if 0 < len(wrong) <= FEW_FRAMES:
         return _single_frames(wrong, numbers, where, truth, 2 * bound)
     for axis, name in zip(range(truth.shape[1]), "xyz", strict=False):
@@ -36,14 +37,14 @@ def diagnose(
     late = float((error * velocity).sum() / max((velocity**2).sum(), 1e-12))
     split, jump = _change_point(error, velocity)
     candidates: list[tuple[Array, str]] = []
-    if _lengths(offset) > bound / 2:
+    if np.linalg.norm(offset) > bound / 2:
         moved = np.round(1e3 * offset).astype(int).tolist()
         candidates.append((error - offset, f"a camera is off: it moves the robot by {moved} mm"))
     if abs(late) > interval / 4:
-        expected = positions_at(times, actual, times[numbers] + late)
+        expected = interpolated(actual, times, times[numbers] + late)
         candidates.append((where - expected, f"pictures show the run {_in_frames(late, interval)}"))
     if abs(jump) > interval / 4 and split > FEW_FRAMES:  # otherwise the whole video is late or early
-        expected = positions_at(times, actual, times[numbers] + jump * (np.arange(len(numbers)) >= split))
+        expected = interpolated(actual, times, times[numbers] + jump * (np.arange(len(numbers)) >= split))
         fault = "left out" if jump > 0 else "shown twice"
         text = f"frames are {fault} at frame {numbers[split]}: from there on, the run is {_in_frames(jump, interval)}"
         candidates.append((where - expected, text))
@@ -63,7 +64,7 @@ def _single_frames(
     if len(wrong) == 2:
         first, second = wrong
         crossed = seen[[first, second]] - actual[[second, first]]
-        if _lengths(crossed).max() <= near:
+        if np.linalg.norm(crossed, axis=1).max() <= near:
             return f"frames {numbers[first]} and {numbers[second]} are swapped"
     return f"frames that do not show their time: {', '.join(str(numbers[index]) for index in wrong)}"
 
@@ -77,21 +78,12 @@ def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
     return split, float(tails[0][split] / max(tails[1][split], 1e-12))
 
 
-def positions_at(times: Array, places: Array, when: Array) -> Array:
-    """Places (N, d) at other times (k,), linearly between those at `times` (N,)."""
-    return np.stack([np.interp(when, times, column) for column in places.T], axis=1)
-
-
 def _in_frames(seconds: float, interval: float) -> str:
     return f"{abs(seconds) / interval:.1f} frames {'early' if seconds > 0 else 'late'}"
 
 
-def _lengths(vectors: Array) -> npt.NDArray[np.float64]:
-    return np.linalg.norm(vectors, axis=-1)
-
-
 def _quantile_95(vectors: Array) -> float:
-    return float(np.quantile(_lengths(vectors), 0.95))
+    return float(np.quantile(np.linalg.norm(vectors, axis=1), 0.95))
 
 
 HIDDEN_FRACTION = 0.05  # of the frames, in which the robot may be hidden
@@ -180,7 +172,7 @@ def compare(
     apart: Array,
     bound: float,
     interval: float,
-    others: tuple[Criterion, ...] = (),
+    others: tuple[Criterion, ...],
 ) -> Verification:
     """Compare positions (N, d) from pixels with the actual ones.
 

@@ -1,10 +1,9 @@
 """MuJoCo's viewer in a browser, on loopback only.
 
-MuJoCo 4.0's server listens on all network interfaces, has no password, accepts uploads from anyone and requests from
-the pages of any site. It has no options to change this. The functions that make its socket and its server are therefore
-replaced while it starts. It then answers only requests with its own host name and port, which rules out DNS rebinding,
-and only pages of its own origin. Before anything is shown, the server is tested. If it answers anywhere but on
-loopback, or admits a foreign request, it is closed.
+MuJoCo 4.0's server is open to the network and to the pages of any site, as `_on_loopback` says, without a password.
+Here it answers only requests with its own host name and port, which rules out DNS rebinding, and only pages of its own
+origin. Before anything is shown, the server is tested. If it answers anywhere but on loopback, or admits a foreign
+request, it is closed.
 """
 
 import contextlib
@@ -145,14 +144,11 @@ class _SimulationSide(plugin.SimPlugin):
 class Browser(Viewer):
     """A viewer in a browser, to be used with `with`: its server runs as long as the block.
 
-    There can be only one in a process: MuJoCo's user interface is global, and a second viewer may crash.
+    There can be only one in a process: MuJoCo's user interface is global, and a second viewer may crash. Raises
+    InputError if the port is taken, MuJoCo's version is not a tested one, or other machines can reach the server.
 
     Args:
-      port: of the server; 0 takes the first free port from 8080 on.
-      title: of the page. The other arguments are a Viewer's.
-
-    Raises:
-      InputError: the port is taken, MuJoCo's version is not a tested one, or other machines can reach the server.
+      port: of the server; 0 takes the first free port from 8080 on. The other arguments but `title` are a Viewer's.
     """
 
     def __init__(self, *arguments: Any, port: int = 0, title: str = "", **options: Any) -> None:
@@ -202,7 +198,7 @@ class Browser(Viewer):
 def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
     """A block in which MuJoCo's server starts on loopback only, refuses uploads, and admits only its own pages.
 
-    Three functions of MuJoCo are replaced, for which 4.0 has no option. Without them, 4.0.0 does this:
+    Three functions of MuJoCo are replaced in it, as there are no options. Without that, 4.0.0 does this:
 
     - `web_server.bind_public_socket`: the viewer passes `::` to it, and the server answers at 127.0.0.2, at ::1 and at
       the machine's addresses in the network.

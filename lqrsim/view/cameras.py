@@ -16,7 +16,7 @@ from lqrsim.annotations import Finite, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
-from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial, tracked_balls
+from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial, interpolated, tracked_balls
 
 Vector = tuple[Finite, Finite, Finite]
 
@@ -230,7 +230,7 @@ def _chase(recorded: RecordedTrial) -> CameraView:
 
     def place(scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         angle = np.interp(time, times, azimuth)
-        at = np.array([np.interp(time, times, column) for column in middle.T])
+        at = interpolated(middle, times, time)
         behind = np.array([np.cos(angle), np.sin(angle), 0.0])
         eye = at - DISTANCE * radius * behind + [0, 0, HEIGHT * radius]
         forward = at + 2 * radius * behind - eye

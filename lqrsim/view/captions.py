@@ -103,7 +103,9 @@ def text_tile(lines: tuple[str, ...], height: int, *, width: int, bold: bool = T
     """
     fonts = [_font(height, bold=bold and number == 0) for number in range(len(lines))]
     needed = max(font.getlength(line) for font, line in zip(fonts, lines, strict=True))
-    tile, draw = _blank_tile(max(needed + 1.4 * height, width), (1.5 * len(lines) + 0.7) * height)
+    size = round(max(needed + 1.4 * height, width)), round((1.5 * len(lines) + 0.7) * height)
+    tile = Image.new("RGBA", size, PAPER)
+    draw = ImageDraw.Draw(tile)
     for number, (font, line) in enumerate(zip(fonts, lines, strict=True)):
         draw.text((0.7 * height, (0.4 + 1.5 * number) * height), line, font=font, fill=INK)
     return np.asarray(tile)
@@ -123,7 +125,8 @@ def legend_tile(entries: tuple[tuple[str, Colour | None], ...], height: int, wid
         rows[-1].append((x, name, colour))
         x += needed
         widest = max(widest, x)
-    tile, draw = _blank_tile(widest, (1.6 * len(rows) + 0.6) * height)
+    tile = Image.new("RGBA", (round(widest), round((1.6 * len(rows) + 0.6) * height)), PAPER)
+    draw = ImageDraw.Draw(tile)
     for number, row in enumerate(rows):
         top = (1.6 * number + 0.45) * height
         for left, name, colour in row:
@@ -159,8 +162,3 @@ def blend(image: Pixels, tile: Pixels, *, left: int, top: int) -> None:
 def _font(height: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
     return ImageFont.truetype(folder / f"DejaVuSans{'-Bold' if bold else ''}.ttf", height)
-
-
-def _blank_tile(width: float, height: float) -> tuple[Image.Image, ImageDraw.ImageDraw]:
-    tile = Image.new("RGBA", (round(width), round(height)), PAPER)
-    return tile, ImageDraw.Draw(tile)

@@ -19,7 +19,7 @@ from lqrsim.errors import Array
 from lqrsim.problem.belief import Belief
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
-from lqrsim.scenes.mjcf_kinematics import placed
+from lqrsim.scenes.mjcf_kinematics import driven_trees, posed
 from lqrsim.scenes.world import Obstacle, World
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.recorded_trial import drawn_geoms, model_of, robot_body
@@ -270,14 +270,10 @@ def moved_objects(rollout: Rollout, trial: int) -> list[MovedObject]:
     if len(frames) < 2:
         return []
     model = model_of(rollout, trial)
-    data = placed(model)
-    mujoco.mj_fwdPosition(model, data)  # which also finds what actuators move
-    driven = {int(model.body_treeid[robot_body(model, rollout.body)]), *model.dof_treeid[data.moment_colind].tolist()}
+    driven = driven_trees(model, robot_body(model, rollout.body))
     objects = [(tree, int(model.tree_bodyadr[tree])) for tree in range(model.ntree) if tree not in driven]
     path, geoms = np.zeros((len(frames), model.nbody, 3)), list[list[list[Obstacle]]]()
-    for number, frame in enumerate(frames):
-        data.qpos[:] = frame
-        mujoco.mj_kinematics(model, data)
+    for number, data in enumerate(posed(model, frames)):
         path[number] = data.xipos
         if number in (0, len(frames) - 1):
             geoms.append([_visible(model, data, tree) for tree, _ in objects])
