@@ -68,9 +68,7 @@ class MjcfPhysics:
         impedance.
       unlimited: ids of the actuators and of the joints whose forces are not limited here.
 
-    Attributes:
-      model: MuJoCo's model. numbers: the numbers for the kernel, without a wrench and loads. team: the words that its
-        threads share.
+    `numbers` are those for the kernel, without a wrench and loads; `team` has the words that its threads share.
     """
 
     def __init__(
@@ -100,10 +98,8 @@ class MjcfPhysics:
         self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
         self._data = [mujoco.MjData(self.model) for _ in range(slots)]
         for data in self._data:
-            # MuJoCo reports the first warning of each kind to a file and the console; here no warning counts as the
-            # first.
-            for warning in range(len(data.warning.number)):
-                data.warning.number[warning] = 1
+            # MuJoCo reports the first warning of each kind to a file and the console; here none is the first.
+            data.warning.number[:] = 1
         self._flags = np.zeros(slots, dtype=np.int64)
         self.team = np.zeros(8, dtype=np.int64)
         n, m = 2 * self.model.nv + self.model.na, self.model.nu
@@ -114,10 +110,7 @@ class MjcfPhysics:
         self.numbers = self._numbers(mjcf.carriers if loaded else (), mjcf.turns_about)
 
     def address(self) -> int:
-        """The address of the numbers, for kernels of places and distances.
-
-        The model for distances, which is as large as all meshes and textures, is not made before.
-        """
+        """The address of the numbers, for kernels of distances. Their model, which may be large, is not made before."""
         self.numbers[kernel.DISTANCE_MODEL] = self._for_distances._address
         return self.numbers.ctypes.data
 
@@ -125,8 +118,7 @@ class MjcfPhysics:
     def _for_distances(self) -> mujoco.MjModel:
         """The model with more exact distances, whose directions are gradients.
 
-        With MuJoCo's own tolerance of 1e-6 m, the direction between two geoms that nearly touch can be a few degrees
-        off.
+        With MuJoCo's tolerance of 1e-6 m, directions between geoms that nearly touch can be a few degrees off.
         """
         exact = copy.copy(self.model)
         exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _TOLERANCE, max(_ITERATIONS, exact.opt.ccd_iterations)
@@ -179,9 +171,7 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
 
 @cache
 def _functions() -> dict[int, float]:
-    """The addresses of the functions that the kernel calls, by their indices: MuJoCo's, in the library that the
-    bindings have loaded, and one that yields to other threads, if there is one.
-    """
+    """The addresses of the functions that the kernel calls, by their indices: MuJoCo's, and one that yields, if any."""
     folder = Path(mujoco.__file__).parent
     patterns = {"Windows": "mujoco.dll", "Darwin": "libmujoco*.dylib"}
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))

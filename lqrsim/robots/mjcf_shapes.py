@@ -35,19 +35,13 @@ _UNBOUNDED = 1e6  # m, a distance beyond all obstacles
 
 
 class MjcfGeoms(CollisionGeoms):
-    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
-
-    Attributes:
-      pairs: (K, 2) geoms that may collide, the second of which is an obstacle. obstacles: (K,) its index in the scene.
-      levers: (nv,) in m/rad, or 1 for slides, as `mjcf_obstacles.levers` has them.
-    """
+    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self.pairs = mjcf_obstacles.pairs_of(scene.model, list(scene.geoms))
-        self.levers = mjcf_obstacles.levers(scene.model)
+        self.scene, self.levers = scene, mjcf_obstacles.levers(scene.model)
+        self.pairs = mjcf_obstacles.pairs_of(scene.model, list(scene.geoms))  # (K, 2), each with an obstacle as second
         number = {geom: i for i, geom in enumerate(scene.geoms)}
-        self.obstacles = np.array([number[geom] for geom in self.pairs[:, 1].tolist()], dtype=np.int64)
+        self.obstacles = np.array([number[geom] for geom in self.pairs[:, 1].tolist()], dtype=np.int64)  # in the scene
 
     @property
     def size(self) -> float:
@@ -75,14 +69,10 @@ class MjcfGeoms(CollisionGeoms):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GeomsInWorld(ShapeInWorld):
-    """The geoms of an MJCF among all or some obstacles of its scene.
-
-    Attributes:
-      numbers: (O,) the index in the scene of each obstacle.
-    """
+    """The geoms of an MJCF among all or some obstacles of its scene."""
 
     geoms: MjcfGeoms
-    numbers: npt.NDArray[np.int64]
+    numbers: npt.NDArray[np.int64]  # (O,), the index in the scene of each obstacle
 
     @property
     def depends_on(self) -> tuple[int, ...]:
@@ -182,19 +172,13 @@ class GeomsInWorld(ShapeInWorld):
 class SelfClearance(Constraint):
     """`distance(link, other link) >= margin` at the steps, by MuJoCo's distances; `MjcfRobot.self_clearance` makes it.
 
-    The links are those that MuJoCo lets collide: neither fixed to each other nor parent and child, not in an
-    `<exclude>` of the MJCF, and of geoms whose `contype` and `conaffinity` fit; and the geoms of each `<pair>`. Links
-    that touch in every position of the joints are left out.
-
-    Attributes:
-      margin: the margin in metres. links: the pairs of links that are kept apart, by the names of their bodies.
+    The links are those of `mjcf_obstacles.link_pairs`; `links` has their pairs, by the names of their bodies.
     """
 
     @checked
     def __init__(self, mjcf: MjcfModel, body: str, margin: Finite = 0.0) -> None:
         model = mjcf.model
-        self.margin = margin
-        self._mjcf, self._pairs = mjcf, mjcf_obstacles.link_pairs(model, model.body(body).id)
+        self.margin, self._mjcf, self._pairs = margin, mjcf, mjcf_obstacles.link_pairs(model, model.body(body).id)
         geom_bodies = model.geom_bodyid[self._pairs]
         bodies = np.sort(
             np.where(model.body_weldid[geom_bodies] != 0, model.body_weldid[geom_bodies], geom_bodies), axis=1
@@ -268,10 +252,9 @@ def _module(states: int) -> Any:
 
 
 class MjcfBalls(CollisionSpheres):
-    """Balls that are fixed to bodies of an MJCF and cover its colliding geoms; `MjcfRobot` makes them.
+    """Balls that are fixed to bodies of an MJCF and cover its colliding geoms, as `outline` of `MjcfRobot` says.
 
-    A sphere is a ball, a capsule a chain of balls, and for any other geom a ball about its centre contains it. The last
-    ball is in the centre of a geom. Geoms that are only drawn count if nothing collides.
+    The last ball is in the centre of a geom. Geoms that are only drawn count if nothing collides.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:

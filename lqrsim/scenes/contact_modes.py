@@ -65,25 +65,18 @@ class Switches:
 
 @dataclass(frozen=True, eq=False)
 class Period:
-    """A control period, linearised in its contact mode.
+    """A control period, linearised in its contact mode."""
 
-    Attributes:
-      state: (n,) at its end. jacobian: (n, n+m). switches: k switches. slopes: (k, n+m), NaN if unknown.
-    """
-
-    state: Array
-    jacobian: Array
+    state: Array  # (n,) at its end
+    jacobian: Array  # (n, n+m)
     switches: Switches
-    slopes: Array
+    slopes: Array  # (k, n+m) of the switches, NaN if unknown
 
 
 class ContactModes:
-    """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
+    """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step."""
 
-    Attributes:
-      check_time: called before each part of a long computation, which its exception ends.
-    """
-
+    # Called before each part of a long computation, which its exception ends.
     check_time: Callable[[], None] = staticmethod(lambda: None)
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:

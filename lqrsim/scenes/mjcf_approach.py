@@ -33,17 +33,14 @@ _DAMPING, _FIRST, _OTHERS, _CHANGE, _OFF = 1e-3, 30, 4, 0.3, 0.5
 
 
 class Approaches:
-    """The approaches to a body, of which iterating gives their words and positions (T+1, nv).
+    """The approaches to a body: iterating gives each in words, and as positions (T+1, nv) in the form of states.
 
-    Positions are in the form of states, NaN where the robot is free to move otherwise.
+    Positions are NaN where the robot is free to move otherwise. `body_geoms` are the ids of the body's geoms that can
+    collide, `tools` those of the driven geoms that can collide with them, the nearest first.
 
     Args:
-      states: (T+1, n) of a plan in which nothing touches the body. change: (nv,) by how much the positions of the body
-        are to change until the end.
-
-    Attributes:
-      body_geoms: ids of the geoms of the body that can collide. tools: ids of the driven geoms that can collide with
-        them, the nearest first.
+      states: (T+1, n) of a plan in which nothing touches the body.
+      change: (nv,) by how much the positions of the body are to change until the end.
     """
 
     def __init__(self, mjcf: MjcfModel, states: Array, change: Array) -> None:

@@ -34,19 +34,12 @@ _FALLS = 200  # heights at which a body that is let down may touch: thinner supp
 
 @dataclass(frozen=True, eq=False)
 class Holding:
-    """Controls, and the forces that they leave.
+    """Controls that come nearest to holding the robot still, and the forces that they leave."""
 
-    Attributes:
-      controls: (nu,), within their limits, that come nearest to holding the robot still.
-      activations: (na,), the states of actuators, at rest with these controls.
-      missed: (nv,), the missing force of each joint in N or N m; 0 for joints that follow others.
-      drifting: (nactuator,), whose activations are not at rest: as an integrator's whose control cannot be 0.
-    """
-
-    controls: Array
-    activations: Array
-    missed: Array
-    drifting: npt.NDArray[np.bool_]
+    controls: Array  # (nu,), within their limits
+    activations: Array  # (na,), the states of actuators, at rest with these controls
+    missed: Array  # (nv,), the missing force of each joint in N or N m; 0 for joints that follow others
+    drifting: npt.NDArray[np.bool_]  # actuators with activations not at rest: integrators whose control cannot be 0
     held: bool
 
 
@@ -171,9 +164,9 @@ class _AtRest:
 
 @unlogged()
 def holding(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> Holding:
-    """The controls with which nothing accelerates at rest and activations stay, by a model at positions (nq,).
+    """The smallest controls with which nothing accelerates at rest and activations stay, by a model at positions (nq,).
 
-    Of several, the smallest. If there are none, those with the least sum of squared remaining forces nearby.
+    If there are none, those with the least sum of squared remaining forces nearby.
     """
     rest = _AtRest(mjcf, model, qpos)
     search = _Search(rest)
@@ -267,9 +260,8 @@ class _Search:
     def _aim(self, z: Array, linear: _Linear, neutral: Array) -> Array | None:
         """The z that holds if forces and rates are linear, or comes nearest; None if activations cannot do as said.
 
-        Of several it is the one nearest to `neutral`.
-
-        The unknowns are the change of z and, for each limit of a force, the part of the force that it cuts off.
+        Of several it is the one nearest to `neutral`. The unknowns are the change of z and, for each limit of a force,
+        the part of the force that it cuts off.
         """
         rest, model, nu, count = self._rest, self._rest.model, self._rest.model.nu, len(z)
         width = count + len(self._limited) + len(self._limited_dofs)
@@ -331,10 +323,7 @@ class _Search:
 
 
 def _left_nonzero(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Of the rates now + rates x of an actuator, with low <= x <= high: what they are, and which are left nonzero.
-
-    Those are as few as may be, of several the last.
-    """
+    """The rates now + rates x of an actuator, low <= x <= high; and those left nonzero: the fewest, rather the last."""
     from scipy.optimize import lsq_linear
 
     tight = np.where(low == high, _TIGHT, 0.0)  # lsq_linear refuses such bounds
@@ -491,9 +480,7 @@ def falling(model: mujoco.MjModel, qpos: Array) -> dict[int, Array | float]:
 
 
 def _let_down(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) -> Array:
-    """Positions (nq,) in which each base that touches nothing is lower along gravity, if it touches something there,
-    within the size of the model.
-    """
+    """Positions (nq,) with each base that touches nothing let down to what is below it, within the model's size."""
     data, lowered, most = mujoco.MjData(model), qpos.copy(), model.stat.extent
 
     def touches(joint: int, down: Array | float, fall: float) -> bool:
@@ -525,7 +512,7 @@ def _free_joints(
 ) -> tuple[npt.NDArray[np.intp], Array]:
     """The free joints, and the map from forces on all joints to those on them, (free, nv), through equalities.
 
-    In a loop those follow that are not driven, as far as there are enough of them.
+    In a loop, undriven joints follow the others as far as there are enough of them.
     """
     if not model.eq_active0.any():
         return np.arange(model.nv), np.eye(model.nv)

@@ -87,11 +87,9 @@ class Equalities:
         return data.efc_pos[rows].copy(), data.efc_J.reshape(-1, self.model.nv)[rows].copy()
 
     def met(self, qpos: Array, aim: Array, fixed: npt.NDArray[np.bool_]) -> Array | None:
-        """Positions (nq,) at which they are met, as little away from those given as may be; None if none was found.
+        """Positions (nq,) nearest to qpos at which they are met; None if none were found.
 
-        Args:
-          qpos: to begin with. aim: where the fixed degrees of freedom, (nv,), go. The others follow them in small
-            steps, so that a loop does not flip over.
+        The fixed degrees of freedom, (nv,), go to `aim`; others follow in small steps, so that no loop flips over.
         """
         positions, move, model = qpos.copy(), np.zeros(self.model.nv), self.model
         mujoco.mj_differentiatePos(model, move, 1.0, qpos, aim)
@@ -125,17 +123,11 @@ class Equalities:
 
 @dataclass(frozen=True)
 class Axes:
-    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2).
+    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2)."""
 
-    Attributes:
-      of: degree of freedom -> axis, where its position is the origin's coordinate.
-      shifted: degree of freedom -> its axis and the origin's coordinate at its zero, where that is another one.
-      moving: whether anything moves the origin along each axis, (3,).
-    """
-
-    of: dict[int, int]
-    shifted: dict[int, tuple[int, float]]
-    moving: tuple[bool, ...]
+    of: dict[int, int]  # degree of freedom -> axis, where its position is the origin's coordinate
+    shifted: dict[int, tuple[int, float]]  # otherwise -> its axis, and the origin's coordinate at its zero
+    moving: tuple[bool, ...]  # whether anything moves the origin along each axis
 
 
 def position_of(mjcf: "MjcfModel", body: int) -> Axes:
@@ -201,10 +193,7 @@ def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:
-    """The largest distance of the colliding geoms of a body, or of bodies that it carries, from its origin, in metres.
-
-    If no geom collides, the visual geoms count instead.
-    """
+    """How far the colliding geoms, else all geoms, of a body and of what it carries reach from its origin, in m."""
     collides = colliding(model) & (model.body_rootid[model.geom_bodyid] == model.body_rootid[body])
     reach = 0.0
     for geom in np.flatnonzero(collides).tolist() if collides.any() else range(model.ngeom):

@@ -43,22 +43,16 @@ Side = tuple[float, float]  # the least and the largest; infinite without a limi
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint.
-
-    Attributes:
-      kind: free, ball, slide or hinge.
-      qpos, dofs: its indices in qpos and in qvel. limits: limits of a slide or hinge, in m or rad, or None.
-      forces: limits of the sum that actuators exert on it, in N or N m, with gravity compensation if that is theirs.
-      speed: largest speed of a slide or hinge, in m/s or rad/s, infinite if none is stated. MuJoCo does not know it: it
-        is the number `<numeric name="NAME_velocity_limit">` in the <custom> section.
-    """
+    """A joint."""
 
     name: str
-    kind: str
-    qpos: slice
-    dofs: slice
-    limits: Side | None
-    forces: Side
+    kind: str  # free, ball, slide or hinge
+    qpos: slice  # its indices in qpos
+    dofs: slice  # and in qvel
+    limits: Side | None  # of a slide or hinge, in m or rad
+    forces: Side  # of the sum that actuators exert on it, in N or N m, with gravity compensation if that is theirs
+    # The largest speed of a slide or hinge, in m/s or rad/s, infinite if none is stated. MuJoCo does not know it: it is
+    # the number `<numeric name="NAME_velocity_limit">` in the <custom> section.
     speed: float
 
     @property
@@ -97,23 +91,18 @@ class Actuator:
     The input is its control, or the last of its activations if it has some. The force is clipped to `forces`; times the
     moment arm, which for a slide or hinge is the gear, it acts on the joint, whose sum is clipped to `Joint.forces`.
 
-    Attributes:
-      joint: name of the joint that it acts on; None if it acts on something else.
-      controls, activations, outputs: its indices in ctrl, act and actuator_force; it may have several of each.
-      inputs: MuJoCo's names of its controls, such as pos and vel; empty for one that is just a command.
-      forces: limits of its force, in N or N m. gear: of its first output.
-      gain, bias: three numbers each; None if the force has another form, as of muscles, `pid` and `dcmotor`.
+    `controls`, `activations` and `outputs` are its indices in ctrl, act and actuator_force; there may be several.
     """
 
     name: str
-    joint: str | None
+    joint: str | None  # that it acts on; None if it acts on something else
     controls: slice
     activations: slice
     outputs: slice
-    inputs: tuple[str, ...]
-    forces: Side
-    gear: float
-    gain: tuple[float, ...] | None
+    inputs: tuple[str, ...]  # MuJoCo's names of its controls, such as pos and vel; empty for just a command
+    forces: Side  # in N or N m
+    gear: float  # of its first output
+    gain: tuple[float, ...] | None  # three numbers, as bias; None for other forms, as of muscles, `pid` and `dcmotor`
     bias: tuple[float, ...] | None
 
 
@@ -129,17 +118,11 @@ class Number:
 @checked
 @dataclass(frozen=True, eq=False)
 class MjcfModel:
-    """An MJCF: its text, and what MuJoCo compiles from it, once, when it is first asked for.
+    """An MJCF: its text, and what MuJoCo compiles from it, once, when it is first asked for."""
 
-    Attributes:
-      name: name of the packaged scene, or the stem of the file.
-      xml: the whole MJCF as text, with includes resolved. The model can be made from it alone.
-      turns_about: the axis about which a robot's free and ball joints turn on and on, see `MjcfRobot`; or None.
-    """
-
-    name: str
-    xml: str
-    turns_about: str | None = None
+    name: str  # of the packaged scene, or the stem of the file
+    xml: str  # the whole text, with includes resolved; the model can be made from it alone
+    turns_about: str | None = None  # the axis about which a robot's free and ball joints turn on; see `MjcfRobot`
 
     @classmethod
     def of_file(cls, name_or_path: str | os.PathLike[str]) -> "MjcfModel":

@@ -1,6 +1,4 @@
-"""Obstacles, primitives and convex hulls, and the world, a set of them; distances are in `kernels/signed_distance.py`
-and `kernels/hull_distance.py`.
-"""
+"""Obstacles, which are primitives and convex hulls, and the world, a set of them. Kernels compute the distances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -109,11 +107,7 @@ class Obstacle:
 @checked
 @dataclass(frozen=True, eq=False)
 class World:
-    """A set of obstacles.
-
-    Attributes:
-      obstacles: in the order in which they are numbered.
-    """
+    """A set of obstacles, in the order in which they are numbered."""
 
     _want = "a World, such as scene.world"
 
@@ -224,17 +218,11 @@ class World:
         return World([seen(obstacle) for obstacle in obstacles if not _parallel(obstacle, across)])
 
     def upright(self) -> "World":
-        """The obstacles of a plane as infinite prisms, for hulls in it.
-
-        Raises InputError if the outline of one depends on the height.
-        """
+        """The obstacles of a plane as infinite prisms. Raises InputError if an outline depends on the height."""
         return World([_prism(obstacle) for obstacle in self.obstacles])
 
     def distances(self, point: npt.ArrayLike) -> Array:
-        """The signed distances in metres to each obstacle, (len(self),), of a point (2,) or (3,); negative inside.
-
-        A point (2,) is for a world that is seen by a robot in the plane, in its coordinates.
-        """
+        """Signed distances (len(self),) in m to the obstacles, of a point (3,) or in a plane (2,); negative inside."""
         x, y, z = (*_places("point", point, single=True).tolist(), 0.0)[:3]
         return np.array([
             hull_distance(self.table, ROW * i, np.array([x, y, z]), 0, 1, np.empty(3)) if obstacle.kind == "mesh"
