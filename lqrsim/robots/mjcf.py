@@ -90,8 +90,8 @@ class MjcfRobot(Robot):
         body that has mass, its own mass or the mass of bodies fixed to it.
       position: the 2 or 3 states that are the body's position in the world, in metres; by default found by MuJoCo's
         kinematics. () for none.
-      radius: radius of a ball about the body's origin that contains everything that may collide; by default that of one
-        which does so however joints turn about the origins of their bodies, with slides at rest.
+      radius: radius of a ball about the body's origin that contains everything that may collide; by default of one that
+        does so at any angles of the joints, with slides at rest.
       outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
         it has no position. A sphere gets one ball, a capsule a chain of balls, any other geom its bounding ball. The
         balls are cheap bounds of the colliding geoms, and pictures follow them.
@@ -117,7 +117,7 @@ class MjcfRobot(Robot):
         *,
         body: str | None = None,
         position: Sequence[str] | None = None,
-        radius: float | None = None,
+        radius: NonNegative | None = None,
         outline: bool | None = None,
         floors: bool = True,
         obstacles: Choice = True,
@@ -167,8 +167,7 @@ class MjcfRobot(Robot):
                 high=tuple(control.high for control in mjcf.controls),
             ),
         )  # fmt: skip
-        reach = reach_of(model, number) if radius is None else radius
-        self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
+        self.radius = reach_of(model, number) if radius is None else radius
         many = not dofs and len(solid_geoms(model)) > 0 if outline is None else outline
         self.balls = MjcfBalls(model) if many else None
 
@@ -227,10 +226,9 @@ class MjcfRobot(Robot):
 
     @property
     def force_limits(self) -> ForceLimits:
-        """The limits of forces as constraints, for a problem with `unlimited` as its dynamics.
+        """The limits of forces as constraints, for a problem with `unlimited` as its dynamics; see `ForceLimits`.
 
-        They are those of `forcerange` and `actuatorfrcrange` where the force is linear in state and control, as of
-        motors and servos. MuJoCo clips forces, and a solver cannot tell how a force that is clipped comes back.
+        They are those of `forcerange` and `actuatorfrcrange` where the force is linear, as of motors and servos.
         """
         if not self._forces[0]:
             raise InputError(f"MjcfRobot {self.name}: force_limits: got none that are linear, want problems without")
@@ -249,10 +247,8 @@ class MjcfRobot(Robot):
         """
         constraint = SelfClearance(self.mjcf, self.body, margin)
         if not constraint.links:
-            want = "an MJCF that lets two links collide"
-            raise InputError(
-                f"MjcfRobot {self.name}: self_clearance: got no pair of links that can collide, want {want}"
-            )
+            want = "want an MJCF that lets two links collide"
+            raise InputError(f"MjcfRobot {self.name}: self_clearance: got no pair of links that can collide, {want}")
         return constraint
 
     def with_parameters(self, **values: float) -> "MjcfRobot":
@@ -392,10 +388,9 @@ class MjcfRobot(Robot):
             self._warn_of_near(np.array([start, goal]), clearance)
             constraints.append(Clearance(self.scene.world, **self.shape, margin=clearance))
         if self_clearance is not None:
-            constraint = self.self_clearance(self_clearance)
-            for field, state in (("start", start), ("goal", goal)):
-                constraint.check(field, dynamics, state)
-            constraints.append(constraint)
+            constraints.append(constraint := self.self_clearance(self_clearance))
+            constraint.check("start", dynamics, start)
+            constraint.check("goal", dynamics, goal)
         control_range = np.array([controls.low, controls.high])
         forces = ForceLimits([limit for limit in self._forces[0] if limit.can_be_kept(start, *control_range)])
         if force_limits and forces.limits:
@@ -476,12 +471,12 @@ class MjcfRobot(Robot):
             if model.dof_jntid[worst] in falls and self.mjcf.joints[model.dof_jntid[worst]].name not in driven:
                 shortfall += "; what stands on the ground starts from robot.at_rest(robot.at())"
                 shortfall += ", on the command line with at_rest=True"
+        position = ", ".join(space.names[i] for i in space.position)
+        where = f"with the position {position}" if position else "whose position is not among the states"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",
-            f"  body: {self.body}, with the position {', '.join(space.names[i] for i in space.position)}"
-            if space.position
-            else f"  body: {self.body}, whose position is not among the states",
+            f"  body: {self.body}, {where}",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
             f"  held at rest by: {listed(commands)}{shortfall}",
             *(f"  {title}: {listed(entries)}" for title, entries in self._remarks().items() if entries),

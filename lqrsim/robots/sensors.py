@@ -64,11 +64,8 @@ class Sensor:
 class RobotSensors:
     """Sensors of a robot's MJCF, made by `plant.sensors(...)`. Their readings (K, Y) are those of all sensors in turn.
 
-    Attributes:
-      sensors: the sensors, with the file's noise, rate and delay where none were given.
-      columns: the columns of each sensor in the readings. names: of the columns, (Y,).
-      drag: the robot's, in N s/m, by which a wind is a force.
-      quaternions: for each sensor, whether it reads a quaternion: this and its negative mean the same.
+    `columns` are those of each sensor in the readings, and `names` those of the columns, (Y,). `quaternions` says which
+    sensors read a quaternion, which means the same as its negative. By `drag`, the robot's, a wind is a force.
     """
 
     _prefix = ""

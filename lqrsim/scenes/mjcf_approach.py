@@ -9,10 +9,9 @@ from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_kinematics import colliding
+from lqrsim.scenes.mjcf_kinematics import carriers, colliding
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_obstacles import touching_pairs
 from lqrsim.scenes.mujoco_log import unlogged
@@ -48,9 +47,7 @@ class Approaches:
         model = self._model
         self._data, self._positions, self._change = mujoco.MjData(model), states[:, : model.nv], change
         root = int(model.body_weldid[model.dof_bodyid[np.argmax(np.abs(change))]])
-        carried: npt.NDArray[np.bool_] = np.zeros(model.nbody, dtype=np.bool_)  # what the body carries, with it
-        for body in range(model.nbody):  # parents come first
-            carried[body] = body == root or (body > 0 and carried[model.body_parentid[body]])
+        carried = np.array([root in carriers(model, body) for body in range(model.nbody)])
         self.body_geoms = np.flatnonzero(carried[model.geom_bodyid] & colliding(model)).tolist()
         self._place(self._positions[0])
         driven = np.unique(model.dof_treeid[self._data.moment_colind[: self._data.moment_rownnz.sum()]])

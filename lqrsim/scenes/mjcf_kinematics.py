@@ -205,7 +205,12 @@ def reach_of(model: mujoco.MjModel, body: int) -> float:
 
 def path_to(model: mujoco.MjModel, geom: int, body: int) -> list[int] | None:
     """The bodies from a geom's own up to `body`, without it; None if that one does not carry the geom."""
-    path = [int(model.geom_bodyid[geom])]
-    while path[-1] not in (0, body):
-        path.append(int(model.body_parentid[path[-1]]))
-    return path[:-1] if path[-1] == body else None
+    path = list(carriers(model, int(model.geom_bodyid[geom])))
+    return path[: path.index(body)] if body in path else None
+
+
+def carriers(model: mujoco.MjModel, body: int) -> Iterator[int]:
+    """A body, and those that carry it, up to the world, without it."""
+    while body:
+        yield body
+        body = int(model.body_parentid[body])

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Finite, checked
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_kinematics import colliding, driven_trees, placed, posed
+from lqrsim.scenes.mjcf_kinematics import carriers, colliding, driven_trees, placed, posed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -180,20 +180,13 @@ def levers(model: mujoco.MjModel) -> Array:
 
 def _base(model: mujoco.MjModel) -> set[int]:
     """The bodies that carry the moving bodies, up to the world, and everything fixed to the last of these."""
-    fixed, base, carriers = model.body_weldid == 0, set[int](), set[int]()
-    for body in np.flatnonzero(~fixed).tolist():
-        parent = int(model.body_parentid[body])
-        if fixed[parent] and parent:
-            carriers.add(parent)
-    for body in carriers:
-        parent = body
-        while parent:
-            base.add(parent)
-            parent = int(model.body_parentid[parent])
+    fixed, parents = model.body_weldid == 0, model.body_parentid.tolist()
+    mounts = {parents[body] for body in np.flatnonzero(~fixed).tolist() if fixed[parents[body]]} - {0}
+    base = {link for body in mounts for link in carriers(model, body)}
     for body in range(1, model.nbody):  # children come after their parents
-        if fixed[body] and int(model.body_parentid[body]) in carriers:
-            carriers.add(body)
-    return base | carriers
+        if fixed[body] and parents[body] in mounts:
+            mounts.add(body)
+    return base | mounts
 
 
 def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
@@ -277,10 +270,9 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
 
 def _joints(model: mujoco.MjModel, body: int) -> Iterator[tuple[int, int]]:
     """The kind and number of each joint between a body and the world."""
-    while body:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    for link in carriers(model, body):
+        first, count = int(model.body_jntadr[link]), int(model.body_jntnum[link])
         yield from ((int(model.jnt_type[joint]), joint) for joint in range(first, first + count))
-        body = int(model.body_parentid[body])
 
 
 def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:

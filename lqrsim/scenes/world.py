@@ -222,7 +222,7 @@ class World:
         return World([_prism(obstacle) for obstacle in self.obstacles])
 
     def distances(self, point: npt.ArrayLike) -> Array:
-        """Signed distances (len(self),) in m to the obstacles, of a point (3,) or in a plane (2,); negative inside."""
+        """The signed distances (len(self),) in m of a point (3,), or (2,) in a plane; negative inside an obstacle."""
         x, y, z = (*_places("point", point, single=True).tolist(), 0.0)[:3]
         return np.array([
             hull_distance(self.table, ROW * i, np.array([x, y, z]), 0, 1, np.empty(3)) if obstacle.kind == "mesh"

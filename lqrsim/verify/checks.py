@@ -19,7 +19,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenes.mjcf_kinematics import posed
+from lqrsim.scenes.mjcf_kinematics import carriers, posed
 from lqrsim.verify.verdict import Criterion, Verification, compare
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
@@ -178,10 +178,8 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
     Else the largest one of the body that can collide; else of the body; else of the bodies that carry it, the nearest
     first; else of any other body of the robot.
     """
-    carriers, above = [body], body
-    while above := int(model.body_parentid[above]):
-        carriers.append(above)
-    nearness = {int(model.body_weldid[carrier]): level for level, carrier in reversed([*enumerate(carriers)])}
+    links = list(carriers(model, body))
+    nearness = {int(model.body_weldid[link]): level for level, link in reversed([*enumerate(links)])}
     ranked = list[tuple[tuple[bool, int, bool, float], int]]()
     for geom in np.flatnonzero(np.isin(model.geom_type, [kind.value for kind in SYMMETRIC_KINDS])).tolist():
         owner, welded = int(model.geom_bodyid[geom]), int(model.body_weldid[model.geom_bodyid[geom]])
@@ -189,7 +187,7 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
             continue
         followed = place is not None and owner == body and np.allclose(model.geom_pos[geom], place, rtol=0, atol=1e-9)
         collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
-        level = 0 if owner == body else 1 + nearness.get(welded, len(carriers))
+        level = 0 if owner == body else 1 + nearness.get(welded, len(links))
         ranked.append(((not followed, level, not collides, -float(model.geom_rbound[geom])), geom))
     if not ranked:
         raise InputError("rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box")
