@@ -18,9 +18,7 @@ from lqrsim.robots.base import Robot, configuration_of
 class DifferentialDrive(Robot):
     """State: (x, y, heading) of the middle of the axle. Control: speed of the left and the right wheel.
 
-    MJCF: models/create.xml.
-
-    Lengths are in m.
+    Lengths are in m. MJCF: models/create.xml.
 
     Attributes:
       max_speed: largest speed of a wheel's rim in m/s, in either direction.

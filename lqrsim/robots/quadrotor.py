@@ -19,9 +19,7 @@ from lqrsim.robots.base import Robot, configuration_of
 class Quadrotor(Robot):
     """State: position, velocity in world axes, rotation vector, angular velocity in body axes. Control: rotor forces.
 
-    Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. MJCF: models/quadrotor.xml.
-
-    Numbers are in kg, m, s and N.
+    Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. Numbers are in kg, m, s and N. MJCF: models/quadrotor.xml.
 
     Attributes:
       inertia: moment of inertia about each axis in kg m^2.

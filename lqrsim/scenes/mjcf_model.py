@@ -22,10 +22,6 @@ from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.urdf import is_urdf, read_urdf
 from lqrsim.scenes.world import KINDS, World
 
-_KINDS = {
-    mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball", mujoco.mjtJoint.mjJNT_SLIDE: "slide",
-    mujoco.mjtJoint.mjJNT_HINGE: "hinge",
-}  # fmt: skip
 _OF_REVOLUTION = (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -155,7 +151,8 @@ class MjcfModel:
     def joints(self) -> tuple[Joint, ...]:
         model, joints = self.model, list[Joint]()
         for number in range(model.njnt):
-            kind, name = _KINDS[mujoco.mjtJoint(model.jnt_type[number])], _joint_name(model, number)
+            kind = mujoco.mjtJoint(model.jnt_type[number]).name.removeprefix("mjJNT_").lower()
+            name = _joint_name(model, number)
             firsts = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
             qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
             single = kind in ("slide", "hinge")

@@ -34,12 +34,10 @@ MOST_USER = 10_000
 MOST_PIXELS = 8192**2  # of a texture that MuJoCo makes
 MOST_COPIES = 1_000_000  # largest number of elements from <replicate>: they take MuJoCo minutes, and GBs
 _COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of the elements that they make
-_MASSES = frozenset(
-    (
-        "mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "boundmass", "boundinertia",
-        "armature",
-    )
-)  # fmt: skip
+_MASSES = {
+    "mass", "density", "viscosity", "armature", "diaginertia", "fullinertia", "settotalmass", "boundmass",
+    "boundinertia",
+}  # fmt: skip
 _NAN = re.compile(r"(^|[\s,])[+-]?nan")
 
 

@@ -105,13 +105,7 @@ THIN, FILLED, THINNEST, FINEST = 16.0, 2.0, 1.0, 4
 ROUND = 1e-3  # relative difference of the widths of a silhouette that counts as a circle
 DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged robots
 # Orthographic silhouettes of these geoms are symmetric about their centre in any orientation.
-SYMMETRIC_KINDS = (
-    Geom.mjGEOM_SPHERE,
-    Geom.mjGEOM_CAPSULE,
-    Geom.mjGEOM_ELLIPSOID,
-    Geom.mjGEOM_CYLINDER,
-    Geom.mjGEOM_BOX,
-)
+SYMMETRIC_KINDS = Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE, Geom.mjGEOM_ELLIPSOID, Geom.mjGEOM_CYLINDER, Geom.mjGEOM_BOX
 
 
 @checked

@@ -396,11 +396,8 @@ class _Recording:
                 self._send(["numbers", *entity], times, self.rerun.Scalars.columns(scalars=values[finite]))
 
     def _points(self, entity: list[str], times: Array, points: Array, colour: npt.ArrayLike, radius: float) -> None:
-        count = len(points)
-        columns = self.rerun.Points3D.columns(
-            positions=points, colors=[in_bytes(colour)] * count, radii=[radius] * count
-        )
-        self._send(entity, times, columns)
+        colours, radii = [in_bytes(colour)] * len(points), [radius] * len(points)
+        self._send(entity, times, self.rerun.Points3D.columns(positions=points, colors=colours, radii=radii))
 
     @staticmethod
     def _ellipsoids(centres: Array, half_axes: Array, rotations: Array) -> dict[str, Any]:

@@ -205,16 +205,9 @@ def _begin_view(axes: Axes, low: Array, high: Array, names: str) -> None:
 def draw_projected(axes: Axes, world: World, low: Array, high: Array, plane: list[int]) -> None:
     """Draw translucent projections of obstacles between two corners (3,) onto the plane of two axes."""
     solid = [obstacle for obstacle in world.obstacles if obstacle.kind != "plane"]
+    over_tubes = {"facecolor": (SOLID, 0.35), "edgecolor": EDGE, "linewidth": 0.6, "zorder": 1.6}  # which show through
     for number, obstacle in enumerate(solid):
-        label = None if number else "obstacle"
-        axes.fill(
-            *_outline(obstacle, low, high, plane).T,
-            facecolor=(SOLID, 0.35),
-            edgecolor=EDGE,
-            linewidth=0.6,
-            label=label,
-            zorder=1.6,  # over tubes, which show through
-        )
+        axes.fill(*_outline(obstacle, low, high, plane).T, label=None if number else "obstacle", **over_tubes)
     _begin_view(axes, low[plane], high[plane], "".join("xyz"[axis] for axis in plane))
 
 
