@@ -70,10 +70,7 @@ class Robot(abc.ABC):
     @property
     @abc.abstractmethod
     def dynamics(self) -> "Dynamics":
-        """The analytic model `xdot = f(x, u)` that policies are computed from.
-
-        It is read often: make it once, such as with `functools.cached_property`.
-        """
+        """The analytic model `xdot = f(x, u)`. It is read often: make it once, as with `functools.cached_property`."""
 
     @abc.abstractmethod
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:

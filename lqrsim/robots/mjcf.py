@@ -97,8 +97,8 @@ class MjcfRobot(Robot):
         balls are cheap bounds of the colliding geoms, and pictures follow them.
       floors: whether there is ground for standing on: level planes and height fields, if a joint lets the robot sink to
         them, and all geoms on which it stands and that a free joint or a slide moves it over.
-      obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
-        none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
+      obstacles: others than by default, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the
+        plan, too.
       turns_about: whether free and ball joints turn about this axis on and on: of the world, or of a ball's
         parent body. The entry along it, such as `<name>_rz`, is then a turn about it, however many times, after a tilt,
         the rotation vector of the other two. Only a tilt of half a turn is singular, as upside down. By default all
@@ -264,8 +264,7 @@ class MjcfRobot(Robot):
 
         They are the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
         those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
-        which activations never rest, as an integrator's whose control cannot be 0. Velocities of the state do not
-        count, nor do its activations, which are set to the values that hold it.
+        which activations never rest. Velocities and activations of the state do not count.
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
@@ -344,8 +343,8 @@ class MjcfRobot(Robot):
         Args:
           dt: the control period in seconds; by default about 0.02.
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
-            that are not named then have none. The turn of a wheel has none unless it is named or (n,) are given, or the
-            goal turns it: a hinge without limits, about the axis of all that collides on its body.
+            that are not named then have none. The turn of a wheel (`MjcfModel.wheels`) has none unless it is named or
+            (n,) are given, or the goal turns it.
           effort: weights of the controls, in the same form. By default 1 over the square of a control's largest value,
             so that a deviation of that size costs 1/2. The largest value comes from the control limits, else from the
             force limits, else it is 1.
@@ -353,10 +352,8 @@ class MjcfRobot(Robot):
             step; half of it is that of its angular velocity. With 0, nothing keeps a plan from tumbling on its way.
           limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
             it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
-          clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
-            default obstacles only add cost.
-          self_clearance: least distance in metres of links that MuJoCo lets collide, as a constraint: the method
-            `self_clearance`; by default links may touch, as MuJoCo has it.
+          clearance: least distance to all obstacles in metres, as a constraint; by default obstacles only add cost.
+          self_clearance: margin of the constraint `self_clearance`; by default links may touch, as MuJoCo has it.
           force_limits: whether limits of forces are constraints, as in `force_limits`, and not in the dynamics. Those
             that no control keeps at the start stay in the dynamics, as all do if MuJoCo's steps are unstable without
             them, or with False: then forces may saturate.

@@ -189,11 +189,9 @@ def _functions() -> dict[int, float]:
 class MjcfDynamics(Dynamics):
     """`x' = g(x, u)`, by MuJoCo's steps of a whole control period; `MjcfRobot` makes it.
 
-    The state is the position of each joint, in MuJoCo's order of degrees of freedom and with rotations of ball and free
-    joints as rotation vectors, or with `turns_about` as turns and tilts; then the velocities; then the states of
-    actuators that have states. The control is MuJoCo's `ctrl`. Derivatives are products of those of the physics steps,
-    differences that are each good to 1e-5 of the largest entry; those of an arm's period are good to some 1e-7. There
-    is no rate: solvers in continuous time, and solvers that need an inverse, do not accept these dynamics.
+    `MjcfRobot` says what states and controls are. Derivatives are products of those of the physics steps, differences
+    that are each good to 1e-5 of the largest entry; those of an arm's period are good to some 1e-7. There is no rate:
+    solvers in continuous time, and solvers that need an inverse, do not accept these dynamics.
     """
 
     by_mujoco: bool = True
@@ -299,8 +297,8 @@ class MjcfDynamics(Dynamics):
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
 
-        A body's inertia scales with its mass; several numbers of a gear keep their ratios. Forces on the body are also
-        parameters: `dynamics.disturbed.with_parameters(force_x=1.0)`.
+        A body's inertia scales with its mass; several numbers of a gear keep their ratios. Of `disturbed`, forces on
+        the body are also parameters: `dynamics.disturbed.with_parameters(force_x=1.0)`.
         """
         numbers = self.numbers
         for name in values:
@@ -320,8 +318,7 @@ class MjcfDynamics(Dynamics):
 
     @unlogged()
     def touches(self, states: Array) -> bool:
-        positions = self._qpos_of(states[np.isfinite(states).all(axis=1)])
-        poses = posed(self.physics.model, positions, mujoco.mj_fwdPosition)
+        poses = self._posed(self.physics.model, states[np.isfinite(states).all(axis=1)])
         return any(np.isin(data.efc_type, _ONE_SIDED).any() for data in poses)
 
     @unlogged()
@@ -330,7 +327,7 @@ class MjcfDynamics(Dynamics):
         model.geom_margin[:] += _GRAZED
         ground = np.isin(model.geom_type, [int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)])
         passed = np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & ~ground)
-        for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
+        for data in self._posed(model, states):
             touched.append(set(passed[np.isin(passed, data.contact.geom)].tolist()))
         met = set[int]().union(*touched) - touched[0] - touched[-1]
         if not met:
@@ -343,15 +340,15 @@ class MjcfDynamics(Dynamics):
         if state >= 2 * model.nv:  # of an actuator
             return ""
         body, welds = int(model.dof_bodyid[state % model.nv]), model.body_weldid
-        for data in posed(model, self._qpos_of(states), mujoco.mj_fwdPosition):
+        for data in self._posed(model, states):
             for pair in data.contact.geom:
                 first, second = (int(welds[model.geom_bodyid[geom]]) for geom in pair)
                 if int(welds[body]) in (first, second) and first and second:
                     return ""
         return model.body(body).name
 
-    def _qpos_of(self, states: Array) -> Array:
-        return self.mjcf.qpos_of(states[:, : self.mjcf.model.nv])
+    def _posed(self, model: mujoco.MjModel, states: Array) -> Iterator[mujoco.MjData]:
+        return posed(model, self.mjcf.qpos_of(states[:, : model.nv]), mujoco.mj_fwdPosition)
 
     def _cause_of_failure(self, state: Array) -> str | None:
         complaints = (joint.past_limits(float(state[joint.dof]), FAR_PAST) for joint in self.mjcf.joints)
@@ -396,8 +393,8 @@ class MjcfDynamics(Dynamics):
         explicit.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
         explicit.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
         data, jacobians, step = mujoco.MjData(explicit), np.zeros((len(states), n, n)), np.zeros((n, n))
-        jacobians[:, :nv, nv : 2 * nv] = np.eye(nv)
-        for slopes, qpos, state, control in zip(jacobians, self._qpos_of(states), states, controls, strict=True):
+        jacobians[:, :nv, nv : 2 * nv], positions = np.eye(nv), self.mjcf.qpos_of(states[:, :nv])
+        for slopes, qpos, state, control in zip(jacobians, positions, states, controls, strict=True):
             data.qpos[:], data.qvel[:], data.act[:] = qpos, state[nv : 2 * nv], state[2 * nv :]
             data.qacc_warmstart[:], data.ctrl[:] = 0.0, control
             with unlogged():

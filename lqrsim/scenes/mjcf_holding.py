@@ -55,13 +55,7 @@ class _Linear(NamedTuple):
 class _AtRest:
     """The actuators of a model at positions qpos, without velocity: what they exert, as MuJoCo computes it.
 
-    Everything is a function of z (nz,), all controls and then all activations.
-
-    Attributes:
-      wanted: (nv,), the forces of actuators with which nothing accelerates. largest: the largest force that acts, in N
-        or N m. moments: (nout, nv). compensated: (nv,), what is exerted beside the forces of actuators, against
-        gravity. low, high: (nz,), the ranges of z. neutral: (nz,), the smallest z, with targets of position where
-        the robot is. of: (nz,), the actuator of each. slow: (nz,), which are targets of velocity.
+    Everything is a function of z (nz,), all controls and then all activations, within the ranges `low` and `high`.
     """
 
     def __init__(self, mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> None:
@@ -69,9 +63,9 @@ class _AtRest:
         self.data = data = mujoco.MjData(model)
         data.qpos[:] = qpos
         mujoco.mj_inverse(model, data)
-        self.wanted = data.qfrc_inverse.copy()
+        self.wanted = data.qfrc_inverse.copy()  # (nv,), the forces of actuators with which nothing accelerates
         parts = self.wanted, data.qfrc_bias, data.qfrc_passive, data.qfrc_constraint
-        self.largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
+        self.largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)  # that acts, in N or N m
         self.moments = np.zeros((model.nout, model.nv))
         if model.nout:
             mujoco.mju_sparse2dense(
@@ -79,7 +73,7 @@ class _AtRest:
             )
         numbers = np.arange(model.nactuator)
         acting = np.repeat(numbers, model.actuator_actnum)
-        self.of = np.concatenate([np.repeat(numbers, model.actuator_ctrlnum), acting])
+        self.of = np.concatenate([np.repeat(numbers, model.actuator_ctrlnum), acting])  # (nz,), the actuator of each
         act = ranges(model.actuator_actlimited[acting].astype(bool), model.actuator_actrange[acting])
         for number, entry, place in _integrals(model):
             if (most := model.actuator_dynprm[number, entry]) > 0:
@@ -87,10 +81,12 @@ class _AtRest:
         self.low = np.array([*(control.low for control in mjcf.controls), *act[0]])
         self.high = np.array([*(control.high for control in mjcf.controls), *act[1]])
         inputs = [name for actuator in mjcf.actuators for name in actuator.inputs]
-        self.slow = np.array([*(name == "vel" for name in inputs), *np.zeros(model.na)], dtype=bool)
+        self.slow = np.array([*(name == "vel" for name in inputs), *np.zeros(model.na)], dtype=bool)  # of velocity
+        # The smallest z, with targets of position where the robot is.
         self.neutral = np.clip(np.concatenate([self._targets(), np.zeros(model.na)]), self.low, self.high)
         self.neutral = np.clip(self.rested(self.neutral, np.arange(model.na)), self.low, self.high)
         self._apply(self._free, self.neutral)
+        # (nv,), what is exerted beside the forces of actuators, against gravity.
         self.compensated = data.qfrc_actuator - data.actuator_force @ self.moments
 
     def _targets(self) -> Array:

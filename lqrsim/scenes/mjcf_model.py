@@ -1,6 +1,5 @@
 """An MJCF as a record, read and compiled once, that robots, dynamics, plants and pictures share."""
 
-import itertools
 import math
 import os
 import warnings
@@ -17,7 +16,7 @@ from lqrsim import rotations
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_name, check_number
 from lqrsim.scenes.mjcf_kinematics import axes_of, colliding, quaternion_of
-from lqrsim.scenes.mjcf_text import SPEED_LIMIT, UNNAMED, model_from_xml, read_mjcf, spec_of
+from lqrsim.scenes.mjcf_text import SPEED_LIMIT, UNNAMED, model_from_xml, read_mjcf, spec_of, unnamed_names
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.urdf import is_urdf, read_urdf
 from lqrsim.scenes.world import KINDS, World
@@ -364,14 +363,13 @@ class MjcfModel:
         for body, joint in free if len(free) > 1 else ():
             if body is not None and body not in {element.get("name") for element in parts["joint"]}:
                 joint.set("name", body)
-        unnamed = {
-            kind: [element for element in elements if element.get("name") is None] for kind, elements in parts.items()
-        }
-        for kind, elements in unnamed.items():
-            names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in used_names)
+        changed = len(free) > 1
+        for kind, elements in parts.items():
+            names = unnamed_names(kind, used_names)
             for element in elements:
-                element.set("name", next(names))
-        changed = len(free) > 1 or any(unnamed.values())
+                if element.get("name") is None:
+                    element.set("name", next(names))
+                    changed = True
         xml = ElementTree.tostring(root, encoding="unicode") if changed else self.xml
         named = replace(self, xml=xml) if changed else self
         has_light = any(element.tag == "light" for element in placed)

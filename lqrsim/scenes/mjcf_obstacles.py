@@ -21,12 +21,9 @@ _POSITIONS = 64  # random positions of joints in which a geom must touch what ca
 
 
 def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
-    """The candidates (ids of geoms fixed to the world) that are obstacles to the robot.
+    """The candidates (ids of geoms fixed to the world) that are obstacles to the robot whose first moving body this is.
 
-    They are those of `touchable`, except its own base, and a floor that anything touches at rest.
-
-    Args:
-      body: the robot's first that moves. floors: whether there may be ground for standing on.
+    They are those of `touchable`, except its own base and, with `floors`, a floor that anything touches at rest.
     """
     data, pairs = placed(model), touching_pairs(model, candidates)
     pairs = pairs[~np.isin(model.geom_bodyid[pairs[:, 1]], [*_base(model)])]
@@ -128,9 +125,7 @@ def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int64], count: int, reach: Finite) -> Array:
     """The data of `kernels/mjcf_distances.py`, except the address of p.
 
-    Args:
-      pairs: (K, 2) geoms, the first of which moves. rows: (K,) the row of each pair, of `count` rows.
-      reach: largest distance of interest, in m.
+    The first geom of each of K pairs moves; `rows` (K,) are theirs, of `count`; `reach` is the largest distance in m.
     """
     bodies, radii = model.geom_bodyid[pairs], model.geom_rbound[pairs]  # that of a plane is 0
     planes = model.geom_type[pairs[:, 1]] == int(mujoco.mjtGeom.mjGEOM_PLANE)

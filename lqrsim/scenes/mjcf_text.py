@@ -7,7 +7,7 @@ import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -155,11 +155,15 @@ def spec_of(xml: str) -> mujoco.MjSpec:
     for kind, elements in (
         ("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms), ("actuator", spec.actuators),
     ):  # fmt: skip
-        used_names = {element.name for element in elements}
-        names = (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in used_names)
+        names = unnamed_names(kind, {element.name for element in elements})
         for element in elements:
             element.name = element.name or next(names)
     return spec
+
+
+def unnamed_names(kind: str, used_names: Container[str | None]) -> Iterator[str]:
+    """The names of elements of a kind that have none in the MJCF."""
+    return (name for count in itertools.count() if (name := f"{UNNAMED}{kind}_{count}") not in used_names)
 
 
 def _check_elements(xml: str, what: str) -> None:

@@ -91,9 +91,9 @@ def load_scene(
     """A packaged scene by name, or any MJCF or URDF by path.
 
     An MJCF may include the packaged robots, e.g. `create.xml`, by name. A URDF becomes an MJCF, `scene.xml`, in which
-    each joint with an effort in its <limit> has a motor, named as the joint. Its largest speeds are kept by
-    `MjcfRobot.joint_limits`. Fixed links stay, and the link that carries them has their masses. Warnings name what is
-    missing, such as efforts and meshes, and the links that touch at zero, which never collide.
+    each joint with an effort in its <limit> has a motor of its name. `MjcfRobot.joint_limits` keeps its largest speeds.
+    Fixed links stay, and the link that carries them has their masses. Warnings name what is missing, such as efforts
+    and meshes, and the links that touch at zero, which never collide.
 
     Args:
       name_or_path: a name in models/, or the path of a file. The meshes of a URDF are .stl, .obj or .msh files, there

@@ -29,18 +29,16 @@ class Obstacle:
     """One primitive or convex hull, with sizes and axes as in MuJoCo. `of_corners` makes a hull.
 
     Attributes:
-      kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` computes
-        distances.
+      kind: one of `KINDS`, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` computes distances.
       position: (3,) in metres.
       rotation: (3, 3) with the local axes as columns. The free side of a plane is its local +z; capsules and cylinders
         lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths, and for other kinds the half lengths of the bounding box; plane (0, 0, 0).
         Boxes, and meshes along their local z, may be infinite.
-      velocity: (3,) in m/s, of an obstacle that moves in a straight line; `position` is its position at time 0. Plans
-        take the velocity into account; in the scene that MuJoCo simulates, the obstacle stands still.
-      corners: (C, 3) in local axes, in metres, of a mesh, which is their convex hull; from `position`, which is the
-        middle of the bounding box.
+      velocity: (3,) in m/s, of an obstacle that moves in a straight line, from `position` at time 0. Plans take it into
+        account; in the scene that MuJoCo simulates, the obstacle stands still.
+      corners: (C, 3) in m in local axes, of a mesh, which is their convex hull; from `position`, the middle of the box.
     """
 
     name: str
@@ -179,21 +177,17 @@ class World:
         A robot in space ("xyz") sees this world itself. For a plane, its two axes become x and y, in their order; the
         third axis is normal to it.
 
-        With an offset, this world is cut by the plane: distances are in space, from the points of the plane. The robot
-        is a ball, obstacles next to the plane do not touch it, and a floor is a wall. Without an offset, in a
-        horizontal plane, the world is seen from above: heights do not count, upright obstacles are infinitely high, and
-        a sphere counts with its equator. In both cases, planes parallel to the robot's plane, such as the floor under a
-        horizontal plane, bound nothing.
+        With an offset, this world is cut by the plane: distances are in space, from the points of the plane, where the
+        robot is a ball, and a floor is a wall. Without an offset, in a horizontal plane, the world is seen from above:
+        heights do not count, upright obstacles are infinitely high, and a sphere counts with its equator. In both
+        cases, planes parallel to the robot's plane, such as the floor under a horizontal plane, bound nothing.
         """
         if plane == SPACE:
             return self
-        if (plane, offset) not in self._seen:
-            self._seen[plane, offset] = self._seen_by(plane, offset)
-        return self._seen[plane, offset]
-
-    @cached_property
-    def _seen(self) -> "dict[tuple[str, float | None], World]":
-        return {}
+        seen: dict[tuple[str, float | None], World] = vars(self).setdefault("_seen", {})
+        if (plane, offset) not in seen:
+            seen[plane, offset] = self._seen_by(plane, offset)
+        return seen[plane, offset]
 
     def _seen_by(self, plane: str, offset: float | None) -> "World":
         if offset is None and plane not in ("xy", "yx"):

@@ -53,12 +53,10 @@ def plot_run(
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
 
-    A robot in space is seen from above and from the side; for a robot without a position the figure shows the balls at
-    several times. Objects that the first run moved are drawn where it began and where it ended. In a view that is more
-    than four times as long as wide the short side is stretched, as its label says.
-
-    A predicted tube is drawn about the plan, 2 standard deviations wide, up to where it is too wide to be shown, with
-    the chance of collision at each step.
+    A robot in space is seen from above and from the side; of a robot without a position, the balls at several times.
+    Objects that the first run moved are drawn where it began and where it ended. In a view that is more than four times
+    as long as wide the short side is stretched. A predicted tube is drawn about the plan, 2 standard deviations wide,
+    up to where it is too wide to be shown, with the chance of collision at each step.
 
     Args:
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
@@ -165,22 +163,16 @@ def _of_balls(solution: Solution, rollouts: Mapping[str, Rollout], world: World,
     across, up = sorted(np.argsort(span, kind="stable")[1:].tolist())
     moments = np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))
     colours = [_paler(RUNS[0], white) for white in np.linspace(0, 0.75, len(moments))[::-1].tolist()]
+    balls = list[tuple[Array, float, str]]()
+    for knot, colour in zip(moments, colours, strict=True):
+        balls += [(centre, float(radius), colour) for centre, radius in zip(alive[knot], radii, strict=True)]
+    margin = float(radii.max()) + 0.1 * float(span.max())
     return Views(
-        title="balls, paler the earlier, and the path of the last",
-        space=first.state_coordinates,
-        world=world,
-        radius=first.radius,
-        places=np.zeros((0, 3)),
-        limits=figure_parts.bounds(alive.reshape(-1, 3), world, float(radii.max()) + 0.1 * float(span.max())),
-        planes=[(across, up)],
+        title="balls, paler the earlier, and the path of the last", space=first.state_coordinates, world=world,
+        radius=first.radius, places=np.zeros((0, 3)), planes=[(across, up)], balls=balls,
+        limits=figure_parts.bounds(alive.reshape(-1, 3), world, margin), objects=moved_objects(first, trial),
         paths=[*_driven(rollouts, trial, zorder=3), DrawnPath(first.planned_places, "planned", zorder=3)],
-        balls=[
-            (centre, float(radius), colour)
-            for knot, colour in zip(moments, colours, strict=True)
-            for centre, radius in zip(alive[knot], radii, strict=True)
-        ],
-        objects=moved_objects(first, trial),
-    )
+    )  # fmt: skip
 
 
 def _paler(colour: str, white: float) -> str:
@@ -276,11 +268,9 @@ def plot_policy(
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
 
-    With a tube it shows the predicted region of 2 standard deviations about the plan, up to where it is too wide to be
-    shown, and the chance of collision at each step. Without a tube it shows the positions whose total cost is near its
-    least, which does not depend on disturbances; solutions of `ilqr` have no total cost, and show the plan alone. A
-    robot in space is seen from above and from the side. For a system without a position, which need not be a robot,
-    the plan's states are shown instead, without `world` and `radius`.
+    With a tube it shows what `plot_run` shows of one. Without a tube it shows the positions whose total cost is near
+    its least, which does not depend on disturbances; solutions of `ilqr` have no total cost, and show the plan alone.
+    Of a system without a position, not necessarily a robot, the plan's states are shown, without `world` and `radius`.
 
     Args:
       radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle
@@ -419,8 +409,7 @@ def plot_funnel(
     """Writes a figure (png, pdf or svg, by the suffix) of a funnel; returns its path.
 
     Outlines are dark at certified knots and pale between them, where the level is interpolated. The ellipsoids of all
-    states are projected onto the position: whether a run may begin at a place also depends on the other states. A robot
-    in space is seen from above and from the side.
+    states are projected onto the position: whether a run may begin at a place also depends on the other states.
 
     Args:
       radius: as in `plot_policy`: 0 for a robot of several balls or geoms.

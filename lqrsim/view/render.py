@@ -139,8 +139,8 @@ def render(
     """Write a video of a run, or of several runs side by side, mp4 (h264) or GIF; or a still of them, png.
 
     Obstacles between a camera and the robot fade. A trial that diverged stands still from then on. The file is complete
-    or absent, even after an error or Ctrl-C. The same runs give bit-identical frames. The metadata of an
-    mp4 describes its content, so that `lqrsim verify` can measure it.
+    or absent, even after an error or Ctrl-C. The same runs give bit-identical frames. By the metadata of an mp4
+    `verify_video` can measure it.
 
     Args:
       trial: row of the rollout; several rows are shown side by side. With several rollouts, one row for all or one for
@@ -149,8 +149,8 @@ def render(
       insets: more cameras, in panes next to the first. In panes of `top` and `side` robots have a green mark.
       overlays: what is drawn over the scene, of `view.OVERLAY_KINDS`.
       solution: the solution that was run, for `cost_tube`; one for all runs, or one for each.
-      funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
-      quality: `draft`, `standard` or `publication`: size, edges, shadows, and compression of the video.
+      funnel: a funnel about the plan of the run, in the same way.
+      quality: of size, edges, shadows, and compression of the video.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
       fps: frames per second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF, which
         has at most 50.

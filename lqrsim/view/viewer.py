@@ -44,13 +44,9 @@ GOAL_STEP = 0.1  # m, step of the goal for each key press
 MOST_DELAY = 0.2  # s, largest delay that is caught up on a slow machine
 # The direction of each key, seen from the camera: right, away, up.
 PUSHES = {
-    "LeftArrow": (-1.0, 0.0, 0.0),
-    "RightArrow": (1.0, 0.0, 0.0),
-    "UpArrow": (0.0, 1.0, 0.0),
-    "DownArrow": (0.0, -1.0, 0.0),
-    "PageUp": (0.0, 0.0, 1.0),
-    "PageDown": (0.0, 0.0, -1.0),
-}
+    "LeftArrow": (-1.0, 0.0, 0.0), "RightArrow": (1.0, 0.0, 0.0), "DownArrow": (0.0, -1.0, 0.0),
+    "UpArrow": (0.0, 1.0, 0.0), "PageDown": (0.0, 0.0, -1.0), "PageUp": (0.0, 0.0, 1.0),
+}  # fmt: skip
 
 
 class ViewerClosed(Exception):
@@ -430,9 +426,6 @@ class ViewedReplanner(Controller, ControllerRun):
             self._show_plan()
         self.viewer.remark = caption(self.live, t)
         return command[None]
-
-    def summary(self) -> str:
-        return self.live.summary()
 
     def _show_plan(self) -> None:
         plan = self.live.active.plan.trajectory
