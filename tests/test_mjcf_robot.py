@@ -467,6 +467,16 @@ def test_weights_of_a_problem_by_name_and_by_unit() -> None:
         robot.problem(start, goal, weights={"N": 1.0})
 
 
+@pytest.mark.parametrize("field", ["weights", "effort"])
+@pytest.mark.parametrize(
+    "value", [[[1.0], [1.0, 2.0]], [1.0, [2.0]], [[1.0]], [], "1", -1.0, [-1.0] * 4, np.nan], ids=str
+)
+def test_what_are_no_weights_of_a_problem(field: str, value: Any) -> None:
+    robot, _ = robot_of("cart", 0)
+    with pytest.raises(InputError, match=f"^{field}: got "):
+        robot.problem(robot.at(pole=1.0), robot.at(), steps=5, **{field: value})
+
+
 def rov_among(others: str, *, hull: str = "ellipsoid") -> ls.MjcfRobot:
     """A body with eight thrusters, which could turn it in any way while it flies, and what else there is."""
     places = [(x, y) for x in (-0.15, 0.15) for y in (-0.1, 0.1)]

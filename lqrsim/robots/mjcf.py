@@ -365,8 +365,9 @@ class MjcfRobot(Robot):
         bounds = self._bounds(start, goal)
         at_start, at_goal = self._held(start), self._held(goal)
         about = (at_start.controls + at_goal.controls) / 2 if at_start.held and at_goal.held else at_start.controls
-        effort_weights = efforts(self.mjcf) ** -2.0 if effort is None else effort
-        cost: Cost = ControlCost(_weights("effort", effort_weights, len(controls)), about=about)
+        effort = efforts(self.mjcf) ** -2.0 if effort is None else effort
+        of_controls = effort if isinstance(effort, Mapping) else check_weights("effort", effort, len(controls))
+        cost: Cost = ControlCost(of_controls, about=about)
         state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
         for joint in self.mjcf.joints:
             if joint.kind != "free":
@@ -398,11 +399,9 @@ class MjcfRobot(Robot):
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_CONTACT_COST)
         return Problem(
-            dynamics=dynamics, dt=period,
-            steps=steps, initial=FixedState(start), stage_cost=cost,
-            final_cost=QuadraticCost(self._final_weights(weights, start, goal), about=goal),
-            control_limits=(controls.low, controls.high),
-            constraints=constraints, control_rate=control_rate,
+            dynamics=dynamics, dt=period, steps=steps, initial=FixedState(start), stage_cost=cost,
+            final_cost=QuadraticCost(self._final_weights(weights, start, goal), about=goal), constraints=constraints,
+            control_limits=(controls.low, controls.high), control_rate=control_rate,
         )  # fmt: skip
 
     def _warn_of_near(self, ends: Array, clearance: float) -> None:
@@ -424,10 +423,9 @@ class MjcfRobot(Robot):
         rolling = [wheel.dof for wheel in self.mjcf.wheels if start[wheel.dof] == goal[wheel.dof]]
         if isinstance(weights, Mapping):
             return {**{names[dof]: 0.0 for dof in rolling}, **weights}
-        if np.ndim(weights) or not rolling:
-            return _weights("weights", weights, len(names))
-        numbers = np.full(len(names), check_number("weights", weights, at_least=0.0))
-        numbers[rolling] = 0.0
+        numbers = check_weights("weights", weights, len(names))
+        if np.ndim(weights) == 0:
+            numbers[rolling] = 0.0
         return numbers
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
@@ -442,9 +440,8 @@ class MjcfRobot(Robot):
                 continue
             begin, end = start[joint.dof], goal[joint.dof]
             positions = [model.qpos0[joint.qpos.start], *model.key_qpos[:, joint.qpos.start]]
-            if not np.isclose(begin, positions, rtol=0, atol=1e-9).any() and (
-                complaint := joint.past_limits(begin, FAR_PAST)
-            ):
+            stated = np.isclose(begin, positions, rtol=0, atol=1e-9).any()
+            if not stated and (complaint := joint.past_limits(begin, FAR_PAST)):
                 raise InputError(f"start: {complaint}")
             if end != begin and (complaint := joint.past_limits(end, _PAST)):
                 raise InputError(f"goal: {complaint}")
@@ -550,8 +547,7 @@ class MjcfRobot(Robot):
             qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), None
         else:
             qpos, qvel, act = self.mjcf.keyframe(keyframe, who)
-        state[: 2 * model.nv] = self.state(qpos, qvel)[: 2 * model.nv]
-        state[2 * model.nv :] = 0.0 if act is None else act
+        state[: 2 * model.nv], state[2 * model.nv :] = self.state(qpos, qvel), 0.0 if act is None else act
         names = self.dynamics.state_coordinates.names
         for name, value in values.items():
             state[names.index(check_name(f"{who}: state", name, names))] = check_number(f"{who}: {name}", value)
@@ -621,8 +617,3 @@ def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) 
     except InputError:  # beyond all numbers
         return False
     return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _UNSTABLE
-
-
-def _weights(field: str, weights: PerEntry, size: int) -> PerEntry:
-    """Weights by name unchanged; other weights as one number for each of `size` entries."""
-    return weights if isinstance(weights, Mapping) else check_weights(field, weights, size)
