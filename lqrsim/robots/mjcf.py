@@ -528,9 +528,8 @@ class MjcfRobot(Robot):
         """
         names, nv = self.dynamics.state_coordinates.names, self.mjcf.model.nv
         places = {names[joint.dof]: joint.limits for joint in self.mjcf.joints if joint.limits is not None}
-        speeds = {
-            names[nv + joint.dof]: (-joint.speed, joint.speed) for joint in self.mjcf.joints if np.isfinite(joint.speed)
-        }
+        limited = [joint for joint in self.mjcf.joints if np.isfinite(joint.speed)]
+        speeds = {names[nv + joint.dof]: (-joint.speed, joint.speed) for joint in limited}
         return StateBounds(places | speeds)
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:

@@ -289,10 +289,8 @@ class MjcfDynamics(Dynamics):
         are several; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
         obstacles = {self.mjcf.model.geom(geom).name for geom in self._stated["obstacles"]}  # which do not collide here
-        numbers = self.mjcf.numbers.items()
-        return {
-            name: number.value for name, number in numbers if number.what != "friction" or number.part not in obstacles
-        }
+        entries = self.mjcf.numbers.items()
+        return {name: entry.value for name, entry in entries if entry.what != "friction" or entry.part not in obstacles}
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.

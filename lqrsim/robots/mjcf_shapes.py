@@ -180,9 +180,8 @@ class SelfClearance(Constraint):
         model = mjcf.model
         self.margin, self._mjcf, self._pairs = margin, mjcf, mjcf_obstacles.link_pairs(model, model.body(body).id)
         geom_bodies = model.geom_bodyid[self._pairs]
-        bodies = np.sort(
-            np.where(model.body_weldid[geom_bodies] != 0, model.body_weldid[geom_bodies], geom_bodies), axis=1
-        )
+        welds = model.body_weldid[geom_bodies]
+        bodies = np.sort(np.where(welds != 0, welds, geom_bodies), axis=1)
         keys, rows = np.unique(bodies, axis=0, return_inverse=True)
         self._rows = np.asarray(rows, dtype=np.int64).ravel()
         self.links = tuple((model.body(first).name, model.body(second).name) for first, second in keys.tolist())

@@ -98,9 +98,7 @@ def _rate_with_two_inertias(x: Any, u: Any, p: Any) -> list[Any]:
 def _rate(x: Any, u: Any, p: Any) -> list[Any]:
     velocity, rotation, w = x[3:6], x[6:9], x[9:12]
     thrust = rotations.rotate(rotation, [0, 0, sum(u)])
-    wind, force, push = (
-        [getattr(p, f"{disturbance}_{axis}") for axis in "xyz"] for disturbance in ("wind", "force", "torque")
-    )
+    wind, force, push = ([getattr(p, f"{name}_{axis}") for axis in "xyz"] for name in ("wind", "force", "torque"))
     acceleration = [(thrust[i] + force[i] - p.drag * (velocity[i] - wind[i])) / p.mass for i in range(3)]
     acceleration[2] -= p.gravity
     # The inertia is the same about each axis, so the gyroscopic term w x J w is zero.

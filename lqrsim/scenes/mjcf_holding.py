@@ -68,9 +68,8 @@ class _AtRest:
         self.largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)  # that acts, in N or N m
         self.moments = np.zeros((model.nout, model.nv))
         if model.nout:
-            mujoco.mju_sparse2dense(
-                self.moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-            )
+            places = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+            mujoco.mju_sparse2dense(self.moments, data.actuator_moment, *places)
         numbers = np.arange(model.nactuator)
         acting = np.repeat(numbers, model.actuator_actnum)
         self.of = np.concatenate([np.repeat(numbers, model.actuator_ctrlnum), acting])  # (nz,), the actuator of each
@@ -446,10 +445,8 @@ def at_rest(mjcf: MjcfModel, model: mujoco.MjModel, qpos: Array) -> tuple[Array,
     displacement = np.zeros(len(free))
     positions, forces = missing(displacement)
     for _ in range(_NEWTON):
-        slopes = [
-            missing(displacement + change)[1] - missing(displacement - change)[1]
-            for change in _SMALL * np.eye(len(free))
-        ]
+        changes = _SMALL * np.eye(len(free))
+        slopes = [missing(displacement + change)[1] - missing(displacement - change)[1] for change in changes]
         step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), forces, rcond=1e-6)[0]
         for fraction in 0.5 ** np.arange(_HALVES):
             trial, trial_forces = missing(displacement + fraction * step)

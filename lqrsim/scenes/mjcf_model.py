@@ -617,13 +617,11 @@ def _same_forces(model: mujoco.MjModel, key: int, other: mujoco.MjModel) -> bool
             mujoco.mj_integratePos(candidate, data.qpos, step, 0.3)
             mujoco.mj_inverse(candidate, data)
             rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-            forces.append(
-                np.concatenate([data.efc_pos[rows], data.ten_length, data.qfrc_passive, data.mocap_pos.ravel()])
-            )
+            parts = data.efc_pos[rows], data.ten_length, data.qfrc_passive, data.mocap_pos.ravel()
+            forces.append(np.concatenate(parts))
     pairs = zip(forces[:3], forces[3:], strict=True)
-    return not _mocap_poses(other, key) and all(
-        len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs
-    )
+    same = all(len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs)
+    return same and not _mocap_poses(other, key)
 
 
 @unlogged()

@@ -48,9 +48,9 @@ def read_urdf(
     root = _parsed(path)
     check_name(f"{path.name}: base", base, ("fixed", "free"))
     settings = root.findall("mujoco/*")  # MuJoCo's extension: elements of an MJCF
-    compiler = {
-        key: value for setting in settings if setting.tag == "compiler" for key, value in setting.attrib.items()
-    }
+    compiler = dict[str, str]()
+    for setting in root.findall("mujoco/compiler"):
+        compiler |= setting.attrib
     _find_meshes(root, path, compiler)
     spec = _read(root, path.name, {key: value for key, value in compiler.items() if key not in _PATHS})
     _set_armature(spec, path.name, {} if armature is None else armature)
@@ -210,9 +210,8 @@ def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> 
         _log.warning(
             "%s: no joint is followed by %s: want a <mimic> of one that turns or slides", name, listed(loose, _LISTED)
         )
-    bounded = {
-        element.get("name") for element in root.iterfind("joint") if element.get("type") in ("revolute", "prismatic")
-    }
+    kinds = "revolute", "prismatic"
+    bounded = {element.get("name") for element in root.iterfind("joint") if element.get("type") in kinds}
     if unlimited := [joint.name or "" for joint in spec.joints if joint.name in bounded and not _is_limited(joint)]:
         _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, listed(unlimited, _LISTED))
 
@@ -317,9 +316,9 @@ def _add_actuators(
     limits = {joint: float(effort_of.get(joint, element.actfrcrange[1])) for joint, element in joints.items()}
     if not isinstance(servos, Mapping):
         servos = {} if servos is None else dict.fromkeys((joint for joint in joints if limits[joint] > 0), servos)
-    gains = {
-        check_name(f"{name}: servos", joint, joints): _gains(name, joint, servo) for joint, servo in servos.items()
-    }
+    for joint in servos:
+        check_name(f"{name}: servos", joint, joints)
+    gains = {joint: _gains(name, joint, servo) for joint, servo in servos.items()}
     section = _add(mjcf, "actuator")
     for joint, element in joints.items():
         attributes, effort = {"name": joint, "joint": joint}, limits[joint]

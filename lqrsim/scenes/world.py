@@ -68,11 +68,10 @@ class Obstacle:
     def of_corners(cls, name: str, corners: npt.ArrayLike, *, velocity: npt.ArrayLike = (0.0, 0.0, 0.0)) -> "Obstacle":
         """The convex hull of points (C, 3) in the world, in m; of points (C, 2), a prism that is infinitely high."""
         name = check_text("obstacle: name", name, "a name", at_most=1000)
-        points = real(f"obstacle {name!r}: corners", corners)
+        who = f"obstacle {name!r}: corners"
+        points = real(who, corners)
         if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
-            raise InputError(
-                f"obstacle {name!r}: corners: got shape {points.shape}, want (C, 2) or (C, 3), at least one"
-            )
+            raise InputError(f"{who}: got shape {points.shape}, want (C, 2) or (C, 3), at least one")
         flat, size = np.zeros((len(points), 3)), np.full(3, np.inf)
         flat[:, : points.shape[1]] = points
         low, high = flat.min(axis=0), flat.max(axis=0)
@@ -191,9 +190,8 @@ class World:
 
     def _seen_by(self, plane: str, offset: float | None) -> "World":
         if offset is None and plane not in ("xy", "yx"):
-            raise InputError(
-                f"offset: got none for the plane {plane!r}, want its coordinate along the third axis, in metres"
-            )
+            wanted = "its coordinate along the third axis, in metres"
+            raise InputError(f"offset: got none for the plane {plane!r}, want {wanted}")
         obstacles = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
         if plane == "xy" and offset is None:
             return World([obstacle for obstacle in obstacles if not _parallel(obstacle, 2)])

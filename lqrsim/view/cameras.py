@@ -236,9 +236,8 @@ def _chase(recorded: RecordedTrial) -> CameraView:
         forward = at + 2 * radius * behind - eye
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
-        _set_perspective(
-            scene, recorded.model, eye, forward, np.cross(right / np.linalg.norm(right), forward), FIELD_OF_VIEW
-        )
+        up = np.cross(right / np.linalg.norm(right), forward)
+        _set_perspective(scene, recorded.model, eye, forward, up, FIELD_OF_VIEW)
 
     return CameraView(place)
 

@@ -77,7 +77,8 @@ def plot_run(
     with styles.figure(path, style=style) as figure:
         first = next(iter(rollouts.values()))
         views = (_of_positions if first.state_coordinates.position else _of_balls)(solution, rollouts, world, trial)
-        views = replace(views, sensed=_sensed(belief, solution))
+        if belief is not None:
+            views = replace(views, sensed=(belief, solution.trajectory.states[:, : belief.size]))
         chances = [
             (run.times, run.collision_chance, color)
             for run, color in zip(rollouts.values(), RUNS, strict=False)
@@ -98,10 +99,6 @@ def plot_run(
         _convergence(figure.add_subplot(costs), solution)
         legend_below(figure, _entries(drawn[0]) | controls)
     return Path(path)
-
-
-def _sensed(belief: Belief | None, solution: Solution) -> tuple[Belief, Array] | None:
-    return None if belief is None else (belief, solution.trajectory.states[:, : belief.size])
 
 
 def _strips(count: int, style: Style) -> tuple[int, Panel]:
@@ -312,7 +309,7 @@ def draw_policy(
         title = "plan" if tube is None else "predicted tube"
         views = Views(
             title=title, space=space, world=world, radius=radius, places=plan, planes=planes_of(plan), paths=[path],
-            tubes=tubes, sensed=_sensed(belief, solution),
+            tubes=tubes, sensed=None if belief is None else (belief, solution.trajectory.states[:, : belief.size]),
         )  # fmt: skip
         parts = arrange(figure, [*views.panels(style), *curves], style)
         of_time = parts[len(views.planes) :]

@@ -124,15 +124,12 @@ def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") ->
     layout = LAYOUTS[style]
     columns = layout.columns
 
-    def heights_of(section: list[list[int]]) -> list[float]:
-        return [sum(panels[i].height for i in column) for column in section]
-
     sections: list[list[list[int]]] = []  # of each section its columns, of each column its panels
     for number, panel in enumerate(panels):
         if panel.wide or columns == 1:
             sections.append([[number]])
         else:
-            tops = heights_of(sections[-1]) if sections else []
+            tops = [sum(panels[i].height for i in column) for column in sections[-1]] if sections else []
             if len(tops) < 2 or 0 < max(tops) < 1.02 * min(tops):
                 sections.append([[] for _ in range(columns)])
                 tops = [0.0] * columns
@@ -209,9 +206,8 @@ def _keep_apart(axes: Axes) -> None:
 def _overlap(axis: Axis, along: int) -> bool:
     """Whether numbers of neighbouring ticks overlap, or are not apart by GAP, along x (0) or y (1)."""
     low, high = sorted(axis.get_view_interval())
-    texts = [
-        text for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high for text in (tick.label1, tick.label2)
-    ]
+    ticks = [tick for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
+    texts = [text for tick in ticks for text in (tick.label1, tick.label2)]
     boxes = [text.get_window_extent() for text in texts if text.get_visible() and text.get_text()]
     spans = sorted((box.min[along], box.max[along]) for box in boxes)
     return any(after[0] - before[1] < GAP for before, after in pairwise(spans))
