@@ -58,9 +58,8 @@ class Switches:
         """Whether the same elements act in both. An element that is out of sight does not act."""
         if not np.array_equal(self.names[self.forces], other.names[other.forces]):
             return False
-        return bool(((self.values < 0) == (other.at(self.names) < 0)).all()) and bool(
-            ((other.values < 0) == (self.at(other.names) < 0)).all()
-        )
+        acts_there, acts_here = other.at(self.names) < 0, self.at(other.names) < 0
+        return np.array_equal(self.values < 0, acts_there) and np.array_equal(other.values < 0, acts_here)
 
 
 @dataclass(frozen=True, eq=False)

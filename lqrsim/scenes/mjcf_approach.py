@@ -113,10 +113,8 @@ class Approaches:
         spots = np.array([self._spot(*tip) for tip in zip(pair, points, strict=True)])
         forward, line, sides = _unit(way[end] - way[begin]), spots[0] - spots[1], np.array([[1.0], [-1.0]])
         line = _unit(line - (line @ forward) * forward)
-        touching = [
-            self._reach(tool, point, way[begin], side * line)
-            for tool, point, side in zip(pair, points, sides, strict=True)
-        ]
+        tips = zip(pair, points, sides, strict=True)
+        touching = [self._reach(tool, point, way[begin], side * line) for tool, point, side in tips]
         begin_closing = max(begin - round(_CLOSING * self._steps), 1)
         centres = way.copy()
         centres[:begin_closing] = np.linspace(spots.mean(axis=0), way[begin], begin_closing)

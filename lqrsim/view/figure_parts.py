@@ -195,10 +195,8 @@ def _begin_view(axes: Axes, low: Array, high: Array, names: str) -> None:
     """Set limits (2,), names and scales: equal ones, unless the view is too slender, which the stretched axis says."""
     span = high - low
     stretch = slenderness(span) / (span[1] / span[0])  # of y, relative to x
-    labels = [
-        f"{name} (m)" + (f"\nstretched {by:.2g}x" if by > 1.0 + 1e-9 else "")
-        for name, by in zip(names, (1 / stretch, stretch), strict=True)
-    ]
+    of_axes = zip(names, (1 / stretch, stretch), strict=True)
+    labels = [f"{name} (m)" + (f"\nstretched {by:.2g}x" if by > 1.0 + 1e-9 else "") for name, by in of_axes]
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect=stretch, xlabel=labels[0], ylabel=labels[1])
 
 

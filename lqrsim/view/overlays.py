@@ -342,9 +342,6 @@ def legend_entries(overlays: Iterable[Overlays]) -> dict[str, Colour | None]:
         if part.label
     }
     # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
-    entries = {
-        label: colour
-        for label, colour in colours.items()
-        if not any(other != label and other.startswith(label) for other in colours)
-    }
-    return dict(sorted(entries.items(), key=lambda entry: entry[1] is None))
+    short = [label for label in colours if any(other != label and other.startswith(label) for other in colours)]
+    entries = [(label, colour) for label, colour in colours.items() if label not in short]
+    return dict(sorted(entries, key=lambda entry: entry[1] is None))

@@ -233,10 +233,9 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
             named = zip((camera, *insets), areas, strict=True)
             views = [(area, camera_view(name, recorded, area.aspect, beside=recordings)) for name, area in named]
             parts.append(SceneRenderer(drawn, views, box, caption, stack))
-            panes += [
-                Pane(box.left + area.left, box.top + area.top, area.width, area.height, run, row, view.camera)
-                for area, view in views
-            ]
+            for area, view in views:
+                left, top = box.left + area.left, box.top + area.top
+                panes.append(Pane(left, top, area.width, area.height, run, row, view.camera))
         yield Picture(distinct, parts, tuple(panes), (width, height), legend)
 
 

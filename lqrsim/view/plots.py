@@ -125,10 +125,8 @@ def _entries(*drawn: Axes) -> dict[str, Artist]:
 
 
 def _driven(rollouts: Mapping[str, Rollout], trial: int, zorder: float = 2.0) -> list[DrawnPath]:
-    return [
-        DrawnPath(run.places(trial), name, color, "-", zorder=zorder)
-        for (name, run), color in zip(rollouts.items(), RUNS, strict=False)
-    ]
+    runs = zip(rollouts.items(), RUNS, strict=False)
+    return [DrawnPath(run.places(trial), name, color, "-", zorder=zorder) for (name, run), color in runs]
 
 
 def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> Views:

@@ -25,11 +25,10 @@ from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.view import video_metadata
 from lqrsim.view.captions import Pixels
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, PictureOptions, open_picture
-from lqrsim.view.video_metadata import VideoMetadata
+from lqrsim.view.video_metadata import VideoMetadata, digest
 
 QUEUE_LENGTH = 3  # largest number of frames that wait to be encoded
 COLOURS = 192  # number of colours of a GIF
@@ -195,9 +194,8 @@ def render(
             writer = gif(unfinished, rate, samples)
         else:
             settings = options.settings
-            metadata = video_metadata.VideoMetadata(
-                tuple(video_metadata.digest(run) for run in drawn.runs), drawn.markers, rate, speed, count, drawn.panes
-            )
+            digests = tuple(digest(run) for run in drawn.runs)
+            metadata = VideoMetadata(digests, drawn.markers, rate, speed, count, drawn.panes)
             writer = encoder(unfinished, drawn.size, rate, crf=settings.crf, preset=settings.preset, metadata=metadata)
         with writer as encode:
             for number in range(count):

@@ -85,10 +85,8 @@ def figure(
     with contextlib.ExitStack() as stack:
         unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
         stack.enter_context(matplotlib.style.context(["default", STYLE | text]))
-        drawn = Figure(
-            figsize=size or (layout.width, layout.width),
-            layout=None if size else ConstrainedLayoutEngine(h_pad=PAD, w_pad=PAD),
-        )
+        engine = None if size else ConstrainedLayoutEngine(h_pad=PAD, w_pad=PAD)
+        drawn = Figure(figsize=size or (layout.width, layout.width), layout=engine)
         FigureCanvasAgg(drawn)
         yield drawn
         for axes in drawn.axes:
