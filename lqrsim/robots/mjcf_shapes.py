@@ -45,8 +45,8 @@ class MjcfGeoms(CollisionGeoms):
 
     @property
     def size(self) -> float:
-        geoms = mjcf_obstacles.solid_geoms(self.scene.model)
-        return float(self.scene.model.geom_rbound[geoms].max(initial=0.0))
+        model = self.scene.model
+        return float(model.geom_rbound[mjcf_obstacles.solid_geoms(model)].max(initial=0.0))
 
     def of_scene(self, scene: Scene) -> bool:
         return scene is self.scene or (scene.xml == self.scene.xml and scene.geoms == self.scene.geoms)

@@ -584,8 +584,7 @@ def _unit(actuator: Actuator, joints: Mapping[str, Joint], entry: str) -> str:
         return ""
     force, length = ("N", "m") if joint.kind == "slide" else ("N m", "rad")
     if entry or actuator.gain is None or actuator.bias is None or any(actuator.gain[1:]):
-        units = {"pos": length, "vel": f"{length}/s", "ff": force, "voltage": "V"}
-        return units.get(entry, "")
+        return {"pos": length, "vel": f"{length}/s", "ff": force, "voltage": "V"}.get(entry, "")
     (gain, _, _), (constant, stiffness, damping) = actuator.gain, actuator.bias
     if not any(actuator.bias):
         return force if gain == 1 and actuator.activations.start == actuator.activations.stop else ""

@@ -131,8 +131,7 @@ def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int6
     planes = model.geom_type[pairs[:, 1]] == int(mujoco.mjtGeom.mjGEOM_PLANE)
     moving = np.where(model.body_weldid[bodies[:, 1]] != 0, bodies[:, 1], 0)
     columns = [rows, pairs[:, 0], bodies[:, 0], pairs[:, 1], radii.sum(axis=1), planes, moving]
-    table = np.stack(columns, axis=1).astype(np.float64)
-    return np.concatenate([[count, len(pairs), reach], table.ravel()])
+    return np.concatenate([[count, len(pairs), reach], np.stack(columns, axis=1).astype(np.float64).ravel()])
 
 
 def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:

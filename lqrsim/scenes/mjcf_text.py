@@ -128,8 +128,7 @@ def _flatten(path: Path) -> str:
             element.set(key, str(second if nested else first))
     if files:
         root.append(ElementTree.Element("compiler", folders))
-    text = ElementTree.tostring(root, encoding="unicode")
-    return re.sub(r"\n\s*\n+", "\n", text) + "\n"
+    return re.sub(r"\n\s*\n+", "\n", ElementTree.tostring(root, encoding="unicode")) + "\n"
 
 
 def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
@@ -215,8 +214,7 @@ def _check_sizes(element: ElementTree.Element, what: str) -> None:
     for key, text in attributes.items() if most else ():
         largest = MOST_USER if key.startswith("nuser_") else most.get(key)
         if largest is not None and _size(text) > largest:
-            got = f"{key}={excerpt(text)} in <{element.tag}>"
-            raise InputError(f"{what}: got {got}, want {largest:,} at most")
+            raise InputError(f"{what}: got {key}={excerpt(text)} in <{element.tag}>, want {largest:,} at most")
     if element.tag == "texture" and "builtin" in attributes:
         width, height = _size(attributes.get("width", "0")), _size(attributes.get("height", "0"))
         if max(width * height, 6 * width**2 if attributes.get("type", "cube") == "cube" else 0) > MOST_PIXELS:

@@ -96,8 +96,8 @@ class Obstacle:
                 f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)} with corners; or an"
                 " MjcfRobot, with geoms=robot.geoms, whose distances are MuJoCo's"
             )
-        mesh = 0.0, len(self.corners), np.inf if self.size[2] == np.inf else 0.0
-        size = mesh if len(self.corners) else self.size
+        high = np.inf if self.size[2] == np.inf else 0.0
+        size = (0.0, len(self.corners), high) if len(self.corners) else self.size
         return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), size])
 
 

@@ -58,8 +58,7 @@ def frames_at_states(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[n
 
 def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
     """Positions (N, d) of the states nearest to these times."""
-    rows = np.abs(rollout.times - times[:, None]).argmin(axis=1)
-    return rollout.places(trial)[rows]
+    return rollout.places(trial)[np.abs(rollout.times - times[:, None]).argmin(axis=1)]
 
 
 def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:

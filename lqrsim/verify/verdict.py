@@ -17,16 +17,15 @@ FEW_FRAMES = 4  # up to this number, each wrong frame is named
 def diagnose(
     numbers: npt.NDArray[np.intp], times: Array, seen: Array, actual: Array, bound: float, interval: float
 ) -> str:
-    """A line with the explanation that leaves nearly all positions within twice the bound.
-
-    Args:
-      numbers: (k,) numbers of the frames in which the robot is seen.
-    """
+    """The explanation, as a line, that leaves nearly all positions in frames `numbers` (k,) within twice the bound."""
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
     error = where - truth
     wrong = np.flatnonzero(np.linalg.norm(error, axis=1) > bound)
     if 0 < len(wrong) <= FEW_FRAMES:
-        return _single_frames(wrong, numbers, where, truth, 2 * bound)
+        named, crossed = numbers[wrong].astype(str), where[wrong] - truth[wrong[::-1]]
+        if len(wrong) == 2 and np.linalg.norm(crossed, axis=1).max() <= 2 * bound:
+            return f"frames {' and '.join(named)} are swapped"
+        return f"frames that do not show their time: {', '.join(named)}"
     for axis, name in zip(range(truth.shape[1]), "xyz", strict=False):
         # If a coordinate is mirrored in one of the two views that show it, it seems to stand still.
         spread = truth[:, axis] - truth[:, axis].mean()
@@ -55,18 +54,6 @@ def diagnose(
     if _quantile_95(error) <= 2 * bound:
         return "the pictures are too small or too coarse"
     return "pictures of another run than the record's: another seed, trial or policy; or another robot's body"
-
-
-def _single_frames(
-    wrong: npt.NDArray[np.intp], numbers: npt.NDArray[np.intp], seen: Array, actual: Array, near: float
-) -> str:
-    """The frames that do not show their time, and whether two of them are swapped."""
-    if len(wrong) == 2:
-        first, second = wrong
-        crossed = seen[[first, second]] - actual[[second, first]]
-        if np.linalg.norm(crossed, axis=1).max() <= near:
-            return f"frames {numbers[first]} and {numbers[second]} are swapped"
-    return f"frames that do not show their time: {', '.join(str(numbers[index]) for index in wrong)}"
 
 
 def _change_point(error: Array, velocity: Array) -> tuple[int, float]:

@@ -278,8 +278,7 @@ def write_rerun(
         raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
     recorded = RecordedTrial(rollout, trial)
     shown = RERUN_OVERLAYS if funnel is None else (*RERUN_OVERLAYS, "funnel")
-    steps = rollout.plan.steps
-    overlays = Overlays(recorded, shown, common_scale([recorded]), funnel=funnel, segments=steps)
+    overlays = Overlays(recorded, shown, common_scale([recorded]), funnel=funnel, segments=rollout.plan.steps)
     with replacing(path) as unfinished:
         stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
         stream.save(unfinished)
@@ -348,8 +347,7 @@ class _Recording:
                 self._log(entity, self._shape(drawable.kind, drawable.size, drawable.rgba))
                 times = self.recorded.frame_times
                 turns = [_scalar_last(drawable.rotation)] * len(times)
-                pose = rerun.Transform3D.columns(translation=drawable.at(times), quaternion=turns)
-                self._send(entity, times, pose)
+                self._send(entity, times, rerun.Transform3D.columns(translation=drawable.at(times), quaternion=turns))
             case DrawnTube():
                 ellipsoids = self._ellipsoids(drawable.centres, drawable.half_axes, drawable.rotations)
                 self._log(entity, rerun.Ellipsoids3D(**ellipsoids, colors=[in_bytes(drawable.rgba[:3])]))

@@ -86,8 +86,7 @@ class SceneRenderer:
             with self._fade(faded, of_model):
                 for arrow in self.overlays.drawables:
                     if isinstance(arrow, Arrow):
-                        force = self.recorded.force_at(time)
-                        geoms.draw_arrow(arrow, force, place, scene, emission=self.emission)
+                        geoms.draw_arrow(arrow, self.recorded.force_at(time), place, scene, emission=self.emission)
                 if view.camera is not None:
                     geoms.draw_mark(scene, view.camera, place, geoms.mark_radius(self.recorded))
                 bottom = self.pixels.shape[0] - box.top - box.height
@@ -310,8 +309,7 @@ def _runs_and_trials(
     """The rollouts, each once, and the run and trial of each part of the picture."""
     if isinstance(runs, Rollout):
         return [runs], [(0, row) for row in rows_of(trial, MOST_RUNS)]
-    wanted = f"a Rollout, or 1 to {MOST_RUNS} of them"
-    distinct = list(check_items("runs", runs, Rollout, wanted, at_most=MOST_RUNS))
+    distinct = list(check_items("runs", runs, Rollout, f"a Rollout, or 1 to {MOST_RUNS} of them", at_most=MOST_RUNS))
     if not distinct:
         raise InputError(f"runs: got 0 to show, want 1 to {MOST_RUNS}")
     return distinct, list(enumerate(_one_each("trial", trial, distinct)))

@@ -114,8 +114,7 @@ def _strip_panel(rows: int, style: Style, *, wide: bool = False) -> Panel:
 
 
 def _grid(figure: Figure, place: SubplotSpec, count: int, across: int) -> list[Axes]:
-    rows = -(-count // across)
-    grid = place.subgridspec(rows, across)
+    grid = place.subgridspec(-(-count // across), across)
     return [figure.add_subplot(grid[number]) for number in range(count)]
 
 

@@ -42,7 +42,6 @@ class RecordedTrial:
     """A trial. A diverged trial stands still from its last finite state on."""
 
     def __init__(self, rollout: Rollout, trial: int) -> None:
-        """Raises InputError if there is no such trial, or it cannot be drawn."""
         self.rollout, self.trial = rollout, trial
         self.model = model_of(rollout, trial)
         finite = np.isfinite(rollout.frames[trial]).all(axis=1)
@@ -88,20 +87,18 @@ class RecordedTrial:
     def driven(self, at: Array | float) -> Array:
         """Places of the robot at these times, (..., 3); on the floor if it is seen from above."""
         alive = np.isin(self.rollout.times, self.times)
-        return self._between(self.rollout.places(self.trial)[alive], self.times, at)
+        places = interpolated(self.rollout.places(self.trial)[alive], self.times, at)
+        return self.rollout.in_world(places, height=self.floor)
 
     def planned(self, at: Array | float) -> Array:
         """Planned places at these times, (..., 3)."""
-        return self._between(self.rollout.planned_places, self.rollout.times, at)
+        places = interpolated(self.rollout.planned_places, self.rollout.times, at)
+        return self.rollout.in_world(places, height=self.floor)
 
     @property
     def ghost_radius(self) -> float:
         """The radius in metres of the ball at the planned place: that of the robot, or of an arm's last ball."""
         return self.size if self.rollout.balls is None else float(self.rollout.balls.radii[-1])
-
-    def _between(self, places: Array, times: Array, at: Array | float) -> Array:
-        """Points (..., 3) in the world at the times `at`, between places (k, 2 or 3) at `times`."""
-        return self.rollout.in_world(interpolated(places, times, at), height=self.floor)
 
     def place_in(self, data: mujoco.MjData) -> Array:
         """Place (3,) of the robot in the posed model."""

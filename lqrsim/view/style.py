@@ -148,8 +148,7 @@ def arrange(figure: Figure, panels: Sequence[Panel], style: Style = "screen") ->
 
 def legend_below(figure: Figure, entries: Mapping[str, Artist]) -> None:
     """A legend below everything, in as many columns as fit; long labels are wrapped."""
-    size = float(matplotlib.rcParams["font.size"])
-    letters = max(int(figure.get_figwidth() * 72 / (0.6 * size)) - 8, 20)
+    letters = max(int(figure.get_figwidth() * 72 / (0.6 * matplotlib.rcParams["font.size"])) - 8, 20)
     labels = ["\n".join(textwrap.wrap(label, letters)) for label in entries]
     for columns in range(len(entries), 0, -1):
         legend = figure.legend(list(entries.values()), labels, loc="outside lower center", ncols=columns)
