@@ -142,10 +142,10 @@ def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
 
 
 def levers(model: mujoco.MjModel) -> Array:
-    """The largest distance that any point of the robot moves per degree of freedom, (nv,): in m/rad, or 1 for slides.
+    """The most that any point of the robot moves per degree of freedom, (nv,), at any angles: m/rad, or 1 for slides.
 
-    It holds for any joint angles. Slides between a joint and the body that it turns count with the farthest that their
-    range lets them move from rest, or 1 m without a range.
+    Slides between a joint and the body that it turns count with the farthest that their range lets them move from rest,
+    or 1 m without a range.
     """
     reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
     arms = np.ones(model.nv)
@@ -203,10 +203,7 @@ def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
 
 
 def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) -> npt.NDArray[np.bool_]:
-    """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom.
-
-    Without `carried` a free joint may carry both.
-    """
+    """Flags (K,) of the pairs that touch in every position of the joints; without `carried`, of all but free joints."""
     if not len(pairs):
         return np.zeros(0, dtype=bool)
     always = _touch(model, placed(model), pairs)

@@ -17,8 +17,7 @@ _quiet, _count, _before = threading.Lock(), 0, None
 
 @contextlib.contextmanager
 def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console, because its warnings are reported or recorded
-    otherwise.
+    """MuJoCo writes neither to MUJOCO_LOG.TXT nor to the console: its warnings are reported or recorded otherwise.
 
     Several threads may be in this context. The last to leave restores the state before the first.
     """

@@ -216,10 +216,10 @@ def _fit(error: Array, velocity: Array, actual: Array) -> tuple[tuple[float, flo
 
     error = offset + shift * velocity + stretch * (actual - mean of actual), by least squares with a free offset.
     """
-    columns = [(part - part.mean(axis=0)).ravel() for part in (velocity, actual)]
-    inverse, centred = np.linalg.pinv(np.stack(columns, axis=1)), (error - error.mean(axis=0)).ravel()
+    columns = np.stack([(part - part.mean(axis=0)).ravel() for part in (velocity, actual)], axis=1)
+    inverse, centred = np.linalg.pinv(columns), (error - error.mean(axis=0)).ravel()
     fit = inverse @ centred
-    noise = float(np.linalg.norm(centred - np.stack(columns, axis=1) @ fit)) / max(np.sqrt(len(centred) - 4), 1)
+    noise = float(np.linalg.norm(centred - columns @ fit)) / max(np.sqrt(len(centred) - 4), 1)
     uncertain = noise * np.linalg.norm(inverse, axis=1)
     return (float(fit[0]), float(uncertain[0])), (float(fit[1]), float(uncertain[1]))
 

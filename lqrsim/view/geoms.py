@@ -85,8 +85,7 @@ def mark_radius(recorded: RecordedTrial) -> float:
 def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -> None:
     """Add the mark of a robot whose body is at `centre` (3,) to a scene that is seen through the camera.
 
-    It is drawn close to the camera, where nothing hides it. In an orthographic picture this does not change its
-    position.
+    It is drawn close to the camera, where nothing hides it: in an orthographic picture its place is the same.
     """
     forward, new = np.array(camera.forward), appending_to(scene)
     centre = centre - (forward @ (centre - camera.position)) * forward
