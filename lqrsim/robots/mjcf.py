@@ -535,9 +535,8 @@ class MjcfRobot(Robot):
         """A state (n,) at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
         A joint that an equality constraint couples to another follows it; if it is named, the other moves. The joints
-        of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of
-        actuators are those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not
-        count.
+        of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations are
+        those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not count.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))

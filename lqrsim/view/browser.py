@@ -205,8 +205,7 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
     - `web_server.serve`, whose handlers are wrapped: a page of another site can open the WebSockets /state and /drop,
       which takes models; a request with another host name gets the model; and any page may read the answer
       (Access-Control-Allow-Origin).
-    - `web_viewer._print_url_banner`: it prints an address in the network, where nothing answers, and warns that others
-      can connect.
+    - `web_viewer._print_url_banner`: it prints an address in the network, where nothing answers, and warns of others.
     """
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
 
