@@ -181,7 +181,8 @@ class MjcfRobot(Robot):
         if not len(world):
             return self.geoms.in_world(self.dynamics, world)
         copy = Scene(self.mjcf.with_obstacles(world), World(), ())
-        other = MjcfRobot(copy, **(self._stated | {"obstacles": world.names}))
+        stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
+        other = MjcfRobot(copy, **stated)
         # Their places in the compiled model, which differ in the last bits.
         pairs = zip(other.scene.world.obstacles, world.obstacles, strict=True)
         moved = World([replace(compiled, velocity=obstacle.velocity) for compiled, obstacle in pairs])

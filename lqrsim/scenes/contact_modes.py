@@ -9,6 +9,7 @@ period is in general discontinuous. If a force changes sign, it has a kink.
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -62,8 +63,7 @@ class Switches:
         return np.array_equal(self.values < 0, acts_there) and np.array_equal(other.values < 0, acts_here)
 
 
-@dataclass(frozen=True, eq=False)
-class Period:
+class Period(NamedTuple):
     """A control period, linearised in its contact mode."""
 
     state: Array  # (n,) at its end

@@ -3,7 +3,6 @@
 import copy
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
@@ -32,8 +31,7 @@ _VERTICAL = 1 - 1e-6  # least part of a slide's axis along gravity, of one by wh
 _FALLS = 200  # heights at which a body that is let down may touch: thinner supports are not found
 
 
-@dataclass(frozen=True, eq=False)
-class Holding:
+class Holding(NamedTuple):
     """Controls that come nearest to holding the robot still, and the forces that they leave."""
 
     controls: Array  # (nu,), within their limits

@@ -2,8 +2,7 @@
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -121,8 +120,7 @@ class Equalities:
         return positions, qvel - np.linalg.lstsq(slopes, slopes @ qvel, rcond=_RANK)[0]
 
 
-@dataclass(frozen=True)
-class Axes:
+class Axes(NamedTuple):
     """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2)."""
 
     of: dict[int, int]  # degree of freedom -> axis, where its position is the origin's coordinate

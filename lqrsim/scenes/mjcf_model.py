@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,8 +36,7 @@ _SAME = 1e-12  # m, and of quaternions, within which a mocap body is where a key
 Side = tuple[float, float]  # the least and the largest; infinite without a limit
 
 
-@dataclass(frozen=True)
-class Joint:
+class Joint(NamedTuple):
     """A joint."""
 
     name: str
@@ -69,8 +68,7 @@ class Joint:
         return f"got {position:.4g} {unit} for {self.name}, {wanted}"
 
 
-@dataclass(frozen=True)
-class Control:
+class Control(NamedTuple):
     """A control: its name, its unit (or empty), and its limits."""
 
     name: str
@@ -79,8 +77,7 @@ class Control:
     high: float
 
 
-@dataclass(frozen=True)
-class Actuator:
+class Actuator(NamedTuple):
     """An actuator. Its force is `(gain @ motion) input + bias @ motion`, where motion is (1, length, velocity).
 
     The input is its control, or the last of its activations if it has some. The force is clipped to `forces`; times the
@@ -101,8 +98,7 @@ class Actuator:
     bias: tuple[float, ...] | None
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number of an MJCF: its kind, its body, joint, geom or actuator (empty for all), and its value."""
 
     what: str

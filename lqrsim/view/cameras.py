@@ -7,6 +7,7 @@ ball, at any distance and anywhere in the picture. The position of a camera alon
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -124,8 +125,7 @@ DISTANCE, HEIGHT = 11.0, 4.5  # distance and height of the chase camera, in radi
 TURN_SECONDS = 0.8  # s, time over which the chase camera averages its direction
 
 
-@dataclass(frozen=True)
-class CameraView:
+class CameraView(NamedTuple):
     """A view of one trial: sets the cameras of a scene, after its update, for a time; and its calibrated camera."""
 
     place: Callable[[mujoco.MjvScene, mujoco.MjData, float], None]

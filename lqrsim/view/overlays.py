@@ -5,7 +5,7 @@ Each is drawn by MuJoCo (`geoms.py`), and by a page in a browser and by Rerun (`
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -126,8 +126,7 @@ class Arrow(Drawable):
     metres_per_newton: float
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(NamedTuple):
     """The error in m at the end of a trace's colours, and the force in N of the longest arrow, in all runs."""
 
     error: float

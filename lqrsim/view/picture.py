@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -143,8 +143,7 @@ Pixel = Annotated[int, Bounds(at_least=64, at_most=LARGEST)]
 Title = Annotated[str, 100]
 
 
-@dataclass(frozen=True)
-class QualitySettings:
+class QualitySettings(NamedTuple):
     """Settings of a quality: size, samples for smooth edges, resolution of shadows (0: none), and settings of x264."""
 
     size: tuple[int, int]

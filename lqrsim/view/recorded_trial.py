@@ -3,8 +3,7 @@
 import copy
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,8 +24,7 @@ FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period wou
 Triangles = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]  # vertices (v, 3) in metres, and faces (f, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnGeom:
+class DrawnGeom(NamedTuple):
     """A geom as pictures outside of MuJoCo draw it, in its own axes, with its number in the model."""
 
     number: int
