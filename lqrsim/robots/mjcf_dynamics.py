@@ -195,6 +195,7 @@ class MjcfDynamics(Dynamics):
     """
 
     by_mujoco: bool = True
+    curvature_source = None  # pyright: ignore[reportIncompatibleVariableOverride] MuJoCo has no second derivatives
     rounding: float = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
 
     def __init__(
@@ -308,11 +309,6 @@ class MjcfDynamics(Dynamics):
         if mjcf_numbers:
             dynamics._set_mjcf(self.mjcf.with_numbers(mjcf_numbers, self.name))
         return dynamics
-
-    @cached_property
-    def curvature_source(self) -> Source | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """None: MuJoCo has no second derivatives."""
-        return None
 
     @unlogged()
     def touches(self, states: Array) -> bool:

@@ -107,10 +107,7 @@ class GeomsInWorld(ShapeInWorld):
         return states[..., None, :]
 
     def clearances(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
-        """Signed distances (..., O) in m to the obstacles at states (..., n).
-
-        With obstacles displaced by (K, O, 3) in m, the states are (K, ..., n).
-        """
+        """Signed distances (..., O) in m at states (..., n); (K, ..., n), if obstacles are displaced by (K, O, 3)."""
         states = vectors_of("states", states, len(self.dynamics.state_coordinates))
         distances, _ = _distances(states.reshape(-1, states.shape[-1]), self._to_each()[1], displaced)
         return distances.reshape(*states.shape[:-1], len(self.world))
@@ -234,8 +231,7 @@ class SelfClearance(Constraint):
 def _distances(states: Array, data: Array, displaced: Array | None = None) -> tuple[Array, Array]:
     """Distances (K rows,) at states (K, n) by the kernel's data, and the pair of each row at the last state.
 
-    Args:
-      displaced: (D, rows, 3), displacements in m of the obstacles, the first for the first K / D states.
+    Obstacles are displaced by (D, rows, 3) in m, by the first of these for the first K / D states.
     """
     flat, rows = in_c_order(states), int(data[1])
     displaced = np.zeros((1, rows, 3)) if displaced is None else displaced

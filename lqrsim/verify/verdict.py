@@ -161,11 +161,9 @@ def compare(
     interval: float,
     others: tuple[Criterion, ...],
 ) -> Verification:
-    """Compare positions (N, d) from pixels with the actual ones.
+    """Compare positions (N, d) from pixels with the actual ones; `apart` (N,) is the views' disagreement in metres.
 
-    Args:
-      apart: (N,) disagreement of the views, in metres.
-      interval: seconds between two frames; the shift must be less than a quarter of it.
+    The shift must be less than a quarter of `interval`, the seconds between two frames.
     """
     good = np.asarray(np.isfinite(seen).all(axis=1))
     detail = f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN_FRACTION):.0f} % of them"

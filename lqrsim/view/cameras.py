@@ -137,8 +137,7 @@ def camera_view(
 ) -> CameraView:
     """The view of that name in a pane of this aspect ratio: one of VIEWS, or another camera of the model.
 
-    Args:
-      beside: trials in the same picture. Those of the same model are seen from the same place, at the same zoom.
+    Trials of the same model `beside` it in a picture are seen from the same place, at the same zoom.
     """
     model = recorded.model
     of_model = [model.camera(number).name for number in range(model.ncam) if model.camera(number).name]

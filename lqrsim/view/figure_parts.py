@@ -304,9 +304,7 @@ def draw_objects(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -
 def draw_sensed(axes: Axes, belief: Belief, states: Array, low: Array, high: Array, along: list[int]) -> None:
     """Draw how well the readings of one period tell the position, as standard deviations in m, between two corners.
 
-    Args:
-      states: (k, n); a place in the view has the height, heading and speed of the nearest.
-      along: the axes of the view.
+    A place in the view, whose axes are `along`, has the height, heading and speed of the nearest of the states (k, n).
     """
     shown = [belief.robot.state_coordinates.position[axis] for axis in along]
     x, y = (np.linspace(low[axis], high[axis], SENSED_CELLS) for axis in along)
