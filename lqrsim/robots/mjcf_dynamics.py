@@ -195,7 +195,7 @@ class MjcfDynamics(Dynamics):
     """
 
     by_mujoco: bool = True
-    curvature_source = None  # pyright: ignore[reportIncompatibleVariableOverride] MuJoCo has no second derivatives
+    curvature_source = None  # pyright: ignore[reportAssignmentType] MuJoCo has no second derivatives
     rounding: float = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
 
     def __init__(
