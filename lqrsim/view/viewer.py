@@ -109,6 +109,9 @@ class Viewer(abc.ABC):
     def __enter__(self) -> Self:
         return self
 
+    def __exit__(self, *_: object) -> None:  # noqa: B027 - a viewer that opens nothing closes nothing
+        """Close what is open."""
+
     @abc.abstractmethod
     def refresh(self) -> bool:
         """Draw the current state and read the person's input; returns whether the viewer is still open."""
