@@ -66,7 +66,9 @@ class VideoMetadata:
             raise InputError(f"video metadata: got version {got}, want version {VERSION}: render the video again")
         rate = re.fullmatch(r"([0-9]{1,9})(?:/([1-9][0-9]{0,8}))?", str(parts.get("rate")))  # as `Fraction` prints it
         if rate is None:
-            raise InputError(f"video metadata: got the rate {excerpt(parts.get('rate'))}, want one such as 30/1")
+            raise InputError(
+                f"video metadata: got {excerpt(parts.get('rate'))} as its rate, which is damaged, want 30/1"
+            )
         tree = {name: part for name, part in parts.items() if name not in ("format", "version")}
         return record_from(cls, tree | {"rate": Fraction(int(rate[1]), int(rate[2] or 1))}, "metadata", {})
 
