@@ -9,10 +9,9 @@ from typing import Annotated, Any, Union
 from tyro.conf import subcommand
 
 from lqrsim.commands.creating import Export, New
-from lqrsim.commands.housekeeping import Cache, Demo
 from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Harden, Rare
 from lqrsim.commands.reproduce import Reproduce
-from lqrsim.commands.solving import Bridge, List, Simulate, Solve
+from lqrsim.commands.solving import Bridge, Cache, Demo, List, Simulate, Solve
 from lqrsim.commands.stressing import Compare, Replay, Report, Stress
 from lqrsim.commands.viewing import Render, Verify, View
 

@@ -34,7 +34,7 @@ def of_funnel(funnel: "ls.types.Funnel") -> Object:
         "successes": funnel.successes, "reason": funnel.reasons,
     }  # fmt: skip
     names = "rate confidence states family goal_radius disturbances seed options simulated policy_digest versions"
-    return {**_fields(funnel, names), "knots": _rows(columns)}
+    return {**_fields(funnel, names), "knots": rows_of(columns)}
 
 
 def of_solution(solution: "ls.Solution") -> Object:
@@ -78,7 +78,7 @@ def of_rollout(rollout: "ls.Rollout", problem: "ls.Problem | None" = None) -> Ob
         "tube": rollout.tube is not None,
         "collision_chance": None if chance is None else chance.max(),
         "reached": rollout.reached.sum(),
-        "trials": _rows(columns),
+        "trials": rows_of(columns),
     }
 
 
@@ -103,16 +103,12 @@ def of_campaign(results: "ls.stress.Results") -> Object:
     }
 
 
-def of_table(table: "ls.types.DataTable") -> list[Object]:
-    """The rows of a table, by the names of its columns."""
-    return _rows(table.columns)
-
-
 def _fields(record: object, names: str) -> Object:
     return {name: getattr(record, name) for name in names.split()}
 
 
-def _rows(columns: Mapping[str, Any]) -> list[Object]:
+def rows_of(columns: Mapping[str, Any]) -> list[Object]:
+    """The rows of a table of columns, by the names of these."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 

@@ -62,8 +62,14 @@ class New:
         except BaseException:  # as on a full disk: the same command can then be given again
             shutil.rmtree(folder, ignore_errors=True)
             raise
+        scenario, runs = f"{(folder / self.name).as_posix()}.py:scenario", f"runs/{self.name}"
         console.say("\nnext:")
-        for command in next_commands(self.name, folder):
+        for command in (
+            ["lqrsim", "solve", scenario],
+            ["lqrsim", "simulate", f"{runs}/solution.npz", "--scenario", scenario, "--disturbances", "scenario"],
+            ["lqrsim", "render", f"{runs}/rollout.npz"],
+            ["python", "-m", "pytest", folder.as_posix()],
+        ):
             console.say(f"  {shlex.join(command)}")
         return 0
 
@@ -170,17 +176,6 @@ def check_robot_name(name: str) -> None:
     spec = importlib.util.find_spec(name)
     if spec is not None and spec.origin is not None:  # a folder without modules has no origin
         raise ls.InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")
-
-
-def next_commands(name: str, folder: Path) -> list[list[str]]:
-    """Commands that solve, simulate, render and test the robot in that folder."""
-    scenario, runs = f"{(folder / name).as_posix()}.py:scenario", f"runs/{name}"
-    return [
-        ["lqrsim", "solve", scenario],
-        ["lqrsim", "simulate", f"{runs}/solution.npz", "--scenario", scenario, "--disturbances", "scenario"],
-        ["lqrsim", "render", f"{runs}/rollout.npz"],
-        ["python", "-m", "pytest", folder.as_posix()],
-    ]
 
 
 def _named(text: str, name: str) -> str:

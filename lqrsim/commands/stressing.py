@@ -189,14 +189,15 @@ class Compare:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.stress.data_table import check_table_path
+        from lqrsim.errors import check_path
+        from lqrsim.stress.data_table import ENDINGS
 
         if self.out is not None:
-            check_table_path("--out", self.out)
+            check_path("--out", self.out, suffixes=ENDINGS)
             console.check_output("--out", self.out.parent, self.out.name)
         table = ls.stress.compare(self.folder, self.other, policies=self.policies)
         console.say(str(table))
         if self.out is not None:
             console.wrote(table.save(self.out))
-        console.result(cells=as_json.of_table(table), notes=table.notes)
+        console.result(cells=as_json.rows_of(table.columns), notes=table.notes)
         return 0

@@ -175,7 +175,7 @@ def _is_packaged(kind: type[Disturbance]) -> bool:
 def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: list[tuple[str, float]]) -> None:
     """Solve for the policies, store them, and write the manifest; or check an existing manifest."""
     scenario, given = campaign.resolved, campaign.given
-    specification = {
+    specification: dict[str, Any] = {
         "campaign": campaign.as_json(),
         "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
@@ -199,16 +199,15 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         f"{policy} {remark}" for policy, solution in solutions.items() for remark in solving.remarks(scenario, solution)
     ]
     impossible = policies.impossible_policies(scenario, given)
+    missing = "; ".join(f"{name}, {impossible[name]}" for name in policies.DEFAULT_POLICIES if name in impossible)
     # Policies that were chosen leave out others on purpose.
-    missing = [policy for policy in policies.DEFAULT_POLICIES if policy in impossible]
-    missing = missing if {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*missing} else []
-    left_out = "; ".join(f"{policy}, {impossible[policy]}" for policy in missing)
-    about = {
-        "versions": versions(), "machine": description(), "remarks": remarks,
-        "left_out": f"left out: {left_out}" if left_out else "",
+    by_default = {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*impossible}
+    specification |= {
+        "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
+        "left_out": f"left out: {missing}" if missing and by_default else "",
         "deterministic": [list(pair) for pair in deterministic],
     }  # fmt: skip
-    files.write_manifest(folder, specification | {"policies": hashes} | about)
+    files.write_manifest(folder, specification)
 
 
 def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:

@@ -49,12 +49,10 @@ def sole_writer(folder: Path) -> Iterator[None]:
         try:
             _lock(handle)
         except OSError as error:
-            if error.errno in _HELD:
-                raise InputError(
-                    f"folder: got {folder}, which another process writes (see {path.name}), want one at a time"
-                ) from None
-            reason = error.strerror or error
-            raise InputError(f"folder: got {folder}, want one whose files can be locked ({reason})") from None
+            got = f"{folder}, which another process writes (see {path.name}), want one at a time"
+            if error.errno not in _HELD:
+                got = f"{folder}, want one whose files can be locked ({error.strerror or error})"
+            raise InputError(f"folder: got {got}") from None
         with contextlib.suppress(OSError):  # shows which process has the lock
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None

@@ -118,7 +118,7 @@ class DataTable:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the table in the format that the name ends with, .csv, .tex or .md; returns its path."""
-        path = check_table_path("path", path)
+        path = check_path("path", path, suffixes=ENDINGS)
         text = _WRITERS[path.suffix.lower()](self)
         with replacing(path) as unfinished:
             unfinished.write_text(text, encoding="utf-8", newline="\n")
@@ -144,11 +144,6 @@ class DataTable:
 
 _WRITERS = {".csv": DataTable.csv, ".tex": DataTable.latex, ".md": DataTable.markdown}
 ENDINGS = tuple(_WRITERS)
-
-
-def check_table_path(field: str, path: object) -> Path:
-    """The path of a table's file. Raises InputError unless its name ends with one of ENDINGS."""
-    return check_path(field, path, suffixes=ENDINGS)
 
 
 def fraction_format(trials: int) -> str:

@@ -69,8 +69,7 @@ def smallest_failure(
       failures: (k, size), failures to begin with; by default the failures of a small splitting.
       rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than 1 % of the
         distance, and five rounds together gain less than a tenth of that.
-      pairs: number of pairs in each round; by default half the size, and at least 250. With fewer pairs the gradient is
-        mostly noise.
+      pairs: pairs in each round; by default half the size, at least 250. With fewer the gradient is mostly noise.
 
     Raises:
       KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
@@ -117,12 +116,10 @@ def _nearest_of(score: Score, failures: Array) -> Array:
     """The nearest failure on the rays through some failures and through their mean."""
     if not len(failures):
         raise InputError("failures: got none, want at least one")
-    nearest = failures[np.argsort(np.linalg.norm(failures, axis=1))[:8]]
-    mean = failures.mean(axis=0)
-    farthest = float(np.linalg.norm(failures, axis=1).max())
-    rays = np.array([*nearest, mean])
-    lengths = np.append(np.linalg.norm(nearest, axis=1), farthest)
-    best = _ray_search(score, _directions(rays), lengths)
+    lengths = np.linalg.norm(failures, axis=1)
+    nearest = np.argsort(lengths)[:8]
+    rays = np.array([*failures[nearest], failures.mean(axis=0)])
+    best = _ray_search(score, _directions(rays), np.append(lengths[nearest], lengths.max()))
     if best is None:
         raise InputError("failures: got vectors that do not fail, want some with a positive score")
     return best
@@ -167,8 +164,7 @@ def _gradients(score: Score, best: Array, pairs: int, rng: np.random.Generator) 
     # minus infinity, as without obstacles, as slightly better than the best.
     finite = scores[np.isfinite(scores)]
     scores = scores.clip(finite.min(initial=0.0) - 1.0, finite.max(initial=0.0) + 1.0)
-    difference = scores[:pairs] - scores[pairs:]
-    half = pairs // 2
+    difference, half = scores[:pairs] - scores[pairs:], pairs // 2
     parts = [difference[:half] @ steps[:half], difference[half:] @ steps[half:]]
     return np.array(parts) / (pairs * SPREAD**2) * len(best)
 
@@ -218,10 +214,9 @@ def largest_effects(rollout: Rollout) -> list[LargestEffect]:
             for i, (name, unit) in enumerate(zip(space.names, space.units, strict=True))
         ),
     ]
-    largest = []
-    for quantity, sizes, unit in sizes_over_time:
+    effects = []
+    for what, sizes, unit in sizes_over_time:
         until = np.nan_to_num(sizes[: last + 1])
         step = int(until.argmax())
-        if until[step] > 0:
-            largest.append(LargestEffect(quantity, float(until[step]), unit, float(rollout.times[step])))
-    return largest
+        effects.append(LargestEffect(what, float(until[step]), unit, float(rollout.times[step])))
+    return [effect for effect in effects if effect.size > 0]

@@ -41,22 +41,15 @@ class Trials:
         plan = next(iter(solutions.values()))  # all plans have the same duration
         self.scenario = campaign.resolved.with_duration_of(plan)
         self.plant = self.scenario.plant()
-        self._controllers: dict[str | tuple[str, str, float], Controller | AffinePolicy] = {}
+        self._controllers: dict[Cell | str, Controller | AffinePolicy] = {}
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
+        campaign = self.campaign
         return simulate(
-            self.plant,
-            self.solutions[cell.policy],
-            controller=self._controller(cell),
-            disturbances=self.campaign.disturbances(cell),
-            **self.campaign.goal_options,
-            seed=self.campaign.seed,
-            trials=count,
-            first_trial=first,
-            frames=frames,
-            contacts=contacts,
-            threads=1,
-        )
+            self.plant, self.solutions[cell.policy], controller=self._controller(cell), threads=1,
+            disturbances=campaign.disturbances(cell), **campaign.goal_options, seed=campaign.seed, trials=count,
+            first_trial=first, frames=frames, contacts=contacts,
+        )  # fmt: skip
 
     def warm_up(self) -> None:
         """Compile everything, by running undisturbed trials."""
@@ -91,15 +84,12 @@ class Trials:
 
     def _controller(self, cell: Cell) -> Controller | AffinePolicy:
         """The controller of a cell, made once for its policy or for the cell, because its gains take time."""
-        kind, design = POLICY_KINDS[cell.policy], self.campaign.design_disturbances
-        key = (cell.policy, cell.sweep, cell.strength) if kind.per_cell else cell.policy
+        kind, campaign, solution = POLICY_KINDS[cell.policy], self.campaign, self.solutions[cell.policy]
+        key = cell if kind.per_cell else cell.policy
         if key not in self._controllers:
+            design = campaign.disturbances(cell) if kind.per_cell else campaign.design_disturbances
             self._controllers[key] = make_controller(
-                kind.controller,
-                self.scenario,
-                self.solutions[cell.policy],
-                design=self.campaign.disturbances(cell) if kind.per_cell else design,
-                replan_every=self.campaign.replan_every,
+                kind.controller, self.scenario, solution, design=design, replan_every=campaign.replan_every
             )
         return self._controllers[key]
 
@@ -173,10 +163,10 @@ class Results:
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
         """The number of trials of each outcome of a cell, which need not be finished if `partial`."""
-        counts: Counter[str] = Counter()
-        for table in self.tables(cell, partial=partial):
-            counts.update(table["outcome"].tolist())
-        return counts
+        return Counter(end for table in self.tables(cell, partial=partial) for end in table["outcome"].tolist())
+
+    def _tallies(self) -> dict[Cell, Counter[str]]:
+        return {cell: self.tally(cell, partial=True) for cell in self.cells}
 
     def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], analysis.Success | None]]:
         """Each cell with its outcomes so far and its success rate, None if no trial has been run."""
@@ -208,7 +198,7 @@ class Results:
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
         lines += [*self.manifest["remarks"], *designs, *self.plans()]
-        lines += [*self._came_to_nothing(tallies), *self._hints(tallies)]
+        lines += [*self.came_to_nothing(tallies), *self.hints(tallies)]
         return "\n".join(lines)
 
     def rates(self) -> DataTable:
@@ -256,27 +246,23 @@ class Results:
                 designs[policy] = "designed anew for the disturbances of each cell, at their strength"
         return designs
 
-    def came_to_nothing(self) -> list[str]:
-        """A line for each of the most frequent reasons of trials that ended with an error or diverged."""
-        return self._came_to_nothing({cell: self.tally(cell, partial=True) for cell in self.cells})
+    def came_to_nothing(self, tallies: Mapping[Cell, Counter[str]] | None = None) -> list[str]:
+        """A line for each of the most frequent reasons of trials that ended with an error or diverged.
 
-    def _came_to_nothing(self, tallies: Mapping[Cell, Counter[str]]) -> list[str]:
-        """These lines for tallies that are known; tables are read again only where there are reasons."""
+        The tallies of all cells are counted unless they are given.
+        """
         reasons: Counter[str] = Counter()
-        for cell, ends in tallies.items():
-            if ends["error"] or ends["diverged"]:
+        for cell, ends in (tallies or self._tallies()).items():
+            if ends["error"] or ends["diverged"]:  # no other table is read again
                 reasons.update(self.reasons(cell).values())
         return [f"{count} trials were stopped: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
-    def hints(self) -> list[str]:
+    def hints(self, tallies: Mapping[Cell, Counter[str]] | None = None) -> list[str]:
         """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance.
 
-        Trials that ended with an error do not count.
+        Trials that ended with an error do not count. The tallies of all cells are counted unless they are given.
         """
-        return self._hints({cell: self.tally(cell, partial=True) for cell in self.cells})
-
-    def _hints(self, tallies: Mapping[Cell, Counter[str]]) -> list[str]:
-        reached: dict[str, int] = {}
+        tallies, reached = tallies or self._tallies(), dict[str, int]()
         for cell, ends in tallies.items():
             if cell.strength > 0 and ends["error"] < ends.total():
                 reached[cell.sweep] = reached.get(cell.sweep, 0) + ends["reached"]

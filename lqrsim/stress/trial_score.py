@@ -4,7 +4,7 @@ Rare failures can then be searched for in the space of these vectors, for any di
 space of reliability analysis. The score is its limit-state function with the opposite sign: positive is failure.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
@@ -36,10 +36,7 @@ class PrescribedDraws:
     def standard_normal(self, size: Size = None, dtype: npt.DTypeLike = np.float64) -> Any:
         count = 1 if size is None else int(np.prod(size))
         numbers = self._draw(count)
-        kind = np.dtype(dtype)
-        if size is None:
-            return float(kind.type(numbers[0]))
-        return numbers.reshape(size).astype(kind)
+        return float(np.dtype(dtype).type(numbers[0])) if size is None else numbers.reshape(size).astype(dtype)
 
     def _draw(self, count: int) -> Array:
         if self.used + count > len(self.numbers):
@@ -52,8 +49,7 @@ class PrescribedDraws:
         return np.minimum(ndtr(self.standard_normal(size)).astype(kind), np.nextafter(kind(1), kind(0)))[()]
 
     def normal(self, loc: npt.ArrayLike = 0.0, scale: npt.ArrayLike = 1.0, size: Size = None) -> Any:
-        drawn = self.standard_normal(_shape(size, loc, scale))
-        return np.asarray(loc) + np.asarray(scale) * drawn
+        return np.asarray(loc) + np.asarray(scale) * self.standard_normal(_shape(size, loc, scale))
 
     def uniform(self, low: npt.ArrayLike = 0.0, high: npt.ArrayLike = 1.0, size: Size = None) -> Any:
         drawn = self.random(_shape(size, low, high))
@@ -99,17 +95,6 @@ def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
     return size if size is not None else (np.broadcast_shapes(*(np.shape(argument) for argument in arguments)) or None)
 
 
-class _CountedDraws(PrescribedDraws):
-    """Counts the numbers that are drawn; each number is zero."""
-
-    def __init__(self) -> None:
-        super().__init__(np.zeros(0))
-
-    def _draw(self, count: int) -> Array:
-        self.used += count
-        return np.zeros(count)
-
-
 LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
 
 
@@ -142,6 +127,7 @@ def miss_score(rollout: Rollout, *, first: Index = 0) -> Array:
     return np.maximum(collision_score(rollout, first=first), outside)
 
 
+ZEROS = np.broadcast_to(0.0, 10**12)  # more than any trial draws, in the memory of one number
 PROBES = 32  # trials that show how much the disturbances change the clearance while the robot leaves an obstacle
 STEADY = 20.0  # a clearance of more of its standard deviations does not show which trials are near a collision
 
@@ -184,7 +170,7 @@ class TrialScore:
     simulations: Index = 0
 
     def __post_init__(self) -> None:
-        draws = [_CountedDraws() for _ in self.disturbances]
+        draws = [PrescribedDraws(ZEROS) for _ in self.disturbances]  # counts how many each draws
         usual = self._simulate(1, lambda trial, stream: draws[stream], frames=False)
         self.sizes = tuple(stream.used for stream in draws)
         self.first, clearance = 0, usual.clearance[0]
@@ -206,19 +192,16 @@ class TrialScore:
     def __call__(self, numbers: npt.ArrayLike) -> Array:
         """The scores (K,) of trials with the given random numbers (K, size)."""
         vectors = check_array("numbers", numbers, (None, self.size))
-        parts: Iterable[Array] = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
-        scores = [self._score(self.rollout(part, frames=False)) for part in parts]
+        parts = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
+        options = {"first": self.first} if self.first else {}  # only lqrsim's own scores leave knots out
+        scores = [np.zeros(0)]
+        for part in parts:
+            returned = self.failure(self.rollout(part, frames=False), **options)
+            scores.append(shaped("failure: returned", returned, (len(part),)))
+            if np.isnan(scores[-1]).any():
+                raise InputError(f"failure: returned {excerpt(scores[-1].tolist())}, want numbers: positive is failure")
         self.simulations += len(vectors)
-        return np.concatenate(scores) if scores else np.zeros(0)
-
-    def _score(self, rollout: Rollout) -> Array:
-        """The scores of a rollout. Raises InputError unless they are one number per trial."""
-        # Only lqrsim's own scores leave knots out.
-        options = {"first": self.first} if self.first else {}
-        scores = shaped("failure: returned", self.failure(rollout, **options), (rollout.trials,))
-        if np.isnan(scores).any():
-            raise InputError(f"failure: returned {excerpt(scores.tolist())}, want numbers: positive is failure")
-        return scores
+        return np.concatenate(scores)
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
         """The trials with the given random numbers (K, size), with frames for drawing or without.
