@@ -20,7 +20,7 @@ from runner import Settings, opening, run
 from scipy import stats
 
 from lqrsim.errors import Array
-from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
+from lqrsim.stress.reliability import NoFailure, failure_probability
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
 
 TRIALS = 20, 50, 200, 500

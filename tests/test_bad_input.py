@@ -19,8 +19,7 @@ from lqrsim.problem import quadratic_cost
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.effects import Effect
 from lqrsim.stress import statistics
-from lqrsim.stress.design_point import smallest_failure
-from lqrsim.stress.multilevel_splitting import failure_probability
+from lqrsim.stress.reliability import failure_probability, smallest_failure
 from lqrsim.stress.trial_score import PrescribedDraws
 
 ls: Any = lqrsim  # any type is passed

@@ -6,7 +6,8 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, ForceNoise, Push
-from lqrsim.stress.design_point import largest_effects, smallest_failure
+from lqrsim.stress.failure_search import largest_effects
+from lqrsim.stress.reliability import smallest_failure
 from lqrsim.stress.trial_score import TrialScore
 
 

@@ -466,7 +466,7 @@ def test_options_that_are_read_from_source_are_those_that_python_has(command: An
 
 def test_an_option_that_the_api_does_not_describe_is_refused() -> None:
     with pytest.raises(AssertionError, match="harden does not say what nothing is"):
-        options_of("stress/hardening.py", "harden", nothing="INT")(type("Command", (), {}))
+        options_of("stress/safer_plans.py", "harden", nothing="INT")(type("Command", (), {}))
 
 
 def test_unknown_option_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.references import resolve
-from lqrsim.stress import multilevel_splitting
+from lqrsim.stress import reliability
 from lqrsim.stress.failure_search import write_json
 from lqrsim.stress.trial_score import TrialScore
 
@@ -280,7 +280,7 @@ def test_options_are_refused_before_anything_is_solved(options: dict[str, Any], 
 def test_where_there_is_no_failure_it_says_so(
     command: str, own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(multilevel_splitting, "MOST_BATCHES", 4)
+    monkeypatch.setattr(reliability, "MOST_BATCHES", 4)
     small = ["--particles", "20", *(["--repetitions", "2"] if command == "rare" else ["--rounds", "3"])]
     words = [command, f"{own}:shifted,most=0.2", *OPEN, *small, "--out", str(tmp_path / "out")]
     assert main(words) == 1

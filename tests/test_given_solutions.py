@@ -19,7 +19,7 @@ import lqrsim as ls
 import lqrsim.gym
 from lqrsim.cli import main
 from lqrsim.commands.options import stated
-from lqrsim.commands.reliability import Break, Rare
+from lqrsim.commands.stressing import Break, Rare
 from lqrsim.scenarios.solutions import remarks
 from lqrsim.stress.policies import solve_policies
 from lqrsim.verify.checks import ran_policy_of

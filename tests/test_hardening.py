@@ -23,8 +23,8 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import console
 from lqrsim.stress import failure_search
-from lqrsim.stress.hardening import AIMED_FRACTION, HardenedPlan, HardeningRound, _Search
-from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
+from lqrsim.stress.reliability import NoFailure, failure_probability
+from lqrsim.stress.safer_plans import AIMED_FRACTION, HardenedPlan, HardeningRound, _Search
 from lqrsim.stress.statistics import rate
 
 CHANCE, OFFSET = 0.05, 0.25
@@ -401,7 +401,7 @@ def test_ctrl_c_in_a_process_of_its_own_keeps_the_plans_that_are_measured(
 def test_wrong_options_are_refused_before_anything_is_solved(
     own: str, options: dict[str, Any], says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lqrsim.stress.hardening.smooth_chance_constrained", refuse("solved"))
+    monkeypatch.setattr("lqrsim.stress.safer_plans.smooth_chance_constrained", refuse("solved"))
     problem = options.pop("problem", {})
     problem = stated(own, **problem) if isinstance(problem, dict) else problem
     with pytest.raises(ls.InputError) as refused:

@@ -19,8 +19,7 @@ from lqrsim.disturbances import (
     Push,
 )
 from lqrsim.simulation.disturbances import preset
-from lqrsim.stress.design_point import smallest_failure
-from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
+from lqrsim.stress.reliability import NoFailure, failure_probability, smallest_failure
 from lqrsim.stress.statistics import rate
 from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision_score, miss_score
 from lqrsim.templates.my_robot.my_robot import MyRobot

@@ -8,16 +8,13 @@ from typing import Annotated, Any, Union
 
 from tyro.conf import subcommand
 
-from lqrsim.commands.creating import Export, New
-from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Harden, Rare
-from lqrsim.commands.reproduce import Reproduce
-from lqrsim.commands.solving import Bridge, Cache, Demo, List, Simulate, Solve
-from lqrsim.commands.stressing import Compare, Replay, Report, Stress
-from lqrsim.commands.viewing import Render, Verify, View
+from lqrsim.commands import creating, reproduce, solving, stressing, viewing
 
 _ALL = (
-    List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Compare, Rare, Certify, Harden,
-    Break, FunnelCommand, Export, Bridge, Reproduce, Cache,
+    solving.List, creating.New, solving.Solve, solving.Simulate, viewing.Render, viewing.Verify, viewing.View,
+    solving.Demo, stressing.Stress, stressing.Replay, stressing.Report, stressing.Compare, stressing.Rare,
+    stressing.Certify, stressing.Harden, stressing.Break, stressing.FunnelCommand, creating.Export, solving.Bridge,
+    reproduce.Reproduce, solving.Cache,
 )  # fmt: skip
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}
 # Name -> the first line of its help.

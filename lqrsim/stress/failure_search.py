@@ -29,8 +29,15 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import names_code
 from lqrsim.stress.campaign_files import digest_of_solution
-from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
-from lqrsim.stress.multilevel_splitting import MOST_REPEATS, Keep, SplittingResult, check_keep, failure_probability
+from lqrsim.stress.reliability import (
+    MOST_REPEATS,
+    DesignPoint,
+    Keep,
+    SplittingResult,
+    check_keep,
+    failure_probability,
+    smallest_failure,
+)
 from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.study import Study, disturbances_as_json
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
@@ -326,6 +333,42 @@ def certify(
         if count == certified and got != want:
             differences.append(f"probability with its interval: got {got}, want {want}")
     return Recheck(certificate, measured, tuple(differences), changes)
+
+
+@dataclass(frozen=True)
+class LargestEffect:
+    """The largest value of a disturbance in a trial. The size of a vector is its length."""
+
+    what: str
+    size: float
+    unit: str
+    time: float
+
+
+def largest_effects(rollout: Rollout) -> list[LargestEffect]:
+    """The largest disturbances of the first trial until its end, in physical units, except those that are always zero.
+
+    The error of an applied control includes the error that the actuators' limits cause.
+    """
+    last = int(rollout.counts[0].sum()) - 1
+    states, controls = rollout.state_coordinates, rollout.control_coordinates
+    measured = states.difference(rollout.measured[0], rollout.states[0])
+    disturbed = rollout.applied[0] - rollout.commanded[0]
+    sizes_over_time: list[tuple[str, Array, str]] = [
+        ("force", np.linalg.norm(rollout.forces[0], axis=1), "N"),
+        ("torque", np.linalg.norm(rollout.torques[0], axis=1), "N m"),
+        *(
+            (f"error of {name}{kind}", np.abs(errors[:, i]), unit)
+            for kind, space, errors in ((" as applied", controls, disturbed), (" as measured", states, measured))
+            for i, (name, unit) in enumerate(zip(space.names, space.units, strict=True))
+        ),
+    ]
+    effects = []
+    for what, sizes, unit in sizes_over_time:
+        until = np.nan_to_num(sizes[: last + 1])
+        step = int(until.argmax())
+        effects.append(LargestEffect(what, float(until[step]), unit, float(rollout.times[step])))
+    return [effect for effect in effects if effect.size > 0]
 
 
 @dataclass(frozen=True, eq=False)
