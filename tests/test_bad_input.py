@@ -193,7 +193,7 @@ OPTIONS: list[tuple[Callable[..., object], list[tuple[dict[str, Any], str]]]] = 
         ({"start": ls.Trajectory(np.zeros((10, 3)), np.zeros((9, 2)), 0.1)}, "start: states"),
     ]),
     (lambda **changes: ls.types.Coordinates(**{"names": ("a", "b"), "units": ("", "")} | changes), [
-        ({"units": ("m",)}, "units: got 1 of them, want 2"),
+        ({"units": ("m",)}, "units: got 1, want 2"),
         ({"names": ("a", "a")}, "names: got a name twice"),
         ({"position": (0,)}, "position: got 1 entries, want 2"),
         ({"angles": (2,)}, r"angles: got indices \(2,\), want them between 0 and 1"),

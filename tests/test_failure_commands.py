@@ -303,7 +303,7 @@ def test_where_there_is_no_failure_it_says_so(
         ("rare {own}:pushed", ["sweep: got 'scenario', in which nothing is random"]),
         ("break {own}:pushed", ["sweep: got 'scenario', in which nothing is random"]),
         ("break {own}:shifted --rounds -1", ["rounds: got -1"]),
-        ("break {own}:blocked", ["scenario: got", "smooth fails with all random numbers at zero"]),
+        ("break {own}:blocked", ["policy: got smooth, which fails with all random numbers at zero"]),
     ],
 )
 def test_bad_input_is_one_line(

@@ -39,7 +39,7 @@ class New:
     """Folder in which the robot's folder is made."""
 
     def run(self) -> int:
-        from lqrsim.results.archive import excerpt_of, replacing
+        from lqrsim.results.archive import excerpt_of, write_text
 
         check_robot_name(self.name)
         folder = self.out / self.name
@@ -49,15 +49,12 @@ class New:
         except FileExistsError:
             raise ls.InputError(f"name: got {self.name!r}, want one without a folder {excerpt_of(folder)}") from None
         except OSError as error:
-            raise ls.InputError(
-                f"--out: got {excerpt_of(self.out)}, want a folder that can be written ({error})"
-            ) from None
+            got = excerpt_of(self.out)
+            raise ls.InputError(f"--out: got {got}, want a folder that can be written ({error})") from None
         try:
             for template in sorted(TEMPLATES.glob("*.*")):
                 path = folder / _named(template.name, self.name)
-                with replacing(path) as unfinished:
-                    text = _named(template.read_text(encoding="utf-8"), self.name)
-                    unfinished.write_text(text, encoding="utf-8", newline="\n")
+                write_text(path, _named(template.read_text(encoding="utf-8"), self.name))
                 console.wrote(path)
         except BaseException:  # as on a full disk: the same command can then be given again
             shutil.rmtree(folder, ignore_errors=True)
@@ -142,9 +139,7 @@ class Export:
             results = ls.stress.Results(self.source, scenario=self.scenario)
             cells = [ls.stress.Cell.named(cell_name, results.cells) for cell_name in self.cell] or results.cells
             shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
-            runs = (
-                ls.stress.replay(results, cell, shard.first, trials=shard.count, frames=False) for cell, shard in shards
-            )
+            runs = (ls.stress.replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
             named = self.scenario or results.manifest["campaign"]["scenario"]
             _ = results.campaign  # raises an exception if that is code which was not named

@@ -137,13 +137,9 @@ SolutionFile = Annotated[
 ]
 Folder = Annotated[Path | None, optional("FOLDER")]
 OwnScenario = Annotated[
-    str | None,
-    optional("SCENARIO", "The scenario, if it is your own function: files never choose code to run."),
+    str | None, optional("SCENARIO", "The scenario, if it is your own function: files never choose code to run.")
 ]
-Json = Annotated[
-    FlagCreatePairsOff[bool],
-    arg(help="Print the result as one JSON object, and everything else to stderr; see docs/json.md."),
-]
+Json = Annotated[FlagCreatePairsOff[bool], arg(help="Print one JSON object, all else to stderr; see docs/json.md.")]
 
 
 def stated(command: Any, function: Callable[..., Any], **others: Any) -> dict[str, Any]:

@@ -62,15 +62,14 @@ class Reproduce:
     def run(self) -> int:
         from lqrsim.errors import check_name
         from lqrsim.machine import description
-        from lqrsim.results.archive import plain, replacing
+        from lqrsim.results.archive import plain, write_text
 
         named = {check_name("results", name, SCRIPTS) for name in self.results} or set(SCRIPTS)
         chosen = [name for name in SCRIPTS if name in named]
         out = self.out
         console.check_output("--out", out)
-        earlier = (
-            _saved(out / "results.json", quick=self.quick) if self.keep else {"machine": description(), "results": {}}
-        )
+        none = {"machine": description(), "results": {}}
+        earlier = _saved(out / "results.json", quick=self.quick) if self.keep else none
         results, failures, begun = dict[str, ScriptResult](), dict[str, int](), time.monotonic()
         with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
             for name in chosen:
@@ -91,10 +90,8 @@ class Reproduce:
             together = earlier["results"] | results
             ordered = {name: together[name] for name in SCRIPTS if name in together}
             saved = {"machine": earlier["machine"], "quick": self.quick, "results": ordered}
-            with replacing(out / "results.json") as unfinished:
-                unfinished.write_text(json.dumps(plain(saved), allow_nan=False) + "\n", encoding="utf-8")
-            with replacing(out / "results.md") as unfinished:
-                unfinished.write_text(results_page(saved), encoding="utf-8")
+            write_text(out / "results.json", json.dumps(plain(saved), allow_nan=False) + "\n")
+            write_text(out / "results.md", results_page(saved))
             console.say("\n" + "\n".join(verdicts(results, out)))
             console.say(f"\ntook {time.monotonic() - begun:.0f} s")
             console.wrote(out / "results.md")
@@ -115,9 +112,8 @@ def _saved(file: Path, *, quick: bool) -> dict[str, Any]:
     except Exception:  # what it has instead may raise anything
         raise ls.InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
     if other:
-        raise ls.InputError(
-            f"--keep: got {file}, written {'without' if quick else 'with'} --quick, want the same option"
-        )
+        how = "without" if quick else "with"
+        raise ls.InputError(f"--keep: got {file}, written {how} --quick, want the same option")
     return saved
 
 

@@ -234,23 +234,17 @@ class Simulate:
             console.say(f"{self.controller} was designed for {DEFAULT_DESIGN}; for others: --design-disturbances NAME")
         violations = _violations(scenario.problem, rollout)
         for violation in (violation for violation in violations or () if violation["trials"]):
-            console.say(
-                f"{violation['trials']} of {rollout.trials} trials violate a constraint, {violation['constraint']}, by"
-                f" up to {violation['most']:.3g} (trial {violation['trial']} at {violation['time']:.2f} s); outcomes do"
-                " not count this"
-            )
+            where = f"trial {violation['trial']} at {violation['time']:.2f} s"
+            by = f"{violation['constraint']}, by up to {violation['most']:.3g} ({where}); outcomes do not count this"
+            console.say(f"{violation['trials']} of {rollout.trials} trials violate a constraint, {by}")
         for site, errors in scenario.problem.site_errors(rollout.states[:, -1]).items():
             worst = max(((error, k) for k, error in enumerate(errors.tolist()) if error == error), default=None)
             if worst is not None:
                 unit = "rad" if " turned" in site else "m"
-                console.say(
-                    f"{site} ends up to {worst[0]:.3g} {unit} off (trial {rollout.first_trial + worst[1]}); outcomes do"
-                    " not count this"
-                )
+                off = f"{worst[0]:.3g} {unit} off (trial {rollout.first_trial + worst[1]})"
+                console.say(f"{site} ends up to {off}; outcomes do not count this")
         if violations is None and scenario.problem.constraints:
-            console.say(
-                "whether trials violate constraints is not checked: another horizon, or constraints of a belief"
-            )
+            console.say("trials are not checked for violations: another horizon, or constraints of a belief")
         tube, remark = tube_under(scenario.problem, solution, plant, disturbances, controller)
         if remark:
             console.say(remark)
@@ -485,13 +479,14 @@ class Cache:
     def run(self) -> int:
         from lqrsim.codegen import disk_cache
 
+        folder, limit = disk_cache.folder(), disk_cache.LIMIT
         if self.clear:
             try:
                 removed = disk_cache.clear()
-                console.say(f"removed {removed} items from {disk_cache.folder()}")
-                console.result(removed=removed, folder=disk_cache.folder())
             except OSError as error:
-                raise ls.InputError(f"--clear: got {disk_cache.folder()}, want removable files ({error})") from None
+                raise ls.InputError(f"--clear: got {folder}, want removable files ({error})") from None
+            console.say(f"removed {removed} items from {folder}")
+            console.result(removed=removed, folder=folder)
             return 0
         items = disk_cache.items()
         groups = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)
@@ -500,9 +495,7 @@ class Cache:
             count = f" ({len(alike)} items)" if len(alike) > 1 else ""
             console.say(f"{sum(item.size for item in alike) / 1e6:8.2f} MB  last used {used}  {kind}{count}")
         total = sum(item.size for item in items) / 1e6
-        console.say(
-            f"{len(items)} items, {total:.1f} of at most {disk_cache.LIMIT / 1e6:.0f} MB, in {disk_cache.folder()}"
-        )
+        console.say(f"{len(items)} items, {total:.1f} of at most {limit / 1e6:.0f} MB, in {folder}")
         listed = [{"what": item.what, "size": item.size, "used": item.used} for item in items]
-        console.result(items=listed, limit=disk_cache.LIMIT, folder=disk_cache.folder())
+        console.result(items=listed, limit=limit, folder=folder)
         return 0

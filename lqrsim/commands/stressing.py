@@ -65,9 +65,8 @@ class Stress(SetupOptions):
 
         if self.resume:
             accepted = {"scenario", "solution", "out", "resume", "json", "workers", "batch", "scheduler"}
-            refuse(
-                self, changed(self).keys() - accepted, "with --resume, which has the campaign's own, want it without"
-            )
+            others = changed(self).keys() - accepted
+            refuse(self, others, "with --resume, which has the campaign's own, want it without")
         setup = ls.stress.Setup(**stated(self, ls.stress.Setup))
         folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
         console.check_output("--out", folder)
@@ -79,13 +78,12 @@ class Stress(SetupOptions):
             options = {name: value for name, value in options.items() if not hasattr(setup, name)}
             campaign = ls.stress.Campaign.of_sets(setup, self.sweep, **options)
         with console.progress("stressing", "trial") as progress:
-            results = ls.stress.run_campaign(
-                campaign, folder, **stated(self, ls.stress.run_campaign, progress=progress)
-            )
+            options = stated(self, ls.stress.run_campaign, progress=progress)
+            results = ls.stress.run_campaign(campaign, folder, **options)
         console.say(results.summary())
         console.wrote(folder)
-        options = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
-        console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *options])}")
+        code = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
+        console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *code])}")
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0

@@ -110,11 +110,8 @@ class Render:
         kind = out.suffix.lower()
         for name, overlay in DRAWN_BY.items() if kind != ".rrd" else ():
             if overlay not in self.overlays:
-                refuse(
-                    self,
-                    ("title" if name == "titles" else name,),
-                    f"without {overlay} in --overlays, want it with that",
-                )
+                option = "title" if name == "titles" else name
+                refuse(self, (option,), f"without {overlay} in --overlays, want it with that")
         if kind in (".mp4", ".gif", ".png"):
             return
         if kind not in (".html", ".rrd"):
@@ -203,9 +200,8 @@ class View:
             refuse(self, OF_RECORDED_RUNS, f"with {self.what}, want it with a RUN.npz")
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
-            solution = (
-                console.solve_and_print(scenario) if self.solution is None else self._given(scenario, self.solution)
-            )
+            given = self.solution
+            solution = console.solve_and_print(scenario) if given is None else self._given(scenario, given)
             scenario = scenario.with_duration_of(solution)
             plant = scenario.plant()
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
@@ -304,12 +300,11 @@ class Verify:
             # The solution file next to a run may belong to another run; a given solution is used in any case.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
+            options: dict[str, Any] = {"solution": solution, "progress": progress}
             if is_run:
-                verification = ls.verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
+                verification = ls.verify_run(rollout, self.trial or 0, **options)
             else:
-                verification = ls.verify_video(
-                    self.file, rollout, trial=self.trial, solution=solution, progress=progress
-                )
+                verification = ls.verify_video(self.file, rollout, trial=self.trial, **options)
         console.say(verification.summary())
         console.result(verification={**vars(verification), "passed": verification.passed})
         return 0 if verification.passed else 1

@@ -18,7 +18,7 @@ from PIL import Image
 
 from lqrsim.annotations import Bounds, Progress, checked
 from lqrsim.errors import Array, InputError, check_path
-from lqrsim.results.archive import replacing
+from lqrsim.results.archive import write_text
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
@@ -141,10 +141,10 @@ def report(
       videos: number of the worst trials to repeat and render. Without OpenGL the page has no videos, and says so.
     """
     path = check_path("out", out, "the path of a page")
-    scenario, missing = results.trials.scenario, Counter[Cell]()
+    scenario, campaign, missing = results.trials.scenario, results.campaign, Counter[Cell]()
     for cell, _, count in results.missing:
         missing[cell] += count
-    begun = [cell for cell in results.cells if missing[cell] < results.campaign.trials]
+    begun = [cell for cell in results.cells if missing[cell] < campaign.trials]
     table = {cell: results.outcomes(cell, partial=True) for cell in begun}
     if not table:
         raise InputError(f"results: got {results.folder}, in which no trial has ended yet, want at least one")
@@ -155,9 +155,7 @@ def report(
     page = _text_and_tables(results, table, worst, scenario)
     tell(1, parts)
     with tempfile.TemporaryDirectory() as folder:
-        page["sweeps"] = [
-            _sweep(name, table, scenario, results.campaign, Path(folder)) for name in results.campaign.sweeps
-        ]
+        page["sweeps"] = [_sweep(name, table, scenario, campaign, Path(folder)) for name in campaign.sweeps]
         tell(2, parts)
         worst_of_each = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
         shown = [trial for trial in worst_of_each if trial is not None][:videos]
@@ -168,8 +166,7 @@ def report(
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(packaged("lqrsim.reports").joinpath("page.html.j2").read_text(encoding="utf-8"))
-    with replacing(path) as unfinished:
-        unfinished.write_text(template.render(page), encoding="utf-8")
+    write_text(path, template.render(page))
     tell(parts, parts)
     return path
 

@@ -271,9 +271,8 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         target = Path(os.path.realpath(path))  # the target of a link is replaced, not the link
     except OSError as error:  # the working folder was removed
-        raise InputError(
-            f"output: got {excerpt_of(path)}, want a file that can be written ({error.strerror})"
-        ) from None
+        got = excerpt_of(path)
+        raise InputError(f"output: got {got}, want a file that can be written ({error.strerror})") from None
     looped = target.is_symlink()  # after all links have been followed
     if looped or (target.exists() and not target.is_file()):
         existing = "a folder" if target.is_dir() else "a link to itself" if looped else "neither a file nor a folder"
@@ -293,6 +292,12 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):  # the error that matters has been raised already
             unfinished.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8, all or nothing."""
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _remove_abandoned(folder: Path) -> None:

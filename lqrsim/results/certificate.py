@@ -50,10 +50,9 @@ class FailureCertificate:
             raise InputError(f"FailureCertificate: probability: got {self.probability:g}, want {wanted}")
         mean = float(self.repetitions.mean()) if len(self.repetitions) > 1 else -1.0
         if abs(mean - self.probability) > 1e-9 * self.probability:
-            raise InputError(
-                f"FailureCertificate: repetitions: got {len(self.repetitions)} whose mean is not {self.probability:g},"
-                " want at least two, of which the probability is the mean"
-            )
+            got = f"{len(self.repetitions)} whose mean is not {self.probability:g}"
+            want = "at least two, of which the probability is the mean"
+            raise InputError(f"FailureCertificate: repetitions: got {got}, want {want}")
 
     def summary(self) -> str:
         """Lines that describe the measurement, and the probability."""

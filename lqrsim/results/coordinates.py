@@ -76,9 +76,7 @@ class Coordinates:
         if not size:
             raise InputError("names: got none, want at least one")
         if len(self.units) != size:
-            raise InputError(
-                f"units: got {len(self.units)} of them, want {size}, one for each of {', '.join(self.names)}"
-            )
+            raise InputError(f"units: got {len(self.units)}, want {size}, one for each of {', '.join(self.names)}")
         if len(set(self.names)) != size:
             raise InputError(f"names: got a name twice in {', '.join(self.names)}, want different names")
         if len(self.position) not in (0, 2, 3):
@@ -97,9 +95,8 @@ class Coordinates:
                     raise InputError(f"units: {name}: got {excerpt(self.units[entry])}, want {unit!r} {why}")
         for first in self.rotation_vectors:
             if len(turns := [self.names[i] for i in range(first, first + 3) if i in self.angles]) > 1:
-                raise InputError(
-                    f"angles: got {', '.join(turns)} of one rotation vector, want at most one of the three"
-                )
+                got = ", ".join(turns)
+                raise InputError(f"angles: got {got} of one rotation vector, want at most one of the three")
         plane = self._plane()
         if len(plane) != 2 and self.offset is not None:
             raise InputError(f"offset: got {excerpt(self.offset)} without a plane, want it with a planar position")
@@ -108,9 +105,8 @@ class Coordinates:
         high = check_array("high", self.high or (np.inf,) * size, (size,), infinite=True)
         if (low >= high).any():
             i = int(np.argmax(low >= high))
-            raise InputError(
-                f"limits of {self.names[i]}: got {low[i]:g} to {high[i]:g}, want the first below the second"
-            )
+            got = f"{low[i]:g} to {high[i]:g}"
+            raise InputError(f"limits of {self.names[i]}: got {got}, want the first below the second")
         keep(self, plane=plane, offset=offset, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def __len__(self) -> int:
@@ -138,9 +134,8 @@ class Coordinates:
         listed = ", ".join(names)
         if len(names) == 3:
             if self.plane not in ("", SPACE):
-                raise InputError(
-                    f"plane: got {excerpt(self.plane)} for the position ({listed}), want none: the position is spatial"
-                )
+                got = f"{excerpt(self.plane)} for the position ({listed})"
+                raise InputError(f"plane: got {got}, want none: the position is spatial")
             if sorted(said) == sorted(SPACE) and said != SPACE:
                 want = ", ".join(names[said.index(letter)] for letter in SPACE)
                 raise InputError(f"position: got ({listed}), want it along x, y and z in this order: ({want})")
@@ -157,10 +152,8 @@ class Coordinates:
         if said in PLANES:
             return said
         if said != "??" or any(word in name.lower() for word in _UPWARD for name in names):
-            raise InputError(
-                f"plane: got none for the position ({listed}), whose names do not tell the plane, want one of:"
-                f" {', '.join(PLANES)}"
-            )
+            got = f"none for the position ({listed}), whose names do not tell the plane"
+            raise InputError(f"plane: got {got}, want one of: {', '.join(PLANES)}")
         return "xy"
 
     @property
@@ -267,9 +260,8 @@ class Coordinates:
         for name, lowest, highest in zip(self.names, low, high, strict=True):
             if not lowest < highest:
                 fixed = "; a control that cannot change is a parameter of the dynamics" if lowest == highest else ""
-                raise InputError(
-                    f"control_limits: got {lowest:g} to {highest:g} for {name}, want the first below the second{fixed}"
-                )
+                got = f"{lowest:g} to {highest:g} for {name}"
+                raise InputError(f"control_limits: got {got}, want the first below the second{fixed}")
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     @checked
@@ -309,10 +301,8 @@ def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose
     """
     for kind, space, wanted in zip(("states", "controls"), got, want, strict=True):
         if space.names != wanted.names:
-            raise InputError(
-                f"{field}: got {what} with the {kind} {', '.join(space.names)}, want {', '.join(wanted.names)}, as"
-                f" {whose} has them"
-            )
+            got = f"{what} with the {kind} {', '.join(space.names)}"
+            raise InputError(f"{field}: got {got}, want {', '.join(wanted.names)}, as {whose} has them")
 
 
 def _letter(name: str) -> str:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Line, OneOf, Want, checked
 from lqrsim.errors import Array, InputError, check_path, excerpt
-from lqrsim.results.archive import replacing
+from lqrsim.results.archive import write_text
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.save_load import hash_of
@@ -128,8 +128,7 @@ def export_c(
         text = (TEMPLATES / template).read_text(encoding="utf-8")
         text = re.sub("@([A-Za-z0-9]+)@", lambda match: parts[match[1]], text)
         text = text.replace(PREFIX, name).replace(PREFIX.upper(), name.upper())
-        with replacing(folder / file) as unfinished:
-            unfinished.write_text(text, encoding="utf-8", newline="\n")
+        write_text(folder / file, text)
         files.append(folder / file)
     return ExportedC(
         files=tuple(files), sha256=sha, table_bytes=tables.bytes, rounding=tuple(tables.rounding["gain"].tolist()),

@@ -89,10 +89,9 @@ class Funnel:
         doubt = (1 - self.confidence) / len(self.knots)  # Bonferroni: at one knot, for all to hold at once
         for trials, successes in zip(self.trials.tolist(), self.successes.tolist(), strict=True):
             if trials and _chance_of_so_few(trials - successes, trials, self.rate) > doubt * (1 + 1e-6):
-                raise InputError(
-                    f"Funnel: successes: got {successes} of {trials} trials, which do not show a rate of {self.rate:g}"
-                    f" with confidence {self.confidence:g} at {len(self.knots)} knots, want more"
-                )
+                shown = f"a rate of {self.rate:g} with confidence {self.confidence:g} at {len(self.knots)} knots"
+                got = f"{successes} of {trials} trials, which do not show {shown}"
+                raise InputError(f"Funnel: successes: got {got}, want more")
 
     @cached_property
     def chosen(self) -> list[int]:
@@ -176,10 +175,9 @@ class Funnel:
         """A line for each knot: its level, the extent along the states, and the trials that certify the level."""
         meant = {"cost_to_go": "level^2/2 is cost", "tube": "levels are standard deviations"}.get(self.family, "")
         of = "all states" if len(self.states) == len(self.state_coordinates) else ", ".join(self.states)
-        lines = [
-            f"funnel of {of}, {self.family}{f' ({meant})' if meant else ''}: at least {self.rate:g} of the runs that"
-            f" start in it succeed, with confidence {self.confidence:g} at all knots at once; {self.simulated:,} trials"
-        ]
+        shape = f"funnel of {of}, {self.family}{f' ({meant})' if meant else ''}"
+        sure = f"with confidence {self.confidence:g} at all knots at once; {self.simulated:,} trials"
+        lines = [f"{shape}: at least {self.rate:g} of the runs that start in it succeed, {sure}"]
         for i, knot in enumerate(self.knots):
             line = f"  {self.times[i]:6.2f} s  level {self.levels[i]:.4g}"
             if self.levels[i] > 0:

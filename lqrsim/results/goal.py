@@ -63,10 +63,8 @@ def departure(space: Coordinates, states: Array, plan: Array, dt: float) -> str:
         return f"does not get beyond {(knot - 1) * dt:.4g} s of the plan"
     text = f"LEAVES the plan at {knot * dt:.4g} s: {worst_of(space, off[knot], scale, TOLERANCE)}"
     if knot and error[knot - 1] <= ON_PLAN:
-        text += (
-            f"; a period before, no state was off by more than {error[knot - 1]:.1g} of its range: that step jumps, as"
-            " where a contact or a limit begins, and a rounding error decides which way"
-        )
+        why = "that step jumps, as where a contact or a limit begins, and a rounding error decides which way"
+        text += f"; a period before, no state was off by more than {error[knot - 1]:.1g} of its range: {why}"
     return text
 
 
@@ -171,19 +169,14 @@ class Target:
         """
         if self.places:
             if goal_tolerance is not None:
-                raise InputError(
-                    f"goal_tolerance: got {excerpt(goal_tolerance)}, want goal_radius, in metres: the {self.name}"
-                    " has a position"
-                )
+                want = f"goal_radius, in metres: the {self.name} has a position"
+                raise InputError(f"goal_tolerance: got {excerpt(goal_tolerance)}, want {want}")
             if goal_radius is not None:
                 return goal_radius
             return self.on_the_way(check_number("goal_radius", robot_radius, above=0.0))
         if goal_radius is not None:
-            names = ", ".join(self.space.names)
-            raise InputError(
-                f"goal_radius: got {excerpt(goal_radius)}, want goal_tolerance, relative to the way: the"
-                f" {self.name} has no position among {names}"
-            )
+            why = f"relative to the way: the {self.name} has no position among {', '.join(self.space.names)}"
+            raise InputError(f"goal_radius: got {excerpt(goal_radius)}, want goal_tolerance, {why}")
         if goal_tolerance is not None:
             return goal_tolerance
         return self.on_the_way(TOLERANCE)

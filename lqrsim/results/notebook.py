@@ -88,10 +88,8 @@ def _svg(lines: list[tuple[Array, str, str, str]], title: str, *, equal: bool) -
     for line, colour, name, dashes in lines:
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places(line))
         style = f' stroke-dasharray="{dashes}"' if dashes else ""
-        drawn.append(
-            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"{style}>'
-            f"<title>{escape(name)}</title></polyline>"
-        )
+        shape = f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"{style}>'
+        drawn.append(f"{shape}<title>{escape(name)}</title></polyline>")
     plan = places(lines[0][0])
     for place, name, fill in ((plan[:1], "start", "none"), (plan[-1:], "the plan's end", "currentColor")):
         for x, y in place if equal else ():

@@ -139,10 +139,8 @@ class OutputFeedbackPolicy:
     def __post_init__(self) -> None:
         states = len(self.state_coordinates)
         if not self.steps or self.nominal.shape[1] < states:
-            raise InputError(
-                f"OutputFeedbackPolicy: nominal: got shape {self.nominal.shape}, want at least one row, of"
-                f" {states} states or more"
-            )
+            want = f"at least one row, of {states} states or more"
+            raise InputError(f"OutputFeedbackPolicy: nominal: got shape {self.nominal.shape}, want {want}")
 
     @property
     def steps(self) -> int:

@@ -76,13 +76,12 @@ class MovingObstacles:
 
     @classmethod
     def of(cls, world: World) -> Self:
-        positions, rotations, sizes, velocities = (
-            np.array([getattr(obstacle, field) for obstacle in world.obstacles])
-            for field in ("position", "rotation", "size", "velocity")
-        )
-        kinds = tuple(obstacle.kind for obstacle in world.obstacles)
+        obstacles = world.obstacles
         return cls(
-            names=world.names, kinds=kinds, positions=positions, rotations=rotations, sizes=sizes, velocities=velocities
+            names=world.names, kinds=tuple(one.kind for one in obstacles),
+            positions=np.array([one.position for one in obstacles]), sizes=np.array([one.size for one in obstacles]),
+            rotations=np.array([one.rotation for one in obstacles]),
+            velocities=np.array([one.velocity for one in obstacles]),
         )  # fmt: skip
 
     def at(self, time: float) -> Array:

@@ -151,9 +151,8 @@ def _declared_at(kind: type, path: str) -> Declared | None:
         if name.isascii() and name.isdigit():
             inside = [declared(get_args(choice)[0]) for choice in kinds if get_origin(choice) is tuple]
         else:
-            inside = [
-                declarations(choice)[name] for choice in kinds if is_dataclass(choice) and name in declarations(choice)
-            ]
+            records = [declarations(choice) for choice in kinds if is_dataclass(choice)]
+            inside = [record[name] for record in records if name in record]
         declaration = inside[0] if inside else None
         kinds = declaration.kinds if declaration else ()
     return declaration
@@ -200,9 +199,8 @@ def _value(said: Declared, tree: Any, path: str, arrays: archive.Arrays) -> Any:
         inner = declared(get_args(kind)[0])
         return tuple(_value(inner, item, _join(path, i), arrays) for i, item in enumerate(tree))
     if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return kind(
-            check_name(path, tree[:100] if isinstance(tree, str) else tree, [str(member.value) for member in kind])
-        )
+        named = tree[:100] if isinstance(tree, str) else tree
+        return kind(check_name(path, named, [str(member.value) for member in kind]))
     if said.dtype is not None:
         raise InputError(f"{path}: got {excerpt(tree)} in meta, want an array")
     return archive.anything(path, tree)

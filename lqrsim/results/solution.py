@@ -130,10 +130,8 @@ class Solution(Plan):
     def total_cost(self) -> TotalCost:
         """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError without a cost-to-come, as from `ilqr`."""
         if self.cost_to_go is None or self.cost_to_come is None:
-            raise InputError(
-                f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth that"
-                " completed its passes and was not shifted"
-            )
+            got, want = f"a solution of {self.solver} without both value functions", "completed its passes, not shifted"
+            raise InputError(f"total_cost: got {got}, want one of smooth that {want}")
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
     def _shifted_parts(self, steps: int, shift: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
@@ -217,9 +215,7 @@ class Solution(Plan):
             return []
         ended = [candidate for candidate in self.candidates if candidate.status is not None]
         dropped = [candidate.cost for candidate in self.candidates if candidate.status is None]
-        best = min(
-            ended, key=lambda candidate: (candidate.status != self.status, abs(candidate.cost - self.cost))
-        ).start
+        best = min(ended, key=lambda other: (other.status != self.status, abs(other.cost - self.cost))).start
         lines = [f"the plan is from the start {best!r}, one of {len(self.candidates)}"]
         if dropped:
             why = f"which cost {min(dropped):.6g} or more" if np.isfinite(min(dropped)) else "for no cost was finite"

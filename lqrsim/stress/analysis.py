@@ -43,8 +43,8 @@ class Outcomes:
       clearance: the least clearance in metres; at most 0 after a collision.
       effort: integral of the squared applied controls over time, in their unit squared times s.
       saturated: fraction of the control periods with a command at a limit.
-      cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before. Of a
-        problem in belief space, that of true states as if they were known: without the cost of what is not known.
+      cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before. In belief
+        space it is the cost of a state that is known.
       deterministic: whether the trials drew nothing, so that all are the same run.
     """
 
@@ -298,9 +298,8 @@ def compare_cells(
             difference, p_value = statistics.independent_difference(*((rate.reached, rate.trials) for rate in rates))
         if all(rate.alike for rate in rates):  # the difference of two runs
             difference, p_value = replace(difference, low=difference.value, high=difference.value), float("nan")
-        compared.append(
-            Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)
-        )
+        found = Comparison(first, second, rates, difference, rms, both, only_first, only_second, p_value, p_value)
+        compared.append(found)
     tested = [number for number, comparison in enumerate(compared) if not np.isnan(comparison.p_value)]
     p_values = statistics.holm([compared[number].p_value for number in tested]).tolist()
     for number, adjusted in zip(tested, p_values, strict=True):

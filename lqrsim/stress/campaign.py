@@ -82,10 +82,8 @@ def run_campaign(
         unfinished = _unfinished(results)
         if unfinished:
             if others := changed(results.manifest["versions"]):
-                raise InputError(
-                    f"versions: got {others}, which may change the last bits, want the versions of {folder},"
-                    " or another folder"
-                )
+                want = f"the versions of {folder}, or another folder"
+                raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
             results.trials.warm_up()  # done here first, so that the workers find everything compiled
         job = executors.Job.of(results.trials, results.manifest, batch)
         total = campaign.trials * len(results.cells)
@@ -195,9 +193,7 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         hashes[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
         save_load.save(given, folder / files.SOLUTION_FILE)
-    remarks = [
-        f"{policy} {remark}" for policy, solution in solutions.items() for remark in solving.remarks(scenario, solution)
-    ]
+    remarks = [f"{name} {line}" for name, plan in solutions.items() for line in solving.remarks(scenario, plan)]
     impossible = policies.impossible_policies(scenario, given)
     missing = "; ".join(f"{name}, {impossible[name]}" for name in policies.DEFAULT_POLICIES if name in impossible)
     # Policies that were chosen leave out others on purpose.
@@ -245,9 +241,8 @@ def _digest_of_runs(scenario: Scenario) -> str:
     # Maps are code: their values at zero and at each unit vector stand for them.
     probes = [[*np.zeros((1, len(space))), *np.eye(len(space))] for space in (states, controls)]
     maps = [np.concatenate(robot.configuration(row)) for row in probes[0]], [robot.actuation(row) for row in probes[1]]
-    balls = (
-        [] if robot.balls is None else [robot.balls.radii, *(robot.balls.centres(dynamics, row) for row in probes[0])]
-    )
+    spheres = robot.balls
+    balls = [] if spheres is None else [spheres.radii, *(spheres.centres(dynamics, row) for row in probes[0])]
     names = robot.name, robot.body, robot.joints, robot.actuators, robot.wheels, dynamics.fixed
     numbers = robot.drag, robot.radius, plant.timestep, robot.activations, scene.geoms, dynamics.parameters
     stated: tuple[Any, ...] = (names, numbers, scenario.near_enough(), without_addresses(str(scenario.simulator)))
@@ -291,9 +286,8 @@ def _is_intact(results: Results, shard: Shard) -> bool:
             aside.parent.mkdir(exist_ok=True)
             path.replace(aside)
         except OSError as problem:
-            raise InputError(
-                f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror}), want it removed"
-            ) from None
+            got = f"{path}, which is damaged and cannot be moved ({problem.strerror})"
+            raise InputError(f"shard: got {got}, want it removed") from None
         _log.warning("%s was damaged (%s); moved it to %s, its trials run again", path.name, error, aside)
         return False
     return True

@@ -24,7 +24,7 @@ from lqrsim.errors import (
     keep,
 )
 from lqrsim.results import notebook
-from lqrsim.results.archive import replacing
+from lqrsim.results.archive import write_text
 
 Entry = str | int | float | None
 _LONGEST = 10_000  # characters of an entry or a note; a reference to a scenario may have as many
@@ -89,9 +89,8 @@ class DataTable:
 
     def latex(self) -> str:
         r"""The table as a `tabular` of LaTeX with the rules of the package booktabs, for `\input` in a `table`."""
-        head, *rows = (
-            " & ".join(row) + r" \\" for row in self._rows(lambda text: text.translate(_LATEX), _latex_number)
-        )
+        entries = self._rows(lambda text: text.translate(_LATEX), _latex_number)
+        head, *rows = (" & ".join(row) + r" \\" for row in entries)
         return _lines(
             r"% needs \usepackage{booktabs}", *(f"% {note}" for note in self.notes),
             rf"\begin{{tabular}}{{{''.join('l' if text else 'r' for text in self._texts)}}}",
@@ -119,9 +118,7 @@ class DataTable:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the table in the format that the name ends with, .csv, .tex or .md; returns its path."""
         path = check_path("path", path, suffixes=ENDINGS)
-        text = _WRITERS[path.suffix.lower()](self)
-        with replacing(path) as unfinished:
-            unfinished.write_text(text, encoding="utf-8", newline="\n")
+        write_text(path, _WRITERS[path.suffix.lower()](self))
         return path
 
     @property

@@ -23,7 +23,7 @@ from lqrsim.errors import Array, InputError, check_path
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
-from lqrsim.results.archive import plain, replacing, sha256
+from lqrsim.results.archive import plain, sha256, write_text
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -148,22 +148,18 @@ class ReliabilityProblem(Study):
         score, level = self._begin(report)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
-            raise InputError(
-                f"scenario: got {self.scenario}, where {self.policy} fails with all random numbers at zero, want a"
-                " policy that succeeds when undisturbed"
-            )
+            got = f"{self.policy}, which fails with all random numbers at zero"
+            raise InputError(f"policy: got {got}, want one that succeeds when undisturbed")
 
         def result(point: DesignPoint) -> SmallestFailure:
             options = {"seed": seed, "rounds": rounds, "particles": particles}
             return SmallestFailure(self, point, score.simulations - before, options)
 
         with keeping(lambda done: result(done) if isinstance(done, DesignPoint) else None):
-            first = failure_probability(
+            failures = failure_probability(
                 score, score.size, particles=particles, keep=0.2, repetitions=2, level=level, seed=seed
-            )
-            point = smallest_failure(
-                score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
-            )
+            ).failures
+            point = smallest_failure(score, score.size, failures=failures, rounds=rounds, progress=progress, seed=seed)
         return result(point)
 
     def _begin(self, report: Report | None) -> tuple[TrialScore, Callable[[float], object] | None]:
@@ -211,10 +207,8 @@ class RareFailures:
         drawn = zip(self.problem.disturbances, score.sizes, strict=True)
         few = [disturbance.describe(score.plant) for disturbance, size in drawn if disturbance.discrete and size]
         if few and len(self.splitting.levels) > 1:
-            lines.append(
-                f"splitting may miss failures by draws with few values, as of {'; '.join(few)}; rare_failures(keep=0)"
-                " counts failures"
-            )
+            draws = f"draws with few values, as of {'; '.join(few)}"
+            lines.append(f"splitting may miss failures by {draws}; rare_failures(keep=0) counts failures")
         return "\n".join(lines)
 
     __str__ = summary
@@ -270,9 +264,8 @@ class Recheck:
         done, certified = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
         lines = [f"measured again: {done} of {certified} repetitions, {self.measured.splitting.simulations:,} trials"]
         if self.changed:
-            lines.append(
-                f"{self.measured.probability:.2g}; intervals are compared, for the bits may differ: got {self.changed}"
-            )
+            why = f"for the bits may differ: got {self.changed}"
+            lines.append(f"{self.measured.probability:.2g}; intervals are compared, {why}")
         lines += [f"NOT as certified: {difference}" for difference in self.differences]
         if not self.differences:
             lines.append("as certified: the intervals overlap" if self.changed else "as certified, to the last bit")
@@ -309,11 +302,8 @@ def certify(
         stated["scenario"] = scenario
     problem = ReliabilityProblem(**stated)
     facts = problem.facts
-    differences = [
-        f"{name}: got {value}, want {was}"
-        for name, value in facts.items()
-        if value != (was := getattr(certificate, name))
-    ]
+    was = {name: getattr(certificate, name) for name in facts}
+    differences = [f"{name}: got {facts[name]}, want {was[name]}" for name in facts if facts[name] != was[name]]
     measured = problem.rare_failures(
         particles=certificate.particles, repetitions=count, keep=certificate.keep, seed=seed, report=report,
         progress=progress,
@@ -325,9 +315,7 @@ def certify(
             differences.append(f"probability: got {estimate:.2g}, want an interval that overlaps")
     else:
         pairs = zip(measured.splitting.repetitions.tolist(), certificate.repetitions.tolist(), strict=False)
-        differences += [
-            f"repetition {i}: got {got!r}, want {want!r}" for i, (got, want) in enumerate(pairs) if got != want
-        ]
+        differences += [f"repetition {i}: got {a!r}, want {b!r}" for i, (a, b) in enumerate(pairs) if a != b]
         got = estimate.value, estimate.low, estimate.high
         want = certificate.probability, certificate.low, certificate.high
         if count == certified and got != want:
@@ -401,27 +389,22 @@ class SmallestFailure:
     def summary(self) -> str:
         """Lines with the distance, FORM's estimate, the fraction of each disturbance, and the largest disturbances."""
         point = self.point
-        lines = [
-            f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, found with"
-            f" {self.simulations:,} trials"
-        ]
+        found = f"found with {self.simulations:,} trials"
+        lines = [f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, {found}"]
         if not point.converged:
             left = "an unknown share" if np.isnan(point.remaining) else f"about {100 * point.remaining:.1f} %"
             why, then = (f"stopped {self.stopped}", "") if self.stopped else ("not converged", "; use more --rounds")
             lines.append(f"{why}: {left} of the distance may be left to gain{then}")
         probability = point.first_order_probability
-        lines.append(
-            f"first-order estimate: one trial in {rounded(1 / max(probability, 1e-300))} fails"
-            f" (reliability {1 - probability:.6g}); `lqrsim rare` measures the probability"
-        )
+        fails = f"one trial in {rounded(1 / max(probability, 1e-300))} fails (reliability {1 - probability:.6g})"
+        lines.append(f"first-order estimate: {fails}; `lqrsim rare` measures the probability")
         score = self.problem.score
         parts = zip(self.shares, score.sizes, score.disturbances, strict=True)
         lines += [f"{100 * share:6.1f} % of the squared distance: {kind.describe(score.plant)} ({count:,} numbers)"
                   for share, count, kind in parts if count]  # fmt: skip
-        lines += [
-            f"largest {effect.what}: {effect.size:.3g} {effect.unit}".rstrip() + f" at {effect.time:.2f} s"
-            for effect in self.largest
-        ]
+        for effect in self.largest:
+            size = f"{effect.size:.3g} {effect.unit}".rstrip()
+            lines.append(f"largest {effect.what}: {size} at {effect.time:.2f} s")
         return "\n".join(lines)
 
     __str__ = summary
@@ -472,5 +455,4 @@ def write_json(
         "stopped": stopped or None,
         "found": result,
     }
-    with replacing(path) as unfinished:
-        unfinished.write_text(json.dumps(plain(contents), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(plain(contents), indent=1, allow_nan=False) + "\n")

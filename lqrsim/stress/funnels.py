@@ -78,10 +78,8 @@ def smallest_test(
     while not proves(high):
         high *= 2
         if high > MOST_TRIALS:
-            raise InputError(
-                f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
-                f" {MOST_TRIALS:,} trials, want a smaller one of the three"
-            )
+            got = f"{rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
+            raise InputError(f"rate: got {got} {MOST_TRIALS:,} trials, want a smaller one of the three")
     low = failures  # with as many trials nothing is proved
     while high - low > 1:
         middle = (low + high) // 2
@@ -121,14 +119,10 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
     pilot = _Pilot(runs, test)
     pilot_level = pilot.level(min(guess, largest), largest)
     if pilot_level == 0:
-        failed = pilot.failures(0.0, test.trials)
-        if failed > test.pilot_failures:
-            reason = (
-                f"even when they begin on the plan, {failed} of {test.trials} trials fail; to prove a rate of {rate:g},"
-                f" at most {test.pilot_failures} may fail"
-            )
-        else:
-            reason = "too many trials fail at all levels that were tried, down to the smallest"
+        reason = "too many trials fail at all levels that were tried, down to the smallest"
+        if (failed := pilot.failures(0.0, test.trials)) > test.pilot_failures:
+            allowed = f"to prove a rate of {rate:g}, at most {test.pilot_failures} may fail"
+            reason = f"even when they begin on the plan, {failed} of {test.trials} trials fail; {allowed}"
         return FoundLevel(0.0, 0, 0, reason, 0.0, pilot.simulated)
     passed, reason, simulated = (0.0, 0, 0), "", pilot.simulated
     for level in dict.fromkeys(min(fraction * pilot_level, largest) for fraction in TESTED_FRACTIONS):
@@ -384,8 +378,7 @@ def check_funnel(
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
         raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
-    between = check_array("between", between, (2,)).tolist()
-    if not 0 <= between[0] < between[1]:
+    if not between[0] < between[1]:
         raise InputError(f"between: got {excerpt(between)}, want two shares of the level, in order, from 0 on")
     if seed == funnel.seed:
         raise InputError(f"seed: got {seed}, the funnel's own, want another one, for new trials")

@@ -58,9 +58,8 @@ Design = Sequence[Disturbance] | str | None  # disturbances, the name of a set, 
 def check_designed(design: Design, policies: Sequence[str]) -> None:
     """Raise InputError if disturbances are given and none of the policies is designed for any."""
     if design is not None and not {*DESIGNED} & {*policies}:
-        raise InputError(
-            f"design_disturbances: got them with {', '.join(policies)}, want {' or '.join(DESIGNED)}, or leave them out"
-        )
+        got = f"got them with {', '.join(policies)}"
+        raise InputError(f"design_disturbances: {got}, want {' or '.join(DESIGNED)}, or leave them out")
 
 
 def design_disturbances(scenario: Scenario, design: Design = None) -> Sequence[Disturbance]:
@@ -126,9 +125,8 @@ def check_used(given: Solution | None, policies: Sequence[str]) -> None:
         return
     users = [policy for policy, kind in POLICY_KINDS.items() if kind.solver == solver_of(given)]
     if not {*users} & {*policies}:
-        raise InputError(
-            f"solution: got a solution of {given.solver} with {', '.join(policies)}, want it with {', '.join(users)}"
-        )
+        got = f"a solution of {given.solver} with {', '.join(policies)}"
+        raise InputError(f"solution: got {got}, want it with {', '.join(users)}")
 
 
 def impossible_policies(scenario: Scenario, given: Solution | None = None) -> dict[str, str]:
@@ -144,10 +142,8 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
     if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver:
         stated = scenario.with_duration_of(given).problem
         if given.problem_digest != stated.digest:
-            other = solving.difference(given, stated)
-            impossible["replan"] = (
-                f"which re-plans the scenario's problem, while the solution is of another problem{other}"
-            )
+            other = f"another problem{solving.difference(given, stated)}"
+            impossible["replan"] = f"which re-plans the scenario's problem, while the solution is of {other}"
     return impossible
 
 
@@ -175,10 +171,8 @@ def make_controller(
         case "replan":
             if solution.problem_digest != problem.digest:
                 other = solving.difference(solution, problem)
-                raise InputError(
-                    f"controller: got replan for a solution of another problem than that of {scenario.name}{other};"
-                    f" want a solution of the scenario's own problem, or one of {', '.join(CONTROLLERS[:-1])}"
-                )
+                got = f"replan for a solution of another problem than that of {scenario.name}{other}"
+                raise InputError(f"controller: got {got}; want one of its own, or {', '.join(CONTROLLERS[:-1])}")
             every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
             return Replanner(problem, solution, every=every, deadline=0.0)
     return solution.policy

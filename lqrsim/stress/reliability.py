@@ -276,11 +276,9 @@ class _Splitting:
                 vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
             if not len(scores):
                 tied = batch_count * self.particles
-                raise NoFailure(
-                    f"score: got scores that tie at {level:g} after {len(levels)} levels, and none of {tied:,} above"
-                    " it: the score does not tell which vectors are nearer to failing",
-                    0 if levels else tied,
-                )
+                got = f"scores that tie at {level:g} after {len(levels)} levels, and none of {tied:,} above it"
+                why = "the score does not tell which vectors are nearer to failing"
+                raise NoFailure(f"score: got {got}: {why}", 0 if levels else tied)
             batches.append(batch_count)
             if level == 0:
                 return np.array([*levels, 0.0]), np.array(step_sizes), batches
@@ -291,10 +289,8 @@ class _Splitting:
                 b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
             levels.append(level)
             step_sizes.append(b)
-        raise NoFailure(
-            f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none"
-            " exist"
-        )
+        got = f"no failure in {len(levels)} levels up to {scores.max():g}"
+        raise NoFailure(f"score: got {got}: failures are too rare, or none exist")
 
     def repetition(
         self, levels: Array, step_sizes: Array, batches: Sequence[int], rng: np.random.Generator

@@ -437,10 +437,8 @@ def compare(
       with low and high; p, adjusted for the number of rows (Holm, 1979). With different seeds, first trials and second
       trials take the place of trials, only first and only second. Failure rates differ by as much, the other way round.
     """
-    opened = [
-        campaign if isinstance(campaign, Results) else Results(campaign)
-        for campaign in ([first] if second is None else [first, second])
-    ]
+    given = [first] if second is None else [first, second]
+    opened = [campaign if isinstance(campaign, Results) else Results(campaign) for campaign in given]
     results, chosen = (opened[0], opened[-1]), policies or ()
     manifests = [campaign.manifest for campaign in results]
     campaigns = [manifest["campaign"] for manifest in manifests]
@@ -455,9 +453,8 @@ def compare(
     )
     pairs = [pair for pair in matches if pair[1] in results[1].cells]
     if not pairs:
-        raise InputError(
-            f"second: got cells from {results[1].cells[0]} to {results[1].cells[-1]}, want some of the first's"
-        )
+        cells = results[1].cells
+        raise InputError(f"second: got cells from {cells[0]} to {cells[-1]}, want some of the first's")
     for sweep in dict.fromkeys(cell.sweep for cell, _ in pairs):
         if campaigns[0]["sweeps"][sweep] != campaigns[1]["sweeps"][sweep]:
             raise InputError(f"second: got other disturbances in the sweep {excerpt(sweep)}, want those of the first")
@@ -467,9 +464,8 @@ def compare(
     paired = campaigns[0]["seed"] == campaigns[1]["seed"]
     trials = [campaign["trials"] for campaign in campaigns]
     counts = [min(trials)] * 2 if paired else trials
-    firsts, seconds = (
-        {pair[side]: results[side].outcomes(pair[side]).first(counts[side]) for pair in pairs} for side in (0, 1)
-    )
+    firsts = {cell: results[0].outcomes(cell).first(counts[0]) for cell, _ in pairs}
+    seconds = {cell: results[1].outcomes(cell).first(counts[1]) for _, cell in pairs}
     comparisons = analysis.compare_cells(pairs, firsts, seconds, paired=paired)
     of = [f"{policy} of " for policy in chosen] or ["", ""]
     notes = [f"first: {of[0]}{results[0].folder}; second: {of[1]}{results[1].folder}"]

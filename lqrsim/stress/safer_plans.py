@@ -16,7 +16,7 @@ trials are then run, and the exact upper bound of their count decides.
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import ceil, log, log1p
 from typing import Annotated, Any
 
@@ -142,7 +142,7 @@ class HardenedPlan:
         """Write solution.npz and harden.json, and the files of `rare` if there are failures; returns those it wrote."""
         folder = check_path("folder", folder, "the path of a folder")
         rounds = [
-            {"cost": plan.cost, "hit": plan.hit, "strays": plan.strays, "probability": asdict(plan.probability)}
+            {"cost": plan.cost, "hit": plan.hit, "strays": plan.strays, "probability": plan.probability}
             for plan in self.rounds
         ]
         findings = {"success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds}
@@ -334,19 +334,16 @@ class _Search:
             return self.ended
         last = self.rounds[-1]
         if last.rare is None:
-            return (
-                f"splitting found no failure of plan {len(self.rounds)} but may have missed some, and"
-                f" {last.unfailing:,} trials without one prove at most {last.probability.high:.2g}; allow more"
-                f" particles: from {ceil(FAILING_TRIALS / self.chance):,} on failures are counted"
-            )
+            found = f"splitting found no failure of plan {len(self.rounds)} but may have missed some"
+            proved = f"{last.unfailing:,} trials without one prove at most {last.probability.high:.2g}"
+            counted = f"from {ceil(FAILING_TRIALS / self.chance):,} on failures are counted"
+            return f"{found}, and {proved}; allow more particles: {counted}"
         after, strays = f"not after {len(self.rounds)} plans", last.strays
         safest = self.safest()
         found = self.rounds[safest].probability
         if found.value <= self.chance:
-            return (
-                f"the probability of plan {safest + 1} is measured as {found.low:.2g} to {found.high:.2g}, too wide an"
-                " interval; allow more particles or repetitions, or a higher chance"
-            )
+            measured = f"the probability of plan {safest + 1} is measured as {found.low:.2g} to {found.high:.2g}"
+            return f"{measured}, too wide an interval; allow more particles or repetitions, or a higher chance"
         if strays < 0.5:
             return f"{after}; allow more rounds, or a higher chance"
         return f"{after}, because {100 * strays:.0f} % of the failing runs leave the last one for good; {self.remedy}"

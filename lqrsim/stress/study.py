@@ -219,10 +219,8 @@ class Campaign(Setup):
             raise InputError("design_disturbances: got none, want at least one disturbance, or None for the default")
         files = -(-self.trials // self.shard) * len(self.cells)
         if files > _MOST_FILES:
-            raise InputError(
-                f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which takes {files}"
-                f" files, want at most {_MOST_FILES}: fewer trials, or larger shards"
-            )
+            got = f"{self.trials} in shards of {self.shard} for {len(self.cells)} cells, which takes {files} files"
+            raise InputError(f"trials: got {got}, want at most {_MOST_FILES}: fewer trials, or larger shards")
 
     @classmethod
     def of_sets(cls, setup: Setup, sets: Sequence[str], *, policies: Sequence[str] = (), **options: Any) -> "Campaign":

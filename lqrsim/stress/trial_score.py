@@ -84,10 +84,8 @@ class PrescribedDraws:
         return np.take(options, np.minimum(which, count - 1), axis)[()]
 
     def __getattr__(self, name: str) -> Any:
-        raise InputError(
-            f"disturbance: got draws by {name}, want standard_normal, normal, random, uniform, exponential,"
-            " integers or choice, which can be made from standard normal numbers"
-        )
+        known = "standard_normal, normal, random, uniform, exponential, integers or choice"
+        raise InputError(f"disturbance: got draws by {name}, want {known}, which are made from standard normal numbers")
 
 
 def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
