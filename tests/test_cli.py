@@ -21,7 +21,7 @@ from sampling import rarely
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
-from lqrsim.commands import COMMANDS, console, reliability, solving, stressing
+from lqrsim.commands import COMMANDS, console, solving, stressing
 from lqrsim.commands.options import options_of, stated
 from lqrsim.commands.reproduce import SCRIPTS
 from lqrsim.commands.solving import Solve
@@ -442,11 +442,11 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("command", "function", "names"),
     [
-        (reliability.Rare, ls.stress.ReliabilityProblem.rare_failures, "particles repetitions"),
-        (reliability.Break, ls.stress.ReliabilityProblem.smallest_failure, "rounds particles"),
-        (reliability.Harden, ls.stress.harden, "chance rounds particles repetitions"),
-        (reliability.Certify, ls.stress.certify, "repetitions seed"),
-        (reliability.FunnelCommand, ls.funnel, "rate failures"),
+        (stressing.Rare, ls.stress.ReliabilityProblem.rare_failures, "particles repetitions"),
+        (stressing.Break, ls.stress.ReliabilityProblem.smallest_failure, "rounds particles"),
+        (stressing.Harden, ls.stress.harden, "chance rounds particles repetitions"),
+        (stressing.Certify, ls.stress.certify, "repetitions seed"),
+        (stressing.FunnelCommand, ls.funnel, "rate failures"),
         (stressing.Stress, ls.stress.Campaign, "strengths trials replan_every shard time_limit goal_radius seed"),
         (stressing.Stress, ls.stress.run_campaign, "workers batch scheduler"),
         (solving.Simulate, ls.simulate, "seed trials first_trial"),

@@ -121,19 +121,11 @@ ControllerName = Literal["feedback", "track", "offset_free", "replan"]
 Strength = Annotated[float, arg(metavar="FACTOR", help="Factor by which the disturbances are scaled.")]
 DesignSet = Annotated[
     str | None,
-    optional(
-        "NAME",
-        "The set of disturbances for which track and offset_free are designed, named as in `lqrsim stress --sweep`. By"
-        " default moderate.",
-    ),
+    optional("NAME", "Set for which track and offset_free are designed, as in `lqrsim stress`. By default moderate."),
 ]
 SolutionFile = Annotated[
     Path | None,
-    optional(
-        "FILE.npz",
-        "Run this solution, from `lqrsim solve`, instead of solving the scenario. It must be of the scenario's robot,"
-        " horizon and goal.",
-    ),
+    optional("FILE.npz", "Run this solution instead of solving the scenario, with its robot, horizon and goal."),
 ]
 Folder = Annotated[Path | None, optional("FOLDER")]
 OwnScenario = Annotated[

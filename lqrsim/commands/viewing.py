@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from lqrsim.view.viewer import MovableGoal, Viewer
 
 
+OVERLAY_HELP = "Drawn over the scene. " + " ".join(f"{name}: {kind.words}." for name, kind in OVERLAY_KINDS.items())
+
+
 @dataclass(frozen=True, kw_only=True)
 @options_of(
     "view/render.py", "render", camera="NAME", size="WIDTH HEIGHT", fps="RATE", speed="FLOAT", time="SECONDS",
@@ -60,13 +63,7 @@ class Render:
     """More cameras, in panes beside the first. top and side are calibrated, and show a mark on the robot."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
     """Title of each run. By default the robot and the scene."""
-    overlays: Annotated[
-        tuple[Overlay, ...],
-        arg(
-            metavar="NAME ...",
-            help="Drawn over the scene. " + " ".join(f"{name}: {kind.words}." for name, kind in OVERLAY_KINDS.items()),
-        ),
-    ] = OVERLAYS
+    overlays: Annotated[tuple[Overlay, ...], arg(metavar="NAME ...", help=OVERLAY_HELP)] = OVERLAYS
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
     """Solution of the runs, one for all or one each, for cost_tube."""
     funnel: Annotated[tuple[Path, ...], optional("FUNNEL ...")] = ()

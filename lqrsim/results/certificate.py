@@ -57,9 +57,7 @@ class FailureCertificate:
     def summary(self) -> str:
         """Lines that describe the measurement, and the probability."""
         interval = f"{100 * self.confidence:g} % interval, {len(self.repetitions)} repetitions"
-        return (
-            f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}; failure: {self.failure}\n"
-            f"probability of failure: {self.probability:.2g} [{self.low:.2g}, {self.high:.2g}] ({interval})"
-        )
+        run = f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}; failure: {self.failure}"
+        return f"{run}\nprobability of failure: {self.probability:.2g} [{self.low:.2g}, {self.high:.2g}] ({interval})"
 
     __str__ = summary

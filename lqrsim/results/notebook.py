@@ -33,10 +33,8 @@ def of_table(
         cells = (f'<{tag} style="text-align:left">{escape(text)}</{tag}>' for tag, text in zip(tags, row, strict=True))
         table += f"<tr>{''.join(cells)}</tr>"
     beside = "display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start"
-    return (
-        f'<div class="lqrsim"><div><strong>{escape(heading)}</strong></div>{lines}'
-        f'<div style="{beside}"><table>{table}</table>{picture}</div></div>'
-    )
+    above = f'<div class="lqrsim"><div><strong>{escape(heading)}</strong></div>{lines}'
+    return f'{above}<div style="{beside}"><table>{table}</table>{picture}</div></div>'
 
 
 def drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
@@ -95,7 +93,6 @@ def _svg(lines: list[tuple[Array, str, str, str]], title: str, *, equal: bool) -
         for x, y in place if equal else ():
             circle = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" stroke="currentColor" fill="{fill}">'
             drawn.append(f"{circle}<title>{escape(name)}</title></circle>")
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}" '
-        f'role="img"><title>{escape(title)}</title>{"".join(drawn)}</svg>'
-    )
+    size = f'width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img"><title>{escape(title)}</title>'
+    return f"{head}{''.join(drawn)}</svg>"

@@ -90,9 +90,7 @@ class Plan:
             "policy": self.policy.shifted(steps, horizon=horizon),
             "trajectory": Trajectory(shift(plan.states), shift(plan.controls), plan.dt),
             "cost_to_go": value,
-            "multipliers": tuple(
-                replace(multiplier, values=shift(multiplier.values)) for multiplier in self.multipliers
-            ),
+            "multipliers": tuple(replace(one, values=shift(one.values)) for one in self.multipliers),
         }
         return replace(self, **parts, **self._shifted_parts(steps, shift))
 

@@ -304,13 +304,9 @@ class Rollout:
     @cached_property
     def _endings(self) -> tuple[npt.NDArray[np.str_], Array]:
         return endings(
-            collided_at=self.collided_at,
-            diverged_at=self.diverged_at,
-            failed_at=self.failed_at,
-            distance=self.goal_distance,
-            radius=self.goal_radius,
-            horizon=self.plan.horizon,
-        )
+            collided_at=self.collided_at, diverged_at=self.diverged_at, failed_at=self.failed_at,
+            distance=self.goal_distance, radius=self.goal_radius, horizon=self.plan.horizon,
+        )  # fmt: skip
 
     @property
     def outcome(self) -> tuple[str, ...]:
@@ -420,10 +416,9 @@ class Rollout:
         saturated = 100 * np.where(begun, self.saturated[k], False).sum() / max(begun.sum(), 1)
         clearance = self.least_clearance()[k]
         least = f"; clearance {clearance:.3f} m" if np.isfinite(clearance) else ""
-        return (
-            f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{self._worst(k)}{final} {unit}{least};"
-            f" {self.contacts[k]} periods in contact with obstacles; {saturated:.0f} % saturated"
-        )
+        errors = f"tracking error rms {rms:.3g}, max {error.max():.3g}{self._worst(k)}{final} {unit}"
+        contact = f"{self.contacts[k]} periods in contact with obstacles"
+        return f"{name}: {how}; {errors}{least}; {contact}; {saturated:.0f} % saturated"
 
     def _worst(self, k: int) -> str:
         """The state with the largest error from the plan in a trial, for a robot without a position; else empty.

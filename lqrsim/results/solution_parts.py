@@ -77,47 +77,29 @@ class Status(enum.StrEnum):
         return member
 
     CONVERGED = "converged", "optimality and, with a cost-to-come, the gap are within tolerance"
-    COST_CONVERGED = (
-        "cost converged", "the change of cost is within tolerance; gap and optimality were not tested",
-        'check the gap, or solve with stop="optimal"',
-    )  # fmt: skip
+    COST_CONVERGED = ("cost converged", "the change of cost is within tolerance; gap and optimality were not tested",
+                      'check the gap, or solve with stop="optimal"')  # fmt: skip
     MAX_ITERATIONS = "max iterations", "the iteration limit was reached", "raise max_iterations"
-    STALLED = (
-        "stalled", "no step makes the plan better, though it is not within tolerance",
-        "begin with another start, or accept a larger tolerance",
-    )  # fmt: skip
-    TIME_LIMIT = (
-        "time limit", "the time limit was reached; the plan is the best so far",
-        "raise time_limit, or start nearer: start=solution of a similar problem",
-    )  # fmt: skip
-    INTERRUPTED = (
-        "interrupted", "the callback raised an exception, or Ctrl-C was pressed; the plan is the best so far",
-        "solve again, from start=solution",
-    )  # fmt: skip
-    INFEASIBLE = (
-        "infeasible", "the constraints cannot be met, at least near the plan with the least violation",
-        "relax the constraint that is named, allow more time, or try another start",
-    )  # fmt: skip
-    DIVERGED = (
-        "diverged", "the cost of the policy grew, or fell, beyond all bounds",
-        "raise the control weight, or give control_limits and StateBounds",
-    )  # fmt: skip
-    NOT_FINITE = (
-        "not finite", "a NaN or an infinity appeared",
-        "check the dynamics and the cost at the step that is named, or begin with another start",
-    )  # fmt: skip
-    NOT_POSITIVE_DEFINITE = (
-        "not positive definite", "a matrix that must be inverted was not positive definite",
-        "raise the control weight, or begin with another start",
-    )  # fmt: skip
-    RISK_TOO_HIGH = (
-        "risk too high", "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
-        "lower the risk below the largest that is named, or lower the noise",
-    )  # fmt: skip
-    NOT_CERTIFIED = (
-        "not certified", "the method converged, but a check of its plan against the problem failed",
-        "try another start or form, and please report it: this is a bug in lqrsim",
-    )  # fmt: skip
+    STALLED = ("stalled", "no step makes the plan better, though it is not within tolerance",
+               "begin with another start, or accept a larger tolerance")  # fmt: skip
+    TIME_LIMIT = ("time limit", "the time limit was reached; the plan is the best so far",
+                  "raise time_limit, or start nearer: start=solution of a similar problem")  # fmt: skip
+    INTERRUPTED = ("interrupted",
+                   "the callback raised an exception, or Ctrl-C was pressed; the plan is the best so far",
+                   "solve again, from start=solution")  # fmt: skip
+    INFEASIBLE = ("infeasible", "the constraints cannot be met, at least near the plan with the least violation",
+                  "relax the constraint that is named, allow more time, or try another start")  # fmt: skip
+    DIVERGED = ("diverged", "the cost of the policy grew, or fell, beyond all bounds",
+                "raise the control weight, or give control_limits and StateBounds")  # fmt: skip
+    NOT_FINITE = ("not finite", "a NaN or an infinity appeared",
+                  "check the dynamics and the cost at the step that is named, or begin with another start")  # fmt: skip
+    NOT_POSITIVE_DEFINITE = ("not positive definite", "a matrix that must be inverted was not positive definite",
+                             "raise the control weight, or begin with another start")  # fmt: skip
+    RISK_TOO_HIGH = ("risk too high",
+                     "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
+                     "lower the risk below the largest that is named, or lower the noise")  # fmt: skip
+    NOT_CERTIFIED = ("not certified", "the method converged, but a check of its plan against the problem failed",
+                     "try another start or form, and please report it: this is a bug in lqrsim")  # fmt: skip
 
     @property
     def success(self) -> bool:
@@ -220,10 +202,8 @@ class ContactCertificate:
 
     def __str__(self) -> str:
         sides = f", across each the cheapest is {-self.across:+.1e}" if np.isfinite(self.across) else ""
-        return (
-            f"optimal within the modes, against {self.pressed} switches{sides}; of {self.samples} plans within"
-            f" {self.radius:g} of the controls' ranges the cheapest is {-self.sampled:+.1e}"
-        )
+        plans = f"of {self.samples} plans within {self.radius:g} of the controls' ranges the cheapest is"
+        return f"optimal within the modes, against {self.pressed} switches{sides}; {plans} {-self.sampled:+.1e}"
 
 
 @checked

@@ -259,15 +259,12 @@ def comparisons(table: Table) -> list[Comparison]:
     Differences are paired by trial. Differences of success have Tango's score interval, differences of errors
     Student's. If nothing was drawn, all trials of a policy are the same run, and there is nothing to test.
     """
-    policies = list(dict.fromkeys(cell.policy for cell in _checked_table(table)))
-    seconds = ((cell, Cell(other, cell.sweep, cell.strength)) for other in policies[1:] for cell in table)
-    pairs = [
-        (first, second)
-        for first, second in seconds
-        if first.policy == policies[0]
-        and second in table
-        and not (alike(first, table[first]) and alike(second, table[second]))
-    ]
+    policies, pairs = list(dict.fromkeys(cell.policy for cell in _checked_table(table))), list[tuple[Cell, Cell]]()
+    for other in policies[1:]:
+        for first in (cell for cell in table if cell.policy == policies[0]):
+            second = replace(first, policy=other)
+            if second in table and not (alike(first, table[first]) and alike(second, table[second])):
+                pairs.append((first, second))
     return compare_cells(pairs, table, table)
 
 
@@ -360,12 +357,8 @@ def worst(table: Table, count: Count = 10) -> list[Trial]:
             -np.nan_to_num(outcomes.worst, nan=np.inf, posinf=np.inf, neginf=-np.inf),
         )
         for row in np.lexsort((outcomes.trial, *reversed(keys)))[:count]:
-            trial = Trial(
-                cell,
-                int(outcomes.trial[row]),
-                str(outcomes.outcome[row]),
-                str(outcomes.obstacle[row]),
-                *(float(values[row]) for values in (outcomes.ended, outcomes.clearance, outcomes.worst)),
-            )
+            texts = str(outcomes.outcome[row]), str(outcomes.obstacle[row])
+            numbers = (float(values[row]) for values in (outcomes.ended, outcomes.clearance, outcomes.worst))
+            trial = Trial(cell, int(outcomes.trial[row]), *texts, *numbers)
             ranked.append((tuple(float(key[row]) for key in keys), trial))
     return [trial for _, trial in sorted(ranked, key=lambda pair: pair[0])[:count]]

@@ -101,10 +101,8 @@ class SplittingResult:
         estimate, plain = self.probability, self.plain_trials
         interval = f"{100 * estimate.confidence:g} % interval, {len(self.repetitions)} repetitions"
         needed = f"about {rounded(plain)}" if np.isfinite(plain) else "unknown, because all repetitions agree"
-        return (
-            f"probability of failure: {estimate:.2g} ({interval})\n"
-            f"simulated: {self.simulations:,} trials; plain trials for the same standard error: {needed}"
-        )
+        simulated = f"{self.simulations:,} trials; plain trials for the same standard error: {needed}"
+        return f"probability of failure: {estimate:.2g} ({interval})\nsimulated: {simulated}"
 
     __str__ = summary
 
