@@ -59,11 +59,7 @@ def of_solution(solution: "ls.Solution") -> Object:
 
 
 def of_rollout(rollout: "ls.Rollout", problem: "ls.Problem | None" = None) -> Object:
-    """The outcomes of a rollout's trials, as in the tables of a stress test.
-
-    Args:
-      problem: the problem, for the costs; without it, or with another horizon, there are no costs.
-    """
+    """The outcomes of a rollout's trials, as in a stress test; without a problem of its horizon there are no costs."""
     from lqrsim.stress.analysis import outcomes
 
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):

@@ -38,14 +38,7 @@ _OPTIONS = {
 
 
 def run(command: Any, name: str) -> int:
-    """Run a command. With `--json` it prints one JSON object, even for bad input, and everything else to stderr.
-
-    Returns:
-      The exit code.
-
-    Raises:
-      process.Unprintable: stdout cannot be written.
-    """
+    """Run a command; returns its exit code. With `--json` it prints one JSON object, and all else to stderr."""
     if not getattr(command, "json", False):
         return command.run()
     result: dict[str, Any] = {"format": f"lqrsim {name}", "version": 1}
@@ -92,11 +85,7 @@ def wrote(path: Path, *, remark: str = "") -> None:
 
 
 def say(text: str = "") -> None:
-    """Print immediately, even to a file or a pipe, and above any progress bar.
-
-    Raises:
-      process.Unprintable: stdout cannot be written.
-    """
+    """Print immediately, even to a file or a pipe, and above any progress bar. Raises process.Unprintable."""
     bars = sys.modules.get("tqdm")
     with process.printing():
         if bars is None:

@@ -336,9 +336,7 @@ class Bridge:
 
 
 def _violations(problem: "ls.Problem", rollout: "ls.Rollout") -> list[dict[str, Any]] | None:
-    """For each constraint, how many trials violate it, and the worst; None for a problem of another horizon, or of a
-    belief, whose constraints are not of states.
-    """
+    """How many trials violate each constraint, and the worst; None for another horizon, or constraints of a belief."""
     from lqrsim.problem.belief import Belief
 
     other = (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt)

@@ -29,8 +29,7 @@ from lqrsim.errors import InputError, check_path, excerpt, printable
 def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
     """SHA-256 of the concatenated parts, in hexadecimal: text as UTF-8, arrays as their numbers in C order.
 
-    There is no separator, and an array's shape and type do not count. If they may differ, put them before the array as
-    text.
+    There is no separator. If shape or type of an array may differ, put them before it as text: they do not count.
     """
     hasher = hashlib.sha256()
     for part in parts:

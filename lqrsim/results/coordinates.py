@@ -47,9 +47,8 @@ class Coordinates:
       units: units of the entries; "" for none. A position is in m, angles and rotation vectors in rad.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
-        without a position, and two of x, y and z for a planar position. By default it follows from names that end in
-        these letters or have such a letter standing alone, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" if no
-        name tells it.
+        without a position, and two of x, y and z for a planar position. By default it follows from names with such a
+        letter at the end or standing alone, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" if no name tells it.
       offset: coordinate of the plane along the third axis, in metres: the y of "xz". A vertical plane has an offset, 0
         by default. A horizontal plane has none by default: the world is then seen from above. See `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.

@@ -129,10 +129,7 @@ class Funnel:
         return np.where(np.isfinite(level), level, np.inf)
 
     def contains(self, x: npt.ArrayLike, t: float, *, about: npt.ArrayLike | None = None) -> npt.NDArray[np.bool_]:
-        """Whether states (..., n) are in the funnel `t` seconds after the start of the plan, (...).
-
-        If the level is 0, no state is in the funnel.
-        """
+        """Whether states (..., n) are in the funnel `t` seconds after the plan's start, (...); at level 0 none is."""
         level = self.level(t)
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
 

@@ -163,8 +163,7 @@ class Target:
         """The distance within which the target counts as reached.
 
         Args:
-          robot_radius: radius of the robot in metres; the default goal radius if distances are in metres, see
-            `on_the_way`.
+          robot_radius: radius of the robot, the default goal radius if distances are in metres; see `on_the_way`.
           goal_tolerance: bound of the scaled error, by default TOLERANCE; see `on_the_way`.
         """
         if self.places:

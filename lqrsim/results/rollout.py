@@ -110,17 +110,14 @@ class Rollout:
       forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
       torques: (K, T, 3) disturbing torque in N m, world axes.
       displaced: (K, obstacles, 3) displacement of each obstacle from its place in the plan, in metres.
-      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius, in metres; infinite without
-        obstacles.
+      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in m; infinite without obstacles.
       contacts: (K,) number of control periods, from the collision on, in which MuJoCo reported a contact of the robot
         with an obstacle; 0 if the robot passes through obstacles.
       collided_at: (K,) seconds to the first collision, at a knot or between two; infinite without a collision.
       obstacles: (K) name of the obstacle of that collision; empty without a collision.
       diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement or a force was not
-        finite, or the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot
-        on.
-      failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
-        after that knot.
+        finite, or the controller's filter had diverged, from which on states are NaN; infinite if nothing diverged.
+      failed_at: (K,) seconds to the knot at which the controller failed, after which states are NaN; else infinite.
       reasons: (K) why the controller failed, its filter diverged or a force was not finite; empty otherwise.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each disturbance, and whether the goal moved.
@@ -320,8 +317,7 @@ class Rollout:
 
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
-        """Mask of the knots that count, (K, T+1): all before the trial ended, the last if no event ended it, and always
-        the first.
+        """Mask of the knots that count, (K, T+1): the first, all before the trial ended, the last if no event ended it.
 
         The mask does not depend on whether obstacles stop the robot.
         """
@@ -355,9 +351,7 @@ class Rollout:
         return f"{self.reached.sum()} of {self.trials} trials reached the {self.target.name}"
 
     def summary(self) -> str:
-        """Disturbances, the end of the plan, and the number of each outcome; then for each of the first trials outcome,
-        tracking error, clearance and saturation.
-        """
+        """Disturbances, the end of the plan, the number of each outcome, and a line for each of the first trials."""
         disturbances = "; ".join(self.disturbances) or "undisturbed"
         lines = [f"{self.robot} in {self.scene}, {disturbances}, seed {self.seed}"]
         if GOAL_MOVED in self.disturbances:
@@ -421,10 +415,7 @@ class Rollout:
         return f"{name}: {how}; {errors}{least}; {contact}; {saturated:.0f} % saturated"
 
     def _worst(self, k: int) -> str:
-        """The state with the largest error from the plan in a trial, for a robot without a position; else empty.
-
-        Also empty for a trial without error.
-        """
+        """The state with the largest error from the plan in a trial, for a robot without a position; else empty."""
         if self.state_coordinates.position:
             return ""
         knot = int(np.argmax(np.where(self.counts[k], self.tracking_error[k], -1.0)))

@@ -30,8 +30,7 @@ class Solution(Plan):
       cost_to_come: the value function of the last forward pass, a `Quadratic` in the primal form and `Moments` in the
         dual form; None if a pass failed, and from `ilqr`.
       iterations: a record of each iteration; `log` is their table.
-      clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
-        if the problem has no obstacles.
+      clearance: (T+1,) signed distance to the nearest obstacle minus the robot's radius in m; None without obstacles.
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
       gap: gap of the plan; see `Iteration.gap`. NaN if it is not defined.
       options: the settings of the solver; with noise, also a description of the noise, and the risk.
@@ -88,9 +87,7 @@ class Solution(Plan):
 
     @property
     def cost(self) -> float:
-        """Cost of the plan, start and end included; with noise the expected cost of a run, with a risk
-        (1/risk) log E exp(risk cost), both to second order about the plan.
-        """
+        """Cost of the plan; with noise its expectation, with a risk (1/risk) log E exp(risk cost), both to second order."""
         return self.certificate.cost
 
     @property
@@ -112,8 +109,7 @@ class Solution(Plan):
         """What the plan does between its knots. It is worked out when it is first needed, and not stored in files.
 
         Raises:
-          InputError: the solution is not as `smooth` or `smooth_many` returned it, but from a file or changed, or its
-            plan is not finite.
+          InputError: the solution is from a file or was changed since `smooth` returned it, or is not finite.
         """
         examine = vars(self).get("_examine_between_knots")
         if examine is None or not self.trajectory.finite:

@@ -62,11 +62,7 @@ class Trajectory:
 
 
 class Status(enum.StrEnum):
-    """The way in which a solve ended.
-
-    Attributes:
-      remedy: what to try; empty for CONVERGED.
-    """
+    """The way in which a solve ended, with a `remedy` to try; none for CONVERGED."""
 
     meaning: str
     remedy: str
@@ -144,7 +140,6 @@ class Iteration:
         method it equals the gap.
       violation: violation of the worst constraint at the steps, in its unit. 0 if all inequalities hold and there are
         no equalities, which have at least rounding errors. NaN if it was not evaluated.
-      seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; "contact modes", see `Certificate.contacts`; with
         constraints or limits "interior point", and "restoration", a descent on cost and penalised violation; in the
         safeguard "damped", or "ilqr" if its step is an iLQR step; in Newton's method and the safeguard "rejected"
@@ -211,8 +206,7 @@ class ContactCertificate:
 class Certificate:
     """Measures of a plan, recomputed from the problem after the solve by code that the solvers do not use.
 
-    For a CONVERGED solution optimality is within twice its tolerance, violation within its own, and the other residuals
-    within rounding.
+    If CONVERGED, optimality is within twice its tolerance, violation within its own, other residuals within rounding.
 
     Attributes:
       cost: cost of the plan; see `Solution.cost`.
@@ -223,8 +217,7 @@ class Certificate:
         `L x + l`.
       limits: largest distance of a control beyond its limits, in its unit.
       violation: violation of the worst constraint at the steps, in its unit; 0 if all inequalities hold and there are
-        no equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6,
-        unless constraints are elastic.
+        no equalities. At most `constraint_tolerance` if converged, 1e-6 for equalities, unless they are elastic.
       optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
         relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient. With `contacts` it
         is the decrease within the plan's contact modes, where switches bound the steps as limits bound controls.
@@ -288,12 +281,10 @@ class BetweenKnots:
 
     Attributes:
       step_error: largest difference between a knot and the exact motion from the knot before, each state relative to
-        its largest size along the plan, at least 1 unit. 0 for steps that MuJoCo does, whose physics steps are the
-        motion.
+        its largest size along the plan, at least 1 unit. 0 for steps of MuJoCo, whose physics steps are the motion.
       end_error: the same for the last knot and the exact motion from the first knot under the plan's controls.
       violations: name of an inequality, as in `Problem.violations` -> its largest violation between the knots, in its
-        unit, and its time in s from the first knot, as all times of a plan; for all that are violated by more than
-        rounding. Obstacles that move are left out.
+        unit, and when, in s; for all that are violated by more than rounding. Obstacles that move are left out.
     """
 
     step_error: float

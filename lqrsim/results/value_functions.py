@@ -73,8 +73,7 @@ class Quadratic:
 @checked
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Quadratic functions of the state by moments, one for each knot: `1/2 (x - mean)' covariance^-1 (x - mean) +
-    const`.
+    """Quadratic functions of the state by moments, for each knot: `1/2 (x - mean)' covariance^-1 (x - mean) + const`.
 
     It is the dual form's cost-to-come. In a direction in which no state can be reached, the covariance is zero and the
     cost infinite. The terms come from Kalman smoothing, to which LQR smoothing is dual.
@@ -146,8 +145,7 @@ class TotalCost:
     def covariance(self) -> Array:
         """The inverses (T+1, n, n) of the Hessians, zero in a direction in which no state can be reached.
 
-        As the covariance of a normal distribution: at k standard deviations the total cost is `k^2/2` above its least
-        value.
+        As covariances of a normal distribution: at k standard deviations the total cost is `k^2/2` above its least.
         """
         come, curvature = self.cost_to_come, self.cost_to_go.hessian
         with _invertible("hessian"):

@@ -46,8 +46,7 @@ class DataTable:
 
     Attributes:
       columns: heading -> entries, all of one length: text, finite numbers, or None for nothing.
-      formats: heading -> format of the numbers in LaTeX and Markdown, such as ".3f"; by default "g". A CSV has all
-        digits.
+      formats: heading -> format of numbers in LaTeX and Markdown, such as ".3f"; by default "g". A CSV has all digits.
       notes: lines that say what the numbers are: comments in LaTeX, lines below the table in Markdown, not in a CSV.
     """
 

@@ -54,8 +54,7 @@ class ReliabilityProblem(Study):
     """A study, and a definition of its failure.
 
     Attributes:
-      failure: "collision": the robot collides, its trial diverges, or its controller fails; "miss": it does not reach
-        its goal.
+      failure: "collision": the robot collides, its trial diverges, or its controller fails; "miss": it misses its goal.
     """
 
     failure: Annotated[str, OneOf(FAILURES)] = "collision"

@@ -88,10 +88,7 @@ def smallest_test(
 
 
 def lowest_rate(successes: int, trials: int, confidence: float) -> float:
-    """The exact one-sided lower bound of a success rate: the bound of a two-sided interval with less confidence.
-
-    From a confidence of 0.5 on; for less there is no such interval.
-    """
+    """The exact one-sided lower bound of a success rate, from a confidence of 0.5 on: that of a two-sided interval."""
     return rate_of(successes, trials, confidence=max(2 * confidence - 1, 1e-12)).low
 
 
@@ -139,10 +136,7 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
 
 
 def run_test(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
-    """Run the test's own trials, which the pilot has not used. Returns the number of failures and the number of trials.
-
-    It stops as soon as too many trials have failed.
-    """
+    """Run the test's own trials, which the pilot has not used, until too many have failed. Returns failures, trials."""
     failed, done = 0, 0
     while done < test.trials and failed <= test.failures:
         count = min(BATCH, test.trials - done)
@@ -175,8 +169,7 @@ class _Pilot:
     def level(self, guess: float, largest: float) -> float:
         """The largest level that seems to pass; 0 if there is none.
 
-        A few trials find the rough level, then all trials run there. At lower levels only the trials that failed run
-        again.
+        A few trials find the rough level, then all run there. At lower levels only the trials that failed run again.
         """
         all_trials, allowed = self.test.trials, self.test.pilot_failures
         few = min(COARSE_TRIALS, all_trials)
@@ -368,8 +361,7 @@ def check_funnel(
     goal_tolerance: float | None = None,
     threads: int | None = None,
 ) -> tuple[FunnelCheck, ...]:
-    """The results of new trials from states drawn uniformly inside a funnel, or in a shell outside, for each knot with
-    a level. The other arguments are as for `funnel`.
+    """The results of new trials from states drawn uniformly in a funnel, for each knot with a level; else as `funnel`.
 
     Args:
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.

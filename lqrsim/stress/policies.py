@@ -87,8 +87,7 @@ def solve_policies(
 ) -> dict[str, Solution]:
     """The solution that each policy runs, by the policy's name.
 
-    In the solution for "track", the policy is the tracking law. The solution for "offset_free" keeps the policy of
-    "smooth".
+    The policy in the solution for "track" is the tracking law, in that for "offset_free" the policy of "smooth".
 
     Args:
       given: a solution from `solutions.check_solution`, in place of the result of its solver.

@@ -247,10 +247,7 @@ class Results:
         return designs
 
     def came_to_nothing(self, tallies: Mapping[Cell, Counter[str]] | None = None) -> list[str]:
-        """A line for each of the most frequent reasons of trials that ended with an error or diverged.
-
-        The tallies of all cells are counted unless they are given.
-        """
+        """A line for each of the most frequent reasons of trials that ended with an error or diverged."""
         reasons: Counter[str] = Counter()
         for cell, ends in (tallies or self._tallies()).items():
             if ends["error"] or ends["diverged"]:  # no other table is read again
@@ -260,7 +257,7 @@ class Results:
     def hints(self, tallies: Mapping[Cell, Counter[str]] | None = None) -> list[str]:
         """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance.
 
-        Trials that ended with an error do not count. The tallies of all cells are counted unless they are given.
+        Trials that ended with an error do not count.
         """
         tallies, reached = tallies or self._tallies(), dict[str, int]()
         for cell, ends in tallies.items():
@@ -376,7 +373,6 @@ def replay(
     It needs the kind of processor and the versions in `results.manifest["versions"]`.
 
     Args:
-      frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
     """
     results = results if isinstance(results, Results) else Results(results)

@@ -397,8 +397,7 @@ class SafestPlan:
 
     Attributes:
       compared: all plans that were compared, the best first.
-      reached: its success rate in fresh trials, with the exact interval. The trials by which it was selected would be
-        biased.
+      reached: its success rate in fresh trials: in those by which it was selected the rate is biased.
     """
 
     solution: Solution
@@ -431,9 +430,8 @@ def smooth_safest(
 ) -> SafestPlan:
     """Choose among the candidates of `smooth` by success rate instead of cost.
 
-    Each candidate is solved to convergence; duplicates are dropped. All plans run in the same trials. The result is the
-    plan with the most successes; the cheapest plan if there are several. What is not named here is as for `smooth` and
-    `simulate`.
+    Each candidate is solved to convergence; duplicates are dropped. All plans run in the same trials. Of plans with as
+    many successes, the cheapest is chosen. What is not named here is as for `smooth` and `simulate`.
 
     Args:
       trials: number of trials of each plan, and of fresh trials of the chosen plan.

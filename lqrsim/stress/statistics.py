@@ -79,8 +79,7 @@ def paired_difference(
     """The difference of the success rates of two policies on the same trials, with Tango's score interval.
 
     The interval contains each difference that the score test does not reject, with the fractions that are most likely
-    under that difference (Tango, Statistics in Medicine 17, 1998). It has a width even if the policies agree in all
-    trials.
+    under that difference (Tango, Statistics in Medicine 17, 1998). It has a width even if the policies always agree.
 
     Args:
       only_first, only_second: number of trials in which only this policy succeeded. trials: number of all trials.

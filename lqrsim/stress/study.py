@@ -143,8 +143,7 @@ class Study(Setup):
     """A policy of a scenario under disturbances. The scenario is solved when first needed.
 
     Attributes:
-      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
-        demo.
+      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default that of the scenario's demo.
     """
 
     design_disturbances: SetName | None = None
@@ -291,10 +290,7 @@ class Campaign(Setup):
     def from_json(
         cls, fields: Mapping[str, Any], scenario: Scenario, solution: str | os.PathLike[str] | None = None
     ) -> "Campaign":
-        """The campaign that `as_json` describes.
-
-        Its scenario is resolved before, because this may define disturbances.
-        """
+        """The campaign that `as_json` describes. Its scenario, which may define disturbances, is resolved before."""
         try:
             design = fields["design_disturbances"]
             sweeps = {name: disturbances_from_json(sweep, scenario) for name, sweep in fields["sweeps"].items()}

@@ -135,8 +135,7 @@ STEADY = 20.0  # a clearance of more of its standard deviations does not show wh
 class TrialScore:
     """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
 
-    A trial fails if its score is positive. Standard normal numbers give trials with the same distribution as in
-    `simulate`.
+    A trial fails if its score is positive. Standard normal numbers give trials with the distribution of `simulate`.
 
     If the robot starts close beside an obstacle and leaves it, its least clearance is the same in nearly all trials and
     does not tell which of them are near a failure. `collision_score` and `miss_score` then leave out the knots until it
@@ -202,10 +201,7 @@ class TrialScore:
         return np.concatenate(scores)
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
-        """The trials with the given random numbers (K, size), with frames for drawing or without.
-
-        Their `seed` means nothing.
-        """
+        """The trials with the given random numbers (K, size); their `seed` means nothing."""
         vectors = check_array("numbers", numbers, (None, self.size))
         parts = np.split(vectors, np.cumsum(self.sizes)[:-1], axis=1)  # of each disturbance
         return self._simulate(len(vectors), lambda trial, stream: PrescribedDraws(parts[stream][trial]), frames=frames)
