@@ -22,7 +22,7 @@ from scipy.stats import binom, norm
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import console
-from lqrsim.stress import failure_search
+from lqrsim.stress import reliability
 from lqrsim.stress.reliability import NoFailure, failure_probability
 from lqrsim.stress.safer_plans import AIMED_FRACTION, HardenedPlan, HardeningRound, _Search
 from lqrsim.stress.statistics import rate
@@ -257,7 +257,7 @@ def test_a_plan_that_never_fails_is_proved_by_trials(
     own: str, hardened: HardenedPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A force of a fiftieth, and a splitting that gives up early."""
-    monkeypatch.setattr(failure_search, "failure_probability", partial(failure_probability, most_levels=2))
+    monkeypatch.setattr(reliability, "failure_probability", partial(failure_probability, most_levels=2))
     problem = stated(own, strength=0.02, solution=hardened.solution)
     found = ls.stress.harden(problem, chance=0.05, particles=20, repetitions=2, rounds=1)
     assert found.success

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 
 OVERLAY_HELP = "Drawn over the scene. " + " ".join(f"{name}: {kind.words}." for name, kind in OVERLAY_KINDS.items())
+OF_LIVE_RUNS = "controller", "design_disturbances", "solution", "replan", "disturbances", "seed", "push"
+OF_RECORDED_RUNS = "trial", "loop"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,10 +127,6 @@ class Render:
 def _one_or_all(items: Sequence[Any]) -> Any:
     """A single item itself; None for no items."""
     return items[0] if len(items) == 1 else items or None
-
-
-OF_LIVE_RUNS = "controller", "design_disturbances", "solution", "replan", "disturbances", "seed", "push"
-OF_RECORDED_RUNS = "trial", "loop"
 
 
 @dataclass(frozen=True, kw_only=True)

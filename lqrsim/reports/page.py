@@ -36,8 +36,12 @@ SIZE = 5.2, 3.7
 COLOURS = (*RUNS, "#e69f00", "#882255", "#56b4e9", "#44aa99")
 LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)), (0, (3, 3)), (0, (8, 2, 1, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-
-
+LARGEST = 1_500_000  # bytes, largest video
+SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
+FPS = 15
+MOST_VIDEOS = 100  # a page with more videos is too large for a browser
+BROKEN_BELOW = 0.95  # success rate below which a policy counts as broken
+WORST_EACH = 3  # number of trials that are listed for each policy and sweep
 Curves = Mapping[str, Mapping[float, Array]]  # policy -> strength -> low, middle and high
 
 
@@ -76,11 +80,6 @@ def plot_errors(curves: Curves, path: Path, label: str) -> Path:
     # Undisturbed errors are tiny, and would take up most of a logarithmic axis.
     curves = {name: {at: band for at, band in curve.items() if at > 0} for name, curve in curves.items()}
     return plot_curves(curves, path, label, yscale="log")
-
-
-LARGEST = 1_500_000  # bytes, largest video
-SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
-FPS = 15
 
 
 def _videos_note(requested: int, shown: int) -> tuple[str, str]:
@@ -122,9 +121,6 @@ def _video(results: Results, trial: analysis.Trial, problem: str, folder: Path) 
 def base64_text(path: Path) -> str:
     """A file in base64, for a page."""
     return base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-MOST_VIDEOS = 100  # a page with more videos is too large for a browser
 
 
 @checked
@@ -287,10 +283,6 @@ def _picture(path: Path, *, caption: str, alt: str) -> dict[str, Any]:
     with Image.open(path) as image:
         width, height = image.size
     return {"data": base64_text(path), "width": width, "height": height, "caption": caption, "alt": alt}
-
-
-BROKEN_BELOW = 0.95  # success rate below which a policy counts as broken
-WORST_EACH = 3  # number of trials that are listed for each policy and sweep
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,21 @@ import numpy.typing as npt
 from lqrsim.annotations import check_string
 from lqrsim.errors import InputError, check_path, excerpt, printable
 
+Arrays = dict[str, npt.NDArray[Any]]
+META, DIGEST = "meta", "sha256"
+UNFINISHED = ".unfinished-"  # beginning of the name of a file that is being written
+ABANDONED = 24 * 3600.0  # s since the last change of an unfinished file; no file takes so long to write
+
+# Largest amounts that are read, in bytes, or relative to the size of the file.
+_LARGEST_TEXT = 1 << 26
+_LARGE, _TIMES = 1 << 30, 100
+_DEPTH = 6  # largest depth of lists and objects in `anything`
+# NumPy's header of an array of numbers, or of a text; other headers are not parsed.
+_HEADER = re.compile(
+    rb"\{'descr': '(<f8|<i8|\|b1|<U[0-9]{1,9})', 'fortran_order': False,"
+    rb" 'shape': \(([0-9]{1,18}(?:, [0-9]{1,18})*,?)?\), \} *\n"
+)
+
 
 def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
     """SHA-256 of the concatenated parts, in hexadecimal: text as UTF-8, arrays as their numbers in C order.
@@ -40,22 +55,6 @@ def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
         else:  # a view of its bytes, because a copy may be large
             hasher.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
     return hasher.hexdigest()
-
-
-Arrays = dict[str, npt.NDArray[Any]]
-META, DIGEST = "meta", "sha256"
-UNFINISHED = ".unfinished-"  # beginning of the name of a file that is being written
-ABANDONED = 24 * 3600.0  # s since the last change of an unfinished file; no file takes so long to write
-
-# Largest amounts that are read, in bytes, or relative to the size of the file.
-_LARGEST_TEXT = 1 << 26
-_LARGE, _TIMES = 1 << 30, 100
-_DEPTH = 6  # largest depth of lists and objects in `anything`
-# NumPy's header of an array of numbers, or of a text; other headers are not parsed.
-_HEADER = re.compile(
-    rb"\{'descr': '(<f8|<i8|\|b1|<U[0-9]{1,9})', 'fortran_order': False,"
-    rb" 'shape': \(([0-9]{1,18}(?:, [0-9]{1,18})*,?)?\), \} *\n"
-)
 
 
 def parse(text: str | bytes) -> Any:

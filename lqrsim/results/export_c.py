@@ -41,6 +41,27 @@ TOLERANCES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
 NUMBERS, GAINS = ("float", "double"), ("full", "int16")
 EXPORTED = "a Solution, an AffinePolicy, such as of track, or an OutputFeedbackPolicy, such as OffsetFree(...).policy"
 DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
+# The template of the source, and what the header says of it.
+FEEDBACK = {"source": "feedback.c", "what": "A feedback law", "lost": "", "or": ", or measured is NULL"}
+FILTER = {
+    "source": "filter.c", "what": "A filter and the law of its estimates",
+    "or": ", or my_policy_init()\n * has not been called",
+    "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period.",
+}  # fmt: skip
+# The behaviour of feedback.c between two knots.
+HELD = {"blend": "", "near": "NOMINAL(k, j)", "wanted": "law(k, i, state)"}
+BLENDED = {
+    "blend": """    const int next = k + 1 < MY_POLICY_STEPS ? k + 1 : k;
+    const double after = knot - 1e-9 - k;
+    const real weight = next > k && after > 0 ? (real)after : 0;
+""",
+    "near": "(1 - weight) * NOMINAL(k, j) + weight * NOMINAL(next, j)",
+    "wanted": "(1 - weight) * law(k, i, state) + weight * law(next, i, state)",
+}
+# What `ExportedC.rounding` bounds, in words.
+ROUNDING_MEANING = """\
+Rounding the gains changes each command by at most this, where everything that they multiply is off its nominal
+value by 1 in its unit"""
 
 
 @checked
@@ -134,25 +155,6 @@ def export_c(
         files=tuple(files), sha256=sha, table_bytes=tables.bytes, rounding=tuple(tables.rounding["gain"].tolist()),
         controls=law.control_coordinates.labels,
     )  # fmt: skip
-
-
-# The template of the source, and what the header says of it.
-FEEDBACK = {"source": "feedback.c", "what": "A feedback law", "lost": "", "or": ", or measured is NULL"}
-FILTER = {
-    "source": "filter.c", "what": "A filter and the law of its estimates",
-    "or": ", or my_policy_init()\n * has not been called",
-    "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period.",
-}  # fmt: skip
-# The behaviour of feedback.c between two knots.
-HELD = {"blend": "", "near": "NOMINAL(k, j)", "wanted": "law(k, i, state)"}
-BLENDED = {
-    "blend": """    const int next = k + 1 < MY_POLICY_STEPS ? k + 1 : k;
-    const double after = knot - 1e-9 - k;
-    const real weight = next > k && after > 0 ? (real)after : 0;
-""",
-    "near": "(1 - weight) * NOMINAL(k, j) + weight * NOMINAL(next, j)",
-    "wanted": "(1 - weight) * law(k, i, state) + weight * law(next, i, state)",
-}
 
 
 class _Tables:
@@ -318,12 +320,6 @@ def _rounding_text(law: AffinePolicy | OutputFeedbackPolicy, tables: _Tables, nu
         lines += [f"largest magnitude over the steps; other numbers as {number}."]
     lines += [*f"{ROUNDING_MEANING}:".split("\n"), *_bounds(law.control_coordinates.labels, tables.rounding["gain"])]
     return "\n * ".join(map(_comment, lines))
-
-
-# What `ExportedC.rounding` bounds, in words.
-ROUNDING_MEANING = """\
-Rounding the gains changes each command by at most this, where everything that they multiply is off its nominal
-value by 1 in its unit"""
 
 
 def _bounds(labels: Iterable[str], rounding: Iterable[float]) -> list[str]:

@@ -87,7 +87,7 @@ class Solution(Plan):
 
     @property
     def cost(self) -> float:
-        """Cost of the plan; with noise its expectation, with a risk (1/risk) log E exp(risk cost), both to second order."""
+        """Cost of the plan; with noise expected, with a risk (1/risk) log E exp(risk cost): both to second order."""
         return self.certificate.cost
 
     @property

@@ -26,6 +26,15 @@ from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.study import Cell
 
 Column = Annotated[Array, "K"]
+MEASURES = {  # measure -> unit; tracking errors and the distance from the goal are in metres for robots with a position
+    "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
+    "saturated": "", "cost": "",
+}  # fmt: skip
+LEVELS = np.array([0.05, 0.5, 0.95])
+RANKING = (
+    "The worst trials are those with errors, then those that collided or diverged, the earliest first, then those with"
+    " the least clearance, then those with the largest tracking error."
+)
 
 
 @checked
@@ -146,12 +155,6 @@ def outcomes(
 
 
 Table = Mapping[Cell, Outcomes]
-
-MEASURES = {  # measure -> unit; tracking errors and the distance from the goal are in metres for robots with a position
-    "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
-    "saturated": "", "cost": "",
-}  # fmt: skip
-LEVELS = np.array([0.05, 0.5, 0.95])
 
 
 @checked
@@ -323,12 +326,6 @@ def quantiles(
     values = values[~np.isnan(values)]
     # Not interpolated: interpolation between two infinite values gives NaN.
     return np.quantile(values, levels, method="inverted_cdf") if len(values) else np.full(len(levels), np.nan)
-
-
-RANKING = (
-    "The worst trials are those with errors, then those that collided or diverged, the earliest first, then those with"
-    " the least clearance, then those with the largest tracking error."
-)
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,18 @@ from lqrsim.stress.analysis import COLUMNS
 from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Shard
 
 _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
+Columns = dict[str, npt.NDArray[np.generic]]  # of the table of a shard, by name
+_KEY = b"lqrsim shard"
+_TEXTS = "outcome", "obstacle", "reason"
+_TYPES = dict.fromkeys((*COLUMNS, "reason"), pa.float64()) | {"trial": pa.int64()} | dict.fromkeys(_TEXTS, pa.string())
+_SNAPPY_RATIO = 22  # bytes that come of one at most; of other compressions it may be tens of thousands
+_TEXT_BYTES = 1 << 26  # bytes of text that are unpacked before they are looked at
+_MAGIC = b"PAR1"  # of parquet; its footer has values of these kinds
+_DEEPEST = 21  # values within each other; a footer has fewer
+_BOOLEANS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _MAP, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, (9, 10), 11, 12
+FORMAT, VERSION, NAME = "lqrsim campaign", 8, "manifest.json"
+SOLUTION_FILE = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
+_LARGEST, _LARGEST_TABLE = 1 << 26, 1 << 29  # bytes, largest manifest and table
 
 
 @contextlib.contextmanager
@@ -73,14 +85,6 @@ else:
 
     def _lock(handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-Columns = dict[str, npt.NDArray[np.generic]]  # of the table of a shard, by name
-_KEY = b"lqrsim shard"
-_TEXTS = "outcome", "obstacle", "reason"
-_TYPES = dict.fromkeys((*COLUMNS, "reason"), pa.float64()) | {"trial": pa.int64()} | dict.fromkeys(_TEXTS, pa.string())
-_SNAPPY_RATIO = 22  # bytes that come of one at most; of other compressions it may be tens of thousands
-_TEXT_BYTES = 1 << 26  # bytes of text that are unpacked before they are looked at
 
 
 class Damaged(Exception):
@@ -173,11 +177,6 @@ def _digest(table: Columns, about: Mapping[str, Any]) -> str:
     return sha256(*parts)
 
 
-_MAGIC = b"PAR1"
-_DEEPEST = 21  # values within each other; a footer has fewer
-_BOOLEANS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _MAP, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, (9, 10), 11, 12
-
-
 class _Chunk(NamedTuple):
     """A column of a row group: its codec (0 none, 1 Snappy), number of values, and bytes in the file."""
 
@@ -243,11 +242,6 @@ def _unsigned(data: io.BytesIO) -> int:
         if shift > 63:
             raise ValueError("a number of more than 64 bits")
     return number | byte << shift
-
-
-FORMAT, VERSION, NAME = "lqrsim campaign", 8, "manifest.json"
-SOLUTION_FILE = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
-_LARGEST, _LARGEST_TABLE = 1 << 26, 1 << 29  # bytes, largest manifest and table
 
 
 @checked

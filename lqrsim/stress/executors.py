@@ -36,6 +36,9 @@ from lqrsim.stress.study import Campaign, Shard
 from lqrsim.versions import versions
 
 FinishedShards = Generator[tuple[Shard, bytes]]
+_POLL = 0.5  # s between two checks of the time limit
+RESUME = "run the same command again to resume"
+_lock = threading.Lock()  # a process has one set of workspaces
 
 ATTEMPTS = 3  # number of attempts to run a shard, or to start a process
 _START_TIMEOUT = 300.0  # s
@@ -244,11 +247,6 @@ def _without_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_POLL = 0.5  # s between two checks of the time limit
-RESUME = "run the same command again to resume"
-_lock = threading.Lock()
-
-
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
     """Connect a dask client. Raises InputError if there is no cluster, or its workers have other versions."""
@@ -333,7 +331,7 @@ def _silenced() -> Iterator[None]:
 
 
 def _task(job: Job, shard: Shard) -> bytes:
-    """Run a shard in a worker; one at a time, because a process has one set of workspaces."""
+    """Run a shard in a worker, one at a time."""
     from distributed import get_worker
 
     with _lock:

@@ -28,16 +28,8 @@ from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import names_code
+from lqrsim.stress import reliability
 from lqrsim.stress.campaign_files import digest_of_solution
-from lqrsim.stress.reliability import (
-    MOST_REPEATS,
-    DesignPoint,
-    Keep,
-    SplittingResult,
-    check_keep,
-    failure_probability,
-    smallest_failure,
-)
 from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.study import Study, disturbances_as_json
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
@@ -95,8 +87,8 @@ class ReliabilityProblem(Study):
         self,
         *,
         particles: Annotated[int, Bounds(at_least=20)] = 250,
-        repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST_REPEATS)] = 10,
-        keep: Keep = 0.1,
+        repetitions: Annotated[int, Bounds(at_least=2, at_most=reliability.MOST_REPEATS)] = 10,
+        keep: reliability.Keep = 0.1,
         seed: Seed | None = None,
         report: Report | None = None,
         progress: TextProgress | None = None,
@@ -114,19 +106,19 @@ class ReliabilityProblem(Study):
         Raises:
           KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
-        check_keep(keep, particles)
+        reliability.check_keep(keep, particles)
         seed = self.seed if seed is None else seed
         options: dict[str, Any] = {"seed": seed, "particles": particles, "repetitions": repetitions, "keep": keep}
-        score, level = self._begin(report)
+        score, level = self.score, self._begin(report)
         with keeping(lambda done: None if done is None else RareFailures(self, done, options)):
-            splitting = failure_probability(score, score.size, level=level, progress=progress, **options)
+            splitting = reliability.failure_probability(score, score.size, level=level, progress=progress, **options)
         return RareFailures(self, splitting, options)
 
     @checked
     def smallest_failure(
         self,
         *,
-        rounds: Annotated[int, Bounds(at_least=1, at_most=MOST_REPEATS)] = 40,
+        rounds: Annotated[int, Bounds(at_least=1, at_most=reliability.MOST_REPEATS)] = 40,
         particles: Annotated[int, Bounds(at_least=20)] = 200,
         seed: Seed | None = None,
         report: Report | None = None,
@@ -144,27 +136,29 @@ class ReliabilityProblem(Study):
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
         seed = self.seed if seed is None else seed
-        score, level = self._begin(report)
+        score, level = self.score, self._begin(report)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
             got = f"{self.policy}, which fails with all random numbers at zero"
             raise InputError(f"policy: got {got}, want one that succeeds when undisturbed")
 
-        def result(point: DesignPoint) -> SmallestFailure:
+        def result(point: reliability.DesignPoint) -> SmallestFailure:
             options = {"seed": seed, "rounds": rounds, "particles": particles}
             return SmallestFailure(self, point, score.simulations - before, options)
 
-        with keeping(lambda done: result(done) if isinstance(done, DesignPoint) else None):
-            failures = failure_probability(
+        with keeping(lambda done: result(done) if isinstance(done, reliability.DesignPoint) else None):
+            failures = reliability.failure_probability(
                 score, score.size, particles=particles, keep=0.2, repetitions=2, level=level, seed=seed
             ).failures
-            point = smallest_failure(score, score.size, failures=failures, rounds=rounds, progress=progress, seed=seed)
+            point = reliability.smallest_failure(
+                score, score.size, failures=failures, rounds=rounds, progress=progress, seed=seed
+            )
         return result(point)
 
-    def _begin(self, report: Report | None) -> tuple[TrialScore, Callable[[float], object] | None]:
-        """Report the summary. Returns the score, and a function that reports a level of it with its unit."""
+    def _begin(self, report: Report | None) -> Callable[[float], object] | None:
+        """Report the summary. Returns a function that reports a level of the score with its unit."""
         if report is None:
-            return self.score, None
+            return None
         report(self.summary())
         unit = "m" if len(self.score.plant.world) else self.score.solution.target.unit
         last, when = math.nan, 0.0
@@ -178,7 +172,7 @@ class ReliabilityProblem(Study):
                 when = now
             last = level
 
-        return self.score, report_level
+        return report_level
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +180,9 @@ class RareFailures:
     """The probability that a policy fails, and typical failures."""
 
     problem: ReliabilityProblem
-    splitting: SplittingResult  # with the levels, the estimate of each repetition, and all failures that were found
+    splitting: (
+        reliability.SplittingResult
+    )  # with the levels, the estimate of each repetition, and all failures that were found
     options: Mapping[str, Any]  # `seed`, `particles`, `repetitions` and `keep`
 
     @property
@@ -277,7 +273,7 @@ class Recheck:
 def certify(
     certificate: FailureCertificate,
     *,
-    repetitions: Annotated[int, Bounds(at_least=2, at_most=MOST_REPEATS)] | None = None,
+    repetitions: Annotated[int, Bounds(at_least=2, at_most=reliability.MOST_REPEATS)] | None = None,
     seed: Seed | None = None,
     scenario: str | None = None,
     report: Report | None = None,
@@ -363,7 +359,7 @@ class SmallestFailure:
     """The failure nearest to the undisturbed trial, and the contribution of each disturbance."""
 
     problem: ReliabilityProblem
-    point: DesignPoint
+    point: reliability.DesignPoint
     simulations: int  # number of trials, including the splitting before the search
     options: Mapping[str, int]  # `seed`, `rounds` and `particles`
 

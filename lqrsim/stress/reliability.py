@@ -58,6 +58,13 @@ Keep = Annotated[float, Bounds(at_least=0.0, at_most=0.5)]
 ACCEPTANCE = 0.4  # fraction of accepted moves at which the pilot run aims
 ENOUGH_ABOVE_TIE = 10  # vectors above a tie with which the pilot run goes on; their number then varies by a third
 MOST_BATCHES = 64  # batches of vectors that the pilot run draws at a tie
+# Of the search for the most likely failure.
+MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
+DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than PROGRESS
+PROGRESS = 0.01  # fraction of the distance
+SPREAD = 0.5  # s, where e is a standard normal vector divided by the root of its size
+TOLERANCE = 0.01  # share of the distance that may be left to gain
+GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of the grid
 
 
 class NoFailure(InputError):
@@ -311,14 +318,6 @@ class _Splitting:
             if fractions[number] == 0:
                 break
         return fractions, vectors, scores
-
-
-MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
-DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than PROGRESS
-PROGRESS = 0.01  # fraction of the distance
-SPREAD = 0.5  # s, where e is a standard normal vector divided by the root of its size
-TOLERANCE = 0.01  # share of the distance that may be left to gain
-GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of the grid
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,14 @@ from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.study import Campaign, Cell, Shard
 
 MOST_REASONS = 5  # largest number of reasons in a summary
+# What may differ between two campaigns that are compared: settings, and other fields of the manifest.
+_SETTINGS = ("scenario", "replan_every", "design_disturbances")
+_FIELDS = ("model", "problem", "start", "solution", "code", "versions")
+# The methods, by whether trials are compared one by one.
+_METHOD = {
+    True: "Tango's score interval for paired proportions; p: McNemar's exact test",
+    False: "Newcombe's hybrid score interval for independent proportions; p: Fisher's exact test",
+}
 
 
 class Trials:
@@ -396,16 +404,6 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
         for name, value in now.items()
         if value.astype(np.asarray(was[name]).dtype)[0].tobytes() != np.asarray(was[name]).tobytes()
     ]
-
-
-# What may differ between two campaigns that are compared: settings, and other fields of the manifest.
-_SETTINGS = ("scenario", "replan_every", "design_disturbances")
-_FIELDS = ("model", "problem", "start", "solution", "code", "versions")
-# The methods, by whether trials are compared one by one.
-_METHOD = {
-    True: "Tango's score interval for paired proportions; p: McNemar's exact test",
-    False: "Newcombe's hybrid score interval for independent proportions; p: Fisher's exact test",
-}
 
 
 @checked

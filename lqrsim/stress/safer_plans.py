@@ -57,6 +57,7 @@ FAILING_TRIALS = 10  # trials of each repetition that fail at the requested prob
 MOST_COUNTED = 100_000  # trials that are run where splitting found no failure: about as many as two splittings
 REPLAYED_FAILURES = 300  # failing runs that are run again, to see where they fail
 MOST_ROUNDS = 20
+SAME_PLAN = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -367,9 +368,6 @@ class _Search:
             problem=self.problem, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,
             reason=reason,
         )  # fmt: skip
-
-
-SAME_PLAN = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
 
 
 @checked

@@ -22,6 +22,10 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 
 Size = int | Sequence[int] | None
+LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
+ZEROS = np.broadcast_to(0.0, 10**12)  # more than any trial draws, in the memory of one number
+PROBES = 32  # trials that show how much the disturbances change the clearance while the robot leaves an obstacle
+STEADY = 20.0  # a clearance of more of its standard deviations does not show which trials are near a collision
 
 
 class PrescribedDraws:
@@ -93,9 +97,6 @@ def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
     return size if size is not None else (np.broadcast_shapes(*(np.shape(argument) for argument in arguments)) or None)
 
 
-LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
-
-
 @checked
 def collision_score(rollout: Rollout, *, first: Index = 0) -> Array:
     """The depth in metres to which each trial enters obstacles, (K,); minus the least clearance without a collision.
@@ -123,11 +124,6 @@ def miss_score(rollout: Rollout, *, first: Index = 0) -> Array:
     """
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
     return np.maximum(collision_score(rollout, first=first), outside)
-
-
-ZEROS = np.broadcast_to(0.0, 10**12)  # more than any trial draws, in the memory of one number
-PROBES = 32  # trials that show how much the disturbances change the clearance while the robot leaves an obstacle
-STEADY = 20.0  # a clearance of more of its standard deviations does not show which trials are near a collision
 
 
 @checked
