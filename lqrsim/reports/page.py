@@ -5,7 +5,7 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as packaged
 from itertools import zip_longest
@@ -184,10 +184,7 @@ def _text_and_tables(
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
         "facts": _facts(results, table, scenario),
-        "commands": {
-            "To resume or repair the campaign": results.command,
-            "This page": results.command_of("report"),
-        },
+        "commands": {"To resume or repair the campaign": results.command, "This page": results.command_of("report")},
         "asked": json.dumps(results.manifest["campaign"], indent=2, ensure_ascii=False),
         "breaks": breaks_table(table),
         "broken_below": f"{100 * BROKEN_BELOW:g} %",
@@ -202,22 +199,15 @@ def _text_and_tables(
 
 
 def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, list[str]]:
-    campaign, manifest = results.campaign, results.manifest
+    campaign, manifest, problem = results.campaign, results.manifest, scenario.problem
     facts = {
         "Scenario": [
             f"{campaign.scenario}: {scenario.summary}",
-            f"Robot {scenario.robot.name} in scene {scenario.scene.name}; {scenario.problem.steps} control periods of"
-            f" {scenario.problem.dt:.4g} s.",
+            f"Robot {scenario.robot.name} in scene {scenario.scene.name}; {problem.steps} periods of {problem.dt:.4g} s.",
         ],
-        "Disturbances, at strength 1": [
-            f"{name}: {_describe(disturbances, scenario)}" for name, disturbances in campaign.sweeps.items()
-        ],
+        "Disturbances, at strength 1": [f"{name}: {_describe(of, scenario)}" for name, of in campaign.sweeps.items()],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
-        "Policies": [
-            ", ".join(policies(table)),
-            *([manifest["left_out"]] if manifest["left_out"] else []),
-            *manifest["remarks"],
-        ],
+        "Policies": [", ".join(policies(table)), *filter(None, [manifest["left_out"], *manifest["remarks"]])],
         "Plans": results.plans(),
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
@@ -244,9 +234,9 @@ def _describe(disturbances: Sequence[Disturbance], scenario: Scenario) -> str:
 
 
 def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campaign, folder: Path) -> dict[str, Any]:
-    policies = list(dict.fromkeys(cell.policy for cell in table if cell.sweep == name))
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
-    curves = {policy: analysis.degradation(table, policy, name) for policy in policies}
+    of_sweep = [cell for cell in table if cell.sweep == name]
+    curves = {policy: analysis.degradation(table, policy, name) for policy in policies(of_sweep)}
     rates, errors = dict[str, dict[float, Array]](), dict[str, dict[float, Array]]()
     for policy, points in curves.items():
         bands = [(point.cell.strength, point.band) for point in points]
@@ -294,7 +284,7 @@ class PageTable:
     rows: Sequence[Sequence[str]]
 
 
-def policies(table: analysis.Table) -> list[str]:
+def policies(table: Iterable[Cell]) -> list[str]:
     """The names of the policies, in the order of the campaign."""
     return list(dict.fromkeys(cell.policy for cell in table))
 

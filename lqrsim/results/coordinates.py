@@ -300,8 +300,8 @@ def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose
     """
     for kind, space, wanted in zip(("states", "controls"), got, want, strict=True):
         if space.names != wanted.names:
-            got = f"{what} with the {kind} {', '.join(space.names)}"
-            raise InputError(f"{field}: got {got}, want {', '.join(wanted.names)}, as {whose} has them")
+            stated = f"{what} with the {kind} {', '.join(space.names)}"
+            raise InputError(f"{field}: got {stated}, want {', '.join(wanted.names)}, as {whose} has them")
 
 
 def _letter(name: str) -> str:

@@ -427,12 +427,7 @@ def _saved(score: TrialScore, numbers: Array, folder: Path) -> Rollout:
 
 
 def write_json(
-    problem: ReliabilityProblem,
-    solution: Solution,
-    path: Path,
-    options: Mapping[str, Any],
-    result: object,
-    stopped: str,
+    problem: ReliabilityProblem, solution: Solution, path: Path, options: Mapping[str, Any], found: object, stopped: str
 ) -> None:
     """Write the settings of a search, and what it found."""
     settings = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
@@ -448,6 +443,6 @@ def write_json(
         "versions": versions(),
         "machine": description(),
         "stopped": stopped or None,
-        "found": result,
+        "found": found,
     }
     write_text(path, json.dumps(plain(contents), indent=1, allow_nan=False) + "\n")

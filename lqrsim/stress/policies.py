@@ -78,13 +78,9 @@ def design_uncertainty(scenario: Scenario, design: Design = None) -> Uncertainty
 
 
 def solve_policies(
-    policies: Sequence[str],
-    scenario: Scenario,
-    design: Design = None,
-    given: Solution | None = None,
-    *,
+    policies: Sequence[str], scenario: Scenario, design: Design = None, given: Solution | None = None, *,
     remark: bool = True,
-) -> dict[str, Solution]:
+) -> dict[str, Solution]:  # fmt: skip
     """The solution that each policy runs, by the policy's name.
 
     The policy in the solution for "track" is the tracking law, in that for "offset_free" the policy of "smooth".

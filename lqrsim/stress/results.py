@@ -267,10 +267,10 @@ class Results:
 
         Trials that ended with an error do not count.
         """
-        tallies, reached = tallies or self._tallies(), dict[str, int]()
-        for cell, ends in tallies.items():
+        reached: Counter[str] = Counter()
+        for cell, ends in (tallies or self._tallies()).items():
             if cell.strength > 0 and ends["error"] < ends.total():
-                reached[cell.sweep] = reached.get(cell.sweep, 0) + ends["reached"]
+                reached[cell.sweep] += ends["reached"]
         sweeps = self.manifest["campaign"]["sweeps"]
         kinds = {name: [f"{name}:{item['kind']}" for item in sweeps[name]] for name in reached if name in PRESETS}
         return [
@@ -284,9 +284,8 @@ class Results:
         campaign, lines = self.manifest["campaign"], []
         for policy in self.manifest["policies"]:
             solution = self.solution(policy)
-            goal_options, radius = (campaign["goal_radius"], campaign["goal_tolerance"]), solution.goal_radius
-            if goal_options != (None, None):
-                radius = solution.target.radius(None, *goal_options)
+            goal, radius = (campaign["goal_radius"], campaign["goal_tolerance"]), solution.goal_radius
+            radius = radius if goal == (None, None) else solution.target.radius(None, *goal)
             lines += [f"{policy}: {line}" for line in solution.target.of_plan(radius)]
         return lines
 

@@ -187,7 +187,7 @@ class TrialScore:
         vectors = check_array("numbers", numbers, (None, self.size))
         parts = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
         options = {"first": self.first} if self.first else {}  # only lqrsim's own scores leave knots out
-        scores = [np.zeros(0)]
+        scores: list[Array] = [np.zeros(0)]
         for part in parts:
             returned = self.failure(self.rollout(part, frames=False), **options)
             scores.append(shaped("failure: returned", returned, (len(part),)))
