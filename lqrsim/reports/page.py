@@ -203,7 +203,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
     facts = {
         "Scenario": [
             f"{campaign.scenario}: {scenario.summary}",
-            f"Robot {scenario.robot.name} in scene {scenario.scene.name}; {problem.steps} periods of {problem.dt:.4g} s.",
+            f"Robot {scenario.robot.name} in scene {scenario.scene.name}; {problem.steps} steps of {problem.dt:.4g} s.",
         ],
         "Disturbances, at strength 1": [f"{name}: {_describe(of, scenario)}" for name, of in campaign.sweeps.items()],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
