@@ -80,14 +80,12 @@ class Coordinates:
             raise InputError(f"names: got a name twice in {', '.join(self.names)}, want different names")
         if len(self.position) not in (0, 2, 3):
             raise InputError(f"position: got {len(self.position)} entries, want 2 (a planar robot), 3, or none")
-        spans = {"position": self.position, "angles": self.angles, "rotation_vectors": self.rotation_vectors}
-        for field, indices in spans.items():
+        for field, (unit, why) in _UNITS.items():
+            indices, width = getattr(self, field), 3 if field == "rotation_vectors" else 1
             if len(set(indices)) < len(indices):
                 raise InputError(f"{field}: got {excerpt(indices)}, want different indices")
-            width = 3 if field == "rotation_vectors" else 1
             if any(index > size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
-            unit, why = _UNITS[field]
             for entry in (first + i for first in indices for i in range(width)):
                 if self.units[entry] not in ("", unit):
                     name = self.names[entry]

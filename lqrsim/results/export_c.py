@@ -306,9 +306,8 @@ def _entries(measured: Coordinates, start: Array, controls: Coordinates) -> str:
     for i, (label, value) in enumerate(zip(measured.labels, start.tolist(), strict=True)):
         lines.append(f"  {i}: {label}{turning.get(i, '')}, {value:.6g}")
     lines.append("command, with its limits:")
-    limits = zip(controls.low, controls.high, strict=True)
-    pairs = zip(controls.labels, limits, strict=True)
-    lines += [f"  {i}: {label}, {low:g} to {high:g}" for i, (label, (low, high)) in enumerate(pairs)]
+    limits = zip(controls.labels, controls.low, controls.high, strict=True)
+    lines += [f"  {i}: {label}, {low:g} to {high:g}" for i, (label, low, high) in enumerate(limits)]
     return "\n".join(f" * {_comment(line)}" for line in lines)
 
 
