@@ -174,6 +174,7 @@ def test_a_solve_begins_with_what_was_stored(
         ("differential_drive --start {left}/policy.npz --paper-start", ["--start, --paper-start: got 2 of them"]),
         ("differential_drive --start {left}/policy.npz --starts 5", ["--start, --starts: got 2 of them"]),
         ("{own}:along --paper-start --starts 5", ["--paper-start, --starts: got 2 of them"]),
+        ("quadrotor --solver ilqr --finish none", ["--finish: got none with --solver ilqr, want it with smooth"]),
     ],
 )
 def test_what_cannot_be_begun_with_is_one_line(

@@ -101,9 +101,8 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
     from lqrsim.results.archive import excerpt_of
 
     check_path(field, folder / name, "the path of an output")
-    existing = folder.absolute()
-    while not os.path.exists(existing) and existing != existing.parent:
-        existing = existing.parent
+    absolute = folder.absolute()
+    existing = next((place for place in (absolute, *absolute.parents) if os.path.exists(place)), absolute)
     try:
         tempfile.TemporaryFile(dir=existing).close()
         with contextlib.suppress(FileNotFoundError):
