@@ -77,10 +77,10 @@ FLOORS_WITHIN = {
     ),
     "solvers": (
         ("budget", "compiled", "initial_guess"),
-        ("certify", "settings", "stages", "step_stability"),
+        ("certify", "settings", "stages"),
         ("curvature",),
         ("engine", "interior_point", "parallel"),
-        ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
+        ("assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
         ("control_rates", "interior_run", "restoration", "risk", "tree", "ways"),
         ("between_knots", "constrained", "free_duration", "reach"),
         ("strategy",),

@@ -13,8 +13,7 @@ from numpy.random import Generator
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
-from lqrsim.solvers.active_set import ActiveSet
-from lqrsim.solvers.interior_point import Barrier, InteriorPoint, InteriorResult, Measures
+from lqrsim.solvers.interior_point import ActiveSet, Barrier, InteriorPoint, InteriorResult, Measures
 from lqrsim.solvers.stages import Stages
 from paper.common import numbers
 

@@ -1,5 +1,6 @@
-"""Makes a `Solution` from the result of a run."""
+"""Makes a `Solution` from the result of a run, and says what is doubtful about its plan."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -20,7 +21,6 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import LAW, MOTION
 from lqrsim.solvers.engine import RunResult
 from lqrsim.solvers.settings import can_be_exact
-from lqrsim.solvers.step_stability import unstable_step
 from lqrsim.versions import versions
 
 # The policies of plans through contacts are run from this many starts that differ by this much in each state.
@@ -34,6 +34,11 @@ NEAR_TILT = 0.1
 EXACT = 1e-6  # m or rad, by which a SiteConstraint that is kept may be off
 UNBOUNDED = 1e10  # a cost so many times below that of the first iteration, or below -1, falls for ever
 UNFINISHED = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
+TAYLOR = np.array([1.0, 1.0, 1 / 2, 1 / 6, 1 / 24])  # R(z), the factor of a Runge-Kutta step; see `_unstable_step`
+# |R(z)| <= 1 for all z of Re z <= 0 within this distance, and on each ray up to one root further away.
+STABLE = 2.61
+LONGEST = 100_000  # number of shorter steps that are tried
+ROUNDING = 1e-6  # of an eigenvalue by MuJoCo's differences, relative to its size: of an oscillation without damping
 
 
 def assemble(
@@ -58,15 +63,9 @@ def assemble(
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
     policy = partial(compiled.policy_of, problem)
-    unstable = unstable_step(problem, states, controls, sound=result.success)
+    unstable, shorter = _unstable_step(problem, states, controls, sound=result.success)
     doubts = (_near_singular(problem, result), _fragile(problem, result)) if np.isfinite(states).all() else ()
-    said = (
-        result.detail,
-        _usable(problem, result, options),
-        *doubts,
-        unstable.detail if unstable else "",
-        _sites(problem, states),
-    )
+    said = result.detail, _usable(problem, result, options), *doubts, unstable, _sites(problem, states)
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -78,7 +77,7 @@ def assemble(
         later,
         status=result.status,
         detail="; ".join(part for part in said if part),
-        remedy=remedy_of(problem, result, log, options, shorter=unstable.remedy if unstable else ""),
+        remedy=remedy_of(problem, result, log, options, shorter=shorter),
         policy=policy(*law, nominal[:-1]),
         cost_to_go=copy_of(result.values.get("cost_to_go")),
         cost_to_come=copy_of(result.values.get("cost_to_come")),
@@ -181,6 +180,79 @@ def _fragile(problem: Problem, result: RunResult) -> str:
         if said := departure(space, run, states, problem.dt):
             return f"from a start that differs by {OFFSET:g} in each state, the policy {said}"
     return ""
+
+
+def _unstable_step(problem: Problem, states: Array, controls: Array, *, sound: bool) -> tuple[str, str]:
+    """What happens at the step at which a plan needs the shortest Runge-Kutta steps, and the remedy; or empty texts.
+
+    A step of h seconds multiplies what has the eigenvalue L of df/dx by R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24, z = hL.
+    If it decays, Re L < 0, but |R(z)| > 1, then a plan is one of the steps, and not of the system. If the plan is not
+    sound, the first such step is told: what follows may be beyond all bounds because of it. Empty if the same controls
+    lead there with shorter steps as well.
+    """
+    known = np.flatnonzero(np.isfinite(states[:-1]).all(axis=1) & np.isfinite(controls).all(axis=1))
+    runge_kutta = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
+    if runge_kutta is None:
+        return "", ""
+    step, slopes = runge_kutta
+    # The norm bounds all eigenvalues, and mostly decides.
+    with np.errstate(over="ignore"):
+        fast = (step * np.linalg.norm(slopes, axis=(1, 2)) > STABLE) & np.isfinite(slopes).all(axis=(1, 2))
+    if not fast.any():
+        return "", ""
+    known, slopes = known[fast], slopes[fast]
+    rates = np.linalg.eigvals(slopes)
+    excess, reach = np.zeros(rates.shape), step * np.abs(rates)
+    for i, j in np.argwhere((reach > STABLE) & (rates.real <= ROUNDING * np.abs(rates))):
+        excess[i, j] = reach[i, j] / _reach(complex(rates[i, j]))
+    worst = excess.max(axis=1)
+    if not (worst > 1).any():
+        return "", ""
+    knot = int(np.argmax(worst if sound else worst > 1))
+    mode = int(np.argmax(excess[knot]))
+    rate, t = rates[knot, mode], int(known[knot])
+    with np.errstate(over="ignore"):
+        growth = abs(np.polyval(TAYLOR[::-1], step * rate))
+    shorter = step / float(worst[knot])
+    unit = 10.0 ** (math.floor(math.log10(shorter)) - 2)  # of three digits
+    longest = math.floor(shorter / unit) * unit
+    if not sound and not _stays_finite(problem, states[0], controls, math.ceil(step / longest)):
+        return "", ""
+    # The state that takes part the most in the eigenvalue, whatever the units of states.
+    eigenvalues, right = np.linalg.eig(slopes[knot])
+    mode = int(np.argmin(np.abs(eigenvalues - rate)))
+    carrier = int(np.argmax(np.abs(np.linalg.pinv(right)[mode] * right[:, mode])))
+    name = problem.dynamics.state_coordinates.names[carrier]
+    value = f"{rate.real:.3g}" + (f" +- {abs(rate.imag):.3g}i" if rate.imag else "")
+    return (
+        f"Runge-Kutta steps of {step:g} s are unstable: at {t * problem.dt:g} s (step {t + 1} of"
+        f" {problem.steps}) df/dx has the stable eigenvalue {value} 1/s, mostly of {name}, whose deviations a"
+        f" step multiplies by {growth:.3g}",
+        problem.dynamics._with_finer_steps(step, longest),
+    )
+
+
+def _stays_finite(problem: Problem, start: Array, controls: Array, times: int) -> bool:
+    """Whether controls (T, m) lead to finite states if each is held for so many control periods as much shorter.
+
+    Controls that are not finite are the nominal one. True for MuJoCo's steps, and false for more than `LONGEST`.
+    """
+    steps, n = times * len(controls), len(start)
+    if problem.dynamics.by_mujoco or steps > LONGEST:
+        return problem.dynamics.by_mujoco
+    held = np.repeat(np.where(np.isfinite(controls), controls, problem.nominal_control), times, axis=0)
+    gain = np.zeros((steps, held.shape[1], n))
+    states, _ = compiled.rollout(problem, gain, held, start, dt=problem.dt / times)
+    return bool(np.isfinite(states).all())
+
+
+def _reach(rate: complex) -> float:
+    """The distance from zero, in the direction of an eigenvalue that decays, at which |R(z)| is 1."""
+    powers = TAYLOR * (rate / abs(rate)) ** np.arange(5)
+    square = np.convolve(powers, powers.conj()).real  # |R|^2 as a polynomial of the distance, the constant first
+    square[0] -= 1.0
+    roots = np.roots(square[:0:-1])
+    return float(roots.real[(np.abs(roots.imag) < ROUNDING) & (roots.real > STABLE)].min(initial=np.inf))
 
 
 def remedy_of(

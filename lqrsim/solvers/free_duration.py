@@ -366,10 +366,9 @@ def _recorder(budget: Budget) -> Callable[[Measures, float], bool]:
 
 def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
     """The price of all violations of a plan, at a price of each row (R,)."""
-    prices = stages.of_each(np.where(np.isfinite(price) & (stages.owners >= 0), price, 0.0))
-    numbers = stages.values(plan)[stages.live]
-    missed = np.where(stages.of_each(stages.equality), np.abs(numbers), np.maximum(-numbers, 0.0))
-    return float((prices * missed).sum())
+    prices, numbers = np.where(np.isfinite(price) & (stages.owners >= 0), price, 0.0), stages.values(plan)
+    missed = np.where(stages.equality, np.abs(numbers), np.maximum(-numbers, 0.0))[stages.live]
+    return float((np.broadcast_to(prices, numbers.shape)[stages.live] * missed).sum())
 
 
 def find_duration(

@@ -1,4 +1,7 @@
-"""The interior point of `kernels/interior_point.py` from one plan, in slices between which its caller is told."""
+"""The interior point and the active set of `kernels/` from one plan.
+
+An interior point runs in slices between which its caller is told, an active set in pieces short enough for a deadline.
+"""
 
 import time
 from collections.abc import Callable
@@ -10,17 +13,19 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
+from lqrsim.kernels import active_set
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
 from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SCALE
 from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning, StructuredArray
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
-from lqrsim.results.solution_parts import Trajectory
+from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.solvers.budget import ATTENTION, Laps
 from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import Sizes, Stages
 
 NAME = "interior point"  # name of its iterations in the log
+STEPS = 12  # largest number of steps of an active set: a solve that needs more does not converge
 
 
 class Measures(NamedTuple):
@@ -167,13 +172,102 @@ class InteriorPoint:
         )  # fmt: skip
 
     def _result(self, solved: bool) -> InteriorResult:
-        stages = self._stages
-        known = tuple(stages.force[:, stages.owners == k].copy() for k in range(len(stages.problem.constraint_terms)))
-        pressing = np.zeros((stages.steps, stages.m))
+        stages, pressing = self._stages, np.zeros((self._stages.steps, self._stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
         return InteriorResult(
             plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain,
-            measures=Measures.of(self._memory), multipliers=known, pressing=pressing, solved=solved,
-            flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self._sizes, scale=float(self._memory["scale"][0]),
+            measures=Measures.of(self._memory), multipliers=tuple(stages.by_constraint(stages.force)),
+            pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self._sizes,
+            scale=float(self._memory["scale"][0]),
         )  # fmt: skip
+
+
+class ActiveSet:
+    """Steps from one plan.
+
+    Args:
+      plan: states (T+1, n) and controls (T, m), not necessarily feasible; the first state is the start.
+      multipliers: multipliers of the constraints, (T+1, rows) each, or none.
+      violation: tolerance of equalities; a fraction of it is the margin of inequalities.
+
+    Attributes:
+      plan: the current plan, which steps overwrite. held: (T+1, R) 1 for rows held at their targets, else 0.
+      hopeless: whether the plan is stationary but violates rows that no multiplier corrects.
+      model_seconds: spent on the models of a plan.
+    """
+
+    def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
+        self._stages, self._violation, self.hopeless = stages, float(violation), False
+        self._arrays, self._memory = stages.active_set
+        self.plan, self.held = self._arrays.plan, stages.held
+        self.plan.states[...], self.plan.controls[...] = plan
+        stages.state(price=np.inf, margin=INSIDE * violation)
+        stages.force[...] = stages.of_constraints(multipliers)
+        clock = time.perf_counter()
+        self._call(active_set.BEGIN)
+        self.model_seconds = time.perf_counter() - clock
+
+    @property
+    def measures(self) -> Measures:
+        """The measures of the plan."""
+        return Measures.of(self._memory)
+
+    def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
+        """Take steps until the measures are within tolerance; return whether they are.
+
+        Args:
+          tolerance: tolerance of stationarity, gaps and complementarity.
+          watch: called with the measures after each step; True ends it.
+          late: called before a piece of work with its expected duration in seconds; True abandons the step.
+        """
+        ended = False
+        for _ in range(STEPS):
+            before = self.measures
+            if self._within(tolerance) or ended or not self._step(late):
+                break
+            ended = watch(self.measures) or not np.isfinite(self.measures.cost)
+            # If everything else is within tolerance, a remaining violation cannot be removed.
+            idle = max(before.stationarity, before.gap) < tolerance
+            self.hopeless = idle and self.measures.violation > 0.5 * before.violation > self._violation
+            ended = ended or self.hopeless
+        return self._within(tolerance)
+
+    def _within(self, tolerance: float) -> bool:
+        measures = self.measures
+        # The rollout of the plan must not use up the margin of the constraints.
+        feasible = self._memory["kept"][0] > 0
+        return feasible and max(measures.stationarity, measures.gap / INSIDE, measures.complementarity) < tolerance
+
+    def _step(self, late: Callable[[float], bool]) -> bool:
+        """Take a step; return False if there is none, or no time for it: twice that of the models is needed."""
+        before = self.held.copy()
+        self._call(active_set.PREPARE)
+        outcome = RUNNING
+        while outcome == RUNNING:
+            outcome = self._call(active_set.PIVOT)
+            if late(2 * self.model_seconds):
+                self.held[...] = before
+                return False
+        if outcome == CONVERGED:
+            self._call(active_set.TAKE)
+        return outcome == CONVERGED
+
+    def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
+        """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values."""
+        about, steps = self._stages.about, self._stages.steps
+        self._call(active_set.ROLL_OUT)
+        values = [rows.reshape(steps + 1, -1) for rows in about.values]
+        return Motion(*map(np.copy, self._arrays.out)), about.policy.gain.copy(), self.measures.cost, values
+
+    def multipliers(self) -> tuple[Multipliers, ...]:
+        """The multipliers of each constraint, with a penalty."""
+        stages, scale, multipliers = self._stages, float(self._memory["scale"][0]), list[Multipliers]()
+        for k, force in enumerate(stages.by_constraint(stages.force)):
+            sizes = stages.row_sizes[stages.owners == k]
+            price = active_set.FIRMNESS * scale / float(np.median(sizes**2)) if len(sizes) else 1.0
+            multipliers.append(Multipliers(force, price))
+        return tuple(multipliers)
+
+    def _call(self, task: int) -> int:
+        return self._stages.call("active_set", task, self._violation, self._stages.about, self._arrays, self._memory)

@@ -16,10 +16,9 @@ from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.plan import Plan, Replan
-from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.solution_parts import Iteration, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
-from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import clearance_of, copy_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
@@ -27,7 +26,7 @@ from lqrsim.solvers.constrained import ConstrainedRun, Known
 from lqrsim.solvers.control_rates import feedback, narrowed, widened
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
-from lqrsim.solvers.interior_point import WEAK, Barrier, InteriorPoint, Measures
+from lqrsim.solvers.interior_point import WEAK, ActiveSet, Barrier, InteriorPoint, Measures
 from lqrsim.solvers.interior_run import copied
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.restoration import restore
@@ -383,7 +382,7 @@ class _Neighbour:
         return RunResult(
             status=Status.CONVERGED if solved else status, detail=detail, plan=plan,
             law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values),
-            multipliers=tuple(Multipliers(*pair) for pair in active.multipliers()),
+            multipliers=active.multipliers(),
         )  # fmt: skip
 
 

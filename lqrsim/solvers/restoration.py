@@ -64,11 +64,8 @@ def restore(
         if error := interrupt_of(functions):
             raise error
         if outcome == NO_PROGRESS and not ended:
-            shares = work.relative_multipliers.reshape(stages.live.shape)
-            terms = range(len(stages.problem.constraint_terms))
-            at_minimum = ended = stationary(
-                Motion(*map(np.copy, work.plan)), [shares[:, stages.owners == k].copy() for k in terms]
-            )
+            shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
+            at_minimum = ended = stationary(Motion(*map(np.copy, work.plan)), shares)
         if not hurried and not functions:
             size = max(1, int(ATTENTION / max(seconds, 1e-9)))
     if outcome == NOT_FINITE:

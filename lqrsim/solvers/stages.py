@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
@@ -259,9 +258,9 @@ class Stages:
             rows[:, self.owners == k] = values
         return rows
 
-    def of_each(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Numbers of the rows (R,) for each of the live rows, (K,)."""
-        return np.broadcast_to(numbers, self.live.shape)[self.live]
+    def by_constraint(self, rows: Array) -> list[Array]:
+        """Copies of the constraints' parts, (T+1, rows) each, of numbers (T+1, R)."""
+        return [rows[:, self.owners == k].copy() for k in range(len(self.problem.constraint_terms))]
 
     def adjoint(self, gain: Array | None = None) -> tuple[Array, Array]:
         """Costates (T+1, n) of the Lagrangian, and its slopes in the controls (T, m), with the current multipliers.
