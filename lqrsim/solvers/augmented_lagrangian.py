@@ -59,7 +59,6 @@ def by_multipliers(run: SolveRun) -> RunResult:
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
-    """A further run, with the rest of the budget."""
     return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
 
 
@@ -291,7 +290,6 @@ class AugmentedLagrangian:
         return max(self._grown.values())
 
     def evaluate(self, plan: Motion) -> None:
-        """Evaluate the constraints of a plan."""
         self._plan, stated = plan, self._work.constraint_values(plan)
         self.kept = self._work.keeps(stated)
         excess = [

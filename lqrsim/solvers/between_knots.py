@@ -48,7 +48,6 @@ class PlanErrors:
 
     @property
     def missed(self) -> float:
-        """The largest violation, 0 if there is none."""
         return max((float(violations.max(initial=0.0)) for violations in self.worst), default=0.0)
 
     def record(self, problem: Problem) -> BetweenKnots:

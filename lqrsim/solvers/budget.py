@@ -83,10 +83,10 @@ class Stop:
         if last is None:
             return f"in the first iteration{left}"
         parts = [f"iteration {self.iterations}: {last.method}"]
-        parts += [
-            f"{name} {value:.4g}" for name, value in (("cost", last.cost), ("violation", last.violation)) if value
-        ]
-        return ", ".join(part for part in parts if not part.endswith(" nan")) + left
+        for name, value in (("cost", last.cost), ("violation", last.violation)):
+            if value and not np.isnan(value):
+                parts.append(f"{name} {value:.4g}")
+        return ", ".join(parts) + left
 
     def reporting(self, what: str) -> contextlib.AbstractContextManager[None]:
         """A block that reports the progress if the caller hears nothing for long, unless many problems are solved."""
@@ -130,17 +130,14 @@ class Budget:
 
     @property
     def left(self) -> int:
-        """The number of iterations that may follow."""
         return max(self._most - len(self.log), 0)
 
     @property
     def over(self) -> bool:
-        """Whether no iteration may follow."""
         return self.stop.due or not self.left
 
     @property
     def watched(self) -> bool:
-        """Whether there is a callback."""
         return self._callback is not None
 
     @property
@@ -149,7 +146,6 @@ class Budget:
         return self.watched or self.stop.deadline < np.inf
 
     def record(self, iteration: Iteration) -> None:
-        """Add an iteration to the log, and tell the callback."""
         self.log.append(iteration)
         self.stop.iterations, self.stop.last = self.stop.iterations + 1, iteration
         self._call((iteration,))
@@ -245,20 +241,20 @@ class _Watch:
         self._thread: threading.Thread | None = None
         self._woken, self._sleeps_until = threading.Event(), 0.0
 
-    def begin(self, activity: "_Activity") -> None:
-        """Begin to watch an activity."""
-        with self._lock:
-            self._activities.append(activity)
-            if self._thread is None or not self._thread.is_alive():  # also after a fork
-                self._thread = threading.Thread(target=self._run, name="progress", daemon=True)
-                self._thread.start()
-            elif activity.due < self._sleeps_until:
-                self._woken.set()
-
-    def end(self, activity: "_Activity") -> None:
-        """Watch an activity no longer."""
-        with self._lock:
-            self._activities.remove(activity)
+    @contextlib.contextmanager
+    def watching(self, activity: "_Activity") -> Iterator[None]:
+        try:
+            with self._lock:
+                self._activities.append(activity)
+                if self._thread is None or not self._thread.is_alive():  # also after a fork
+                    self._thread = threading.Thread(target=self._run, name="progress", daemon=True)
+                    self._thread.start()
+                elif activity.due < self._sleeps_until:
+                    self._woken.set()
+            yield
+        finally:
+            with self._lock:
+                self._activities.remove(activity)
 
     def _run(self) -> None:
         idle = False
@@ -292,7 +288,6 @@ class _Activity:
         self.due = time.perf_counter() + self._wait
 
     def report(self, now: float) -> None:
-        """Report the progress if it is due."""
         if now < self.due:
             return
         if now - self.called() >= SILENT:
@@ -304,10 +299,9 @@ class _Activity:
 _watch = _Watch()
 
 
-@contextlib.contextmanager
 def reported(
     what: str, progress: Callable[[], str], called: Callable[[], float] = lambda: -np.inf, begun: float | None = None
-) -> Iterator[None]:
+) -> contextlib.AbstractContextManager[None]:
     """A block that reports its progress after two silent seconds, as a warning of the logger `lqrsim`.
 
     Args:
@@ -316,9 +310,4 @@ def reported(
       called: function that returns the time at which a callback was last called, on the clock of `time.perf_counter`.
       begun: time at which the activity began, on the same clock; by default now.
     """
-    activity = _Activity(what, progress, called, time.perf_counter() if begun is None else begun)
-    try:
-        _watch.begin(activity)
-        yield
-    finally:
-        _watch.end(activity)
+    return _watch.watching(_Activity(what, progress, called, time.perf_counter() if begun is None else begun))

@@ -240,7 +240,6 @@ class ConstrainedRun:
         return None
 
     def _restore(self, plan: Motion, price: float) -> Restored | None:
-        """Run the descent; its iterations go to the log."""
         budget, laps, restored = self._budget, Laps(self._budget), None
 
         def watch(cost: float, violation: float, predicted: float, seconds: float) -> bool:
@@ -273,11 +272,9 @@ class ConstrainedRun:
     def _interior(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
     ) -> RunResult | None:
-        """The result of the interior point from a plan."""
         return self._remember(self._point.run_from(plan, barrier, multipliers=multipliers, stale=stale))
 
     def _remember(self, result: RunResult | None) -> RunResult | None:
-        """Keep a result if it is the best so far."""
         if result is not None and (self._best is None or result.rank < self._best.rank):
             self._best = result.kept()
         return result

@@ -374,7 +374,6 @@ class Descent:
         return by_period, np.zeros_like(self.model.low) if step is None else step.limits
 
     def _go_to(self, plan: CostedPlan) -> None:
-        """Adopt a plan, and linearise about it."""
         count = self.model.points.shape[1] - 1
         self._earlier = [*self._earlier[-count:], (self.model.points, self.model.periods)]
         self.plan, self.model = plan, ModeModel(self._problem, self._modes, plan)

@@ -192,7 +192,6 @@ class SolveRun:
         return run
 
     def give_back(self) -> None:
-        """Leave the memory to another solve."""
         self._release_stages()
         _pool.give_back(self, self.problem)
 
@@ -420,7 +419,6 @@ class SolveRun:
     # The results of a run.
 
     def result(self, ending: Ending) -> RunResult:
-        """The result of smoothing, with its ending."""
         work, last = self.work, self._last
         return RunResult(
             status=ending.status, detail=ending.detail(self.problem.steps), plan=work.last,
@@ -678,7 +676,6 @@ class SolveRun:
         return self._stated(task, first, last, rows, tolerance, options, prior=self.work.no_prior, last=self.work.trial)
 
     def _linearize_arguments(self, rows: StructuredArray) -> tuple[Any, ...]:
-        """Arguments for policy and value functions about the plan."""
         return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.rough, 0.0, 0, 0, rows)
 
     def _check_arguments(
@@ -772,7 +769,6 @@ class Workspace:
 
     @property
     def cost(self) -> float:
-        """The cost of the best plan; infinite where there is none."""
         return float(self.memory["plan_cost"])
 
     def set_best(self, plan: Motion, cost: float = np.inf) -> None:
@@ -820,7 +816,6 @@ class Workspace:
         return self.model.stage._replace(data=tuple(data))
 
     def roll_out(self, policy: Policy, state: Array) -> Motion:
-        """Roll out a policy from a state."""
         plan = Motion(np.empty_like(self.last.states), np.empty_like(self.last.controls))
         of = self._problem.steps, in_c_order(state), Policy(*map(in_c_order, policy)), self.model, plan
         if self._rollout is None:
@@ -841,7 +836,6 @@ class Workspace:
         return [numbers.reshape(self._problem.steps + 1, -1) for numbers in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
-        """Gradient (n+m,) of one row of a constraint."""
         slope = np.zeros(len(x) + len(u))
         self._costs.slope_of_constraint(which, row, x, u, step, self.model.stage.constraints, slope)
         return slope

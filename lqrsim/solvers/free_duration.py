@@ -165,7 +165,6 @@ class DurationSearch:
             self._refine(self._fixed[-1].trajectory, self._settings)
 
     def _follow(self, name: str, plan: Trajectory) -> None:
-        """Go on from a plan that is one of the candidates."""
         before = self._total
         _, ordinary, result = self._find(plan, Budget(self._settings.max_iterations, self._stop))
         status = Status.CONVERGED if result.solved else Status.STALLED
@@ -253,7 +252,6 @@ class DurationSearch:
         return cheaper, ordinary, result
 
     def _solved(self, fixed: Problem, settings: SmootherSettings) -> Solution:
-        """Solve with a fixed duration."""
         solution = self._solve(fixed, settings)
         if fixed.segments:
             knots = [*fixed.segments]  # a list, as it is in a file

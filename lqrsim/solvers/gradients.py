@@ -105,7 +105,6 @@ def gradients(
     optimum = _Optimum(problem, solution)
 
     def difference(k: int, step: float) -> list[Array]:
-        """The central difference of all values in a parameter."""
         forward, backward = point.copy(), point.copy()
         forward[k] += step
         backward[k] -= step
@@ -232,7 +231,6 @@ class _Optimum:
 
 
 def _described(stages: Stages, row: int) -> str:
-    """The name of a row."""
     owner, first = stages.owners[row], int(np.argmax(stages.owners == stages.owners[row]))
     if owner >= 0:
         return stages.problem.constraint_terms[owner].describe(row - first)

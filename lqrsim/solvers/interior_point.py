@@ -78,7 +78,6 @@ class InteriorResult:
     scale: float  # the cost to which measures are relative
 
     def trajectory(self, dt: float) -> Trajectory:
-        """The plan in steps of dt seconds."""
         return Trajectory(self.plan.states, self.plan.controls, dt)
 
 
@@ -210,7 +209,6 @@ class ActiveSet:
 
     @property
     def measures(self) -> Measures:
-        """The measures of the plan."""
         return Measures.of(self._memory)
 
     def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:

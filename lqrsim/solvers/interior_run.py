@@ -141,7 +141,6 @@ class InteriorRun:
         return RunResult(status=Status.MAX_ITERATIONS, plan=plan, law=law, cost=cost, violation=violation)
 
     def without_multipliers(self) -> None:
-        """Set multipliers and penalties of the augmented Lagrangian to zero."""
         for multipliers in self._run.work.multipliers:
             multipliers.penalty, multipliers.values[...] = 0.0, 0.0
 

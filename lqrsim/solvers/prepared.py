@@ -132,10 +132,9 @@ class PreparedSolver(OneVersion):
             run.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and run.second_order:
             stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
+            _finder(run, plan, best).find()
             if _can_yield(self.problem):
-                _Yielding(run, plan, best).find()
                 return
-            _Neighbour(run, plan, best).find()
             # Another solve may need code that this solve did not need.
             InteriorPoint(stages, plan).run(
                 tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
@@ -199,13 +198,10 @@ class PreparedSolver(OneVersion):
         )
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
-            if run.second_order and _can_yield(problem):
-                point = _Yielding(run, _plan_of(start, best), best, self._closing)
-                result, ended = point.find(), point.ended
-            elif problem.constraints and run.second_order:
-                neighbour = _Neighbour(run, _plan_of(start, best), best, self._closing)
-                result, ended = neighbour.find(), neighbour.laps.ended
-                if neighbour.may_be_far:
+            if problem.constraints and run.second_order:
+                finder = _finder(run, _plan_of(start, best), best, self._closing)
+                result, ended = finder.find(), finder.laps.ended
+                if finder.may_be_far:
                     best.consider(result)
                     result, ended = ConstrainedRun(run, Known()).run_to_end(), time.perf_counter()
             else:
@@ -217,7 +213,16 @@ class PreparedSolver(OneVersion):
         seconds = [iteration.seconds for iteration in budget.log]
         self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
         best.consider(result)
-        answer = self._answer(problem, best, result, budget, clock, best.rolling_out + sum(seconds))
+        # The next solve overwrites this memory.
+        states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
+        answer = Replan(
+            status=result.status, detail=result.detail, improved=best.improved,
+            policy=compiled.policy_of(problem, gain, offset, states[:-1].copy()),
+            trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
+            violation=best.violation, cost_to_go=copy_of(best.cost_to_go), multipliers=best.multipliers,
+            goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
+            seconds=time.perf_counter() - clock, iterating=best.rolling_out + sum(seconds),
+        )  # fmt: skip
         run.give_back()  # this is skipped after an exception
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
@@ -239,20 +244,6 @@ class PreparedSolver(OneVersion):
         )
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return replace(plan, seconds=time.perf_counter() - clock)
-
-    def _answer(
-        self, problem: Problem, best: "_Best", result: RunResult, budget: Budget, clock: float, iterating: float
-    ) -> Replan:
-        # The next solve overwrites this memory.
-        states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
-        return Replan(
-            status=result.status, detail=result.detail, improved=best.improved,
-            policy=compiled.policy_of(problem, gain, offset, states[:-1].copy()),
-            trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
-            violation=best.violation, cost_to_go=copy_of(best.cost_to_go), multipliers=best.multipliers,
-            goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
-            seconds=time.perf_counter() - clock, iterating=iterating,
-        )  # fmt: skip
 
 
 def _check_fixed(problem: Problem) -> None:
@@ -303,8 +294,8 @@ def _unchanged(best: "_Best") -> RunResult:
     return RunResult(status=Status.TIME_LIMIT, plan=best.plan, law=best.law)
 
 
-class _Neighbour:
-    """Finds the constrained optimum next to a plan, by Newton steps with its active set or by the interior point.
+class _Finder:
+    """Finds the constrained optimum next to a plan, in time.
 
     Args:
       run: a run with the initial law and multipliers. best: the plan that the law leads to.
@@ -322,9 +313,27 @@ class _Neighbour:
         self._closing, self._budget = closing, run.budget
         self._allowed = run.settings.violation_tolerance(run.problem)
         self.laps, self.may_be_far, self._out_of_time = Laps(run.budget), False, False
+        for function in functions_of(run.problem):
+            function.forget()
 
     def find(self) -> RunResult:
         """Run until it converges or has to stop."""
+        raise NotImplementedError
+
+    def _late(self, seconds: float) -> bool:
+        """Whether work of this duration would end too late; if so, the solve ends."""
+        self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._budget.stop.deadline
+        return self._out_of_time
+
+    @property
+    def _unsolved(self) -> Status:
+        return Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
+
+
+class _Neighbour(_Finder):
+    """Newton steps with the active set of the plan, or the interior point."""
+
+    def find(self) -> RunResult:
         run, budget = self._run, self._budget
         if self._late(0.0):
             return _unchanged(self._best)
@@ -332,8 +341,6 @@ class _Neighbour:
             detail = "the policy that it begins with diverges"
             return replace(_unchanged(self._best), status=Status.NOT_FINITE, detail=detail)
         known = tuple(multipliers.values for multipliers in run.initial_guess.multipliers)
-        for function in functions_of(run.problem):
-            function.forget()
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
             self.laps.ended = time.perf_counter()
@@ -363,16 +370,11 @@ class _Neighbour:
 
         return active.run(self._run.final, watch, self._late)
 
-    def _late(self, seconds: float) -> bool:
-        """Whether work of this duration would end too late; if so, the solve ends."""
-        self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._budget.stop.deadline
-        return self._out_of_time
-
     def _result(self, active: ActiveSet, solved: bool) -> RunResult:
         """The rollout of the plan with a policy about it."""
-        problem, status = self._run.problem, Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
+        problem = self._run.problem
         if not np.isfinite(active.measures).all():
-            return replace(_unchanged(self._best), status=status, detail=raised_by(functions_of(problem)))
+            return replace(_unchanged(self._best), status=self._unsolved, detail=raised_by(functions_of(problem)))
         plan, gain, cost, values = active.carried_out()
         pairs = zip(problem.constraint_terms, values, strict=True)
         solved = solved and all(
@@ -380,18 +382,17 @@ class _Neighbour:
         )
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
-            status=Status.CONVERGED if solved else status, detail=detail, plan=plan,
+            status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
             law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values),
             multipliers=active.multipliers(),
         )  # fmt: skip
 
 
 def _can_yield(problem: Problem) -> bool:
-    """Whether a problem has constraints that may give way."""
     return any(term.yields for term in problem.constraint_terms)
 
 
-class _Yielding:
+class _Yielding(_Finder):
     """A solve in which constraints give way that the robot keeps by itself: limits of forces, which MuJoCo clips.
 
     After a push, no plan may keep them. A stiff servo whose target is held for a period cannot keep its force within
@@ -401,36 +402,23 @@ class _Yielding:
 
     The plan hardly moves from one solve to the next, and derivatives by MuJoCo take most of the time of an iteration.
     So those about the first plan serve for all steps that need not be shortened, and are computed anew at the end.
-
-    Arguments and `ended` are as in `_Neighbour`, of whose laps it is the last time.
     """
-
-    def __init__(self, run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
-        self._run, self._plan, self._best, self._closing = run, plan, best, closing
-        terms, owners = run.problem.constraint_terms, run.stages.owners
-        self._yields = (owners >= 0) & np.array([term.yields for term in terms])[owners]
-        self._allowed = run.settings.violation_tolerance(run.problem)
-        self.ended, self._late = time.perf_counter(), False
 
     def find(self) -> RunResult:
         """The plan that is found, carried out with feedback, unless it is worse than the best."""
-        run, budget, clock = self._run, self._run.budget, time.perf_counter()
-        for function in functions_of(run.problem):
-            function.forget()
+        run, budget, clock = self._run, self._budget, time.perf_counter()
+        terms, owners = run.problem.constraint_terms, run.stages.owners
+        self._yields = (owners >= 0) & np.array([term.yields for term in terms])[owners]
         with np.errstate(all="ignore"):
             point = InteriorPoint(run.stages, self._plan, STRONGER, price=self._price, oldest=OLDEST)
-            self.ended = time.perf_counter()
-            model_seconds, laps = self.ended - clock, Laps(budget)
+            self.laps.ended = time.perf_counter()
+            model_seconds = self.laps.ended - clock
 
             def watch(measures: Measures, seconds: float) -> bool:
-                measures.record(laps, seconds=seconds)
-                self.ended = time.perf_counter()
-                # The next iteration may compute the derivatives anew.
-                self._late = self.ended + model_seconds + seconds + self._closing >= budget.stop.deadline
-                return self._late
+                measures.record(self.laps, seconds=seconds)
+                return self._late(model_seconds + seconds)  # the next iteration may compute the derivatives anew
 
-            self._late = self.ended + model_seconds + self._closing >= budget.stop.deadline
-            if self._late or not budget.left:
+            if self._late(model_seconds) or not budget.left:
                 return replace(_unchanged(self._best), status=self._unsolved)
             result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
             law = compiled.law_about(*result.plan, result.gain.copy())
@@ -449,11 +437,6 @@ class _Yielding:
         answer = RunResult(status=status, detail=detail, plan=plan, law=law, cost=reached, violation=violation)
         self._best.adopt(answer)
         return answer
-
-    @property
-    def _unsolved(self) -> Status:
-        """The status of a solve that has not converged."""
-        return Status.TIME_LIMIT if self._late else Status.MAX_ITERATIONS
 
     def _price(self, sizes: Sizes) -> Array:
         self._prices = np.where(self._yields, PRICE * sizes.cost / sizes.rows, np.inf)
@@ -474,6 +457,10 @@ class _Yielding:
         short = np.where(stages.live & self._yields, np.maximum(-values, 0.0), 0.0)
         paid = float((short * np.where(self._yields, self._prices, 0.0)).sum())
         return not np.isfinite(plan.states).all(), self._missed(plan), cost + paid
+
+
+def _finder(run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> _Finder:
+    return (_Yielding if _can_yield(run.problem) else _Neighbour)(run, plan, best, closing)
 
 
 class _Best:

@@ -38,7 +38,6 @@ class Settings:
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
 
     def options(self, start: InitialGuess) -> dict[str, object]:
-        """The options that a solution records."""
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
 
 
@@ -78,7 +77,6 @@ class SmootherSettings(Settings):
         return self.constraint_tolerance or (MISSED if self.second_order(problem) else SPARED)
 
     def final(self, problem: Problem) -> float:
-        """Tolerance of the optimality."""
         default = ROUGH if not self.second_order(problem) else FINE if has_curvature(problem) else LEARNED
         return self.tolerance or default
 

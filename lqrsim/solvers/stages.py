@@ -173,7 +173,6 @@ class Stages:
         return stages
 
     def give_back(self) -> None:
-        """Leave the memory to another solve."""
         _pool.give_back(self, self.problem)
 
     def prepare(self) -> None:
@@ -243,11 +242,9 @@ class Stages:
 
     @property
     def row_sizes(self) -> Array:
-        """(R,) typical sizes of the rows."""
         return self._sizes[0]
 
     def resize(self, sizes: Sizes) -> None:
-        """Use other typical sizes."""
         self.about.state_size[...], self.about.control_size[...] = sizes.states, sizes.controls
         self._sizes[...] = sizes.rows
 
@@ -281,14 +278,12 @@ class Stages:
 
     @functools.cached_property
     def interior(self) -> tuple[InteriorArrays, StructuredArray]:
-        """The same of an interior point."""
         active, memory = self.active_set
         crossover = {"active": active, "active_memory": memory}
         return zeros_of(InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(1, INTERIOR)
 
     @functools.cached_property
     def restoration(self) -> tuple[RestorationArrays, StructuredArray]:
-        """The same of a restoration."""
         return zeros_of(RestorationArrays, **self._lengths), np.zeros(1, RESTORATION)
 
 

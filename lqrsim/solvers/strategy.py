@@ -469,7 +469,6 @@ class Search:
             self._try(name, guess_from(best, name), refine)
 
     def grow_trees(self) -> None:
-        """Go on from ways through trees until one leads to a plan."""
         for seed, way in ways_by_trees(self._problem, self._budget.stop):
             self._try(f"trees of short plans, seed {seed}", way, from_states)
             if self.best[1].success:
@@ -505,7 +504,6 @@ class Search:
         return sorted(moving)
 
     def try_sinusoidal_controls(self) -> None:
-        """Solve from the most promising of some oscillating controls."""
         problem = self._problem
         runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
         chosen = choose(runs, self._threads)[0]
@@ -801,13 +799,11 @@ class Search:
         return ended
 
     def _solve_softly(self, name: str, soft: Problem, begin: InitialGuess, most: int) -> RunResult:
-        """Plan for softer contacts from a policy."""
         run = self._another(begin, soft)
         with soft.dynamics.solving(self._threads), run.budget.limited(most):
             return self._keep_softer(name, run, refine(run, Known()))
 
     def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
-        """Keep a plan for softer contacts as a candidate."""
         self._softer.append(run.candidate(f"contacts of softness {name}", result))
         return result
 
@@ -833,7 +829,6 @@ class Search:
         return True
 
     def solution(self) -> Solution:
-        """The best result as a Solution."""
         chosen, result = self.best
         problem, settings, stop = self._problem, self._settings, self._budget.stop
         if not np.isfinite(result.states).all() and not result.success:
