@@ -165,7 +165,7 @@ def test_nothing_beside_a_plan_that_is_called_optimal_is_cheaper(seed: int) -> N
     descent = Descent(problem, modes, begin, 1e-6, Budget(50, Stop()))
     assert descent.run() is ls.Status.CONVERGED
     pulls, limits = descent.switch_multipliers()
-    parts = surroundings(problem, descent.model, descent.plan, pulls)
+    parts = surroundings(descent.model, descent.plan, pulls)
     assert parts.pressed > 0
     assert parts.across < 1e-6
 

@@ -308,11 +308,8 @@ def remedy_of(
 def _flat_controls(problem: Problem, result: RunResult) -> list[str]:
     """The controls in which the stage cost is not curved at the first step of a plan."""
     n, names = result.states.shape[1], problem.control_coordinates.names
-    joint = n + len(names)
-    hessian, gradient = np.zeros((joint, joint)), np.zeros(joint)
-    state, control = result.states[0].copy(), result.controls[0].copy()
     stage = compiled.arguments(problem).stage
-    compiled.costs_module(problem).cost_quadratic(state, control, 0, stage, hessian, gradient)
+    _, _, hessian = compiled.quadratic_at(problem, stage, result.states[0], result.controls[0], 0)
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 

@@ -10,8 +10,8 @@ one of the attempts of `constrained.py`, among obstacles and with the dynamics o
 `kernels/augmented_lagrangian.py`.
 """
 
-import dataclasses
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -45,12 +45,12 @@ def by_multipliers(run: SolveRun) -> RunResult:
         if result.success or run.budget.over:
             return run.certified(result)
         # Multipliers of another problem do not help here.
-        run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
+        run = _again(run, run.problem, replace(run.initial_guess, multipliers=()))
     result = run.run_to_end()
     if run.budget.over:
         if result.success and not run.work.keeps(run.work.constraint_values(result.plan)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
-            result = dataclasses.replace(result, status=status, detail="before the constraints could be met")
+            result = replace(result, status=status, detail="before the constraints could be met")
     elif result.success:
         result = meet_constraints(run, result)
     else:
@@ -65,7 +65,7 @@ def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> Solv
 def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: int = STALE) -> RunResult:
     """Continue from the result without the constraints or, without one, from another solution's multipliers.
 
-    `stale` is the number of undamped iterations without progress after which damped iterations follow.
+    After `stale` undamped iterations without progress damped iterations follow.
     """
     lagrangian = AugmentedLagrangian(run)
     if unconstrained is None:
@@ -79,7 +79,7 @@ def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: i
         lagrangian.start()
         run.weigh_noise(unconstrained.plan)
         plan = Motion(*map(np.copy, unconstrained.plan))  # the arrays will be overwritten
-        unconstrained = dataclasses.replace(unconstrained, plan=plan)
+        unconstrained = replace(unconstrained, plan=plan)
     undamped = _undamped(run, lagrangian, known=unconstrained is None, patience=stale)
     if undamped.success or not run.settings.safeguard or run.budget.over:
         return undamped
@@ -96,7 +96,7 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
     if not (run.settings.safeguard and any(cost.contact_curvature for cost in problem.obstacle_costs)):
         return run, result
     plain = problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, 0.0))
-    without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))
+    without = _again(run, plain, replace(run.initial_guess, prior=None))
     with budget.without_costs():
         first = without.run_to_end()
         if first.success and not budget.over:
@@ -104,8 +104,8 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
     if not first.success or budget.over:
         # Only the constraint values of the plan are known. The certificate provides the cost.
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if first.success else first.status
-        return run, dataclasses.replace(first, status=status, final=not first.success, values={})
-    initial_guess = dataclasses.replace(
+        return run, replace(first, status=status, final=not first.success, values={})
+    initial_guess = replace(
         run.initial_guess, gain=first.law.gain.copy(), offset=first.law.offset.copy(), trajectory=None, prior=None,
         cost_to_go=first.values.get("cost_to_go"), multipliers=first.multipliers,
     )  # fmt: skip
@@ -117,9 +117,9 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
 
 
 def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, patience: int) -> RunResult:
-    """Undamped iterations, with updates of the multipliers, which may be `known` from another solution at first.
+    """Undamped iterations, with updates of the multipliers, until `patience` iterations make no progress.
 
-    They end after `patience` iterations without progress.
+    The multipliers may be `known` from another solution at first.
     """
     work, log, most = run.work, run.budget.log, run.settings.gap_tolerance
     rows = np.zeros(min(ITERATIONS, max(run.budget.left, 1)), LOG)
@@ -151,9 +151,9 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
     result = run.result(ending)
     detail = result.detail or ("" if result.success else f"with constraints; {lagrangian.worst()}")
     if result.success and not lagrangian.solved:
-        result = dataclasses.replace(result, status=Status.MAX_ITERATIONS)
+        result = replace(result, status=Status.MAX_ITERATIONS)
         detail = f"{done} iterations with constraints: {lagrangian.worst()}"
-    return dataclasses.replace(result, detail=detail, multipliers=lagrangian.multipliers())
+    return replace(result, detail=detail, multipliers=lagrangian.multipliers())
 
 
 def _damped(
@@ -215,7 +215,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
         if ending.success and lagrangian.solved:
             if not rough:
                 result = run.damped_result(ending, ending.status, why)
-                return dataclasses.replace(result, multipliers=lagrangian.multipliers())
+                return replace(result, multipliers=lagrangian.multipliers())
             if not budget.over:
                 rough = False
                 continue
@@ -231,7 +231,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
     if budget.stop.due:
         status = Status.TIME_LIMIT
     result = run.damped_result(ending, status, detail)
-    return dataclasses.replace(result, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
+    return replace(result, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
 
 
 def _forces(multipliers: ConstraintMultipliers, values: Array) -> Array:
@@ -240,13 +240,6 @@ def _forces(multipliers: ConstraintMultipliers, values: Array) -> Array:
     least = -multipliers.price if multipliers.term.equality else 0.0
     forces = np.clip(multipliers.values - multipliers.penalty * acting, least, multipliers.price)
     return np.where(np.isinf(values), 0.0, forces)
-
-
-def _added(multipliers: ConstraintMultipliers, values: Array) -> float:
-    """The augmented Lagrangian's terms in the cost."""
-    known, penalty, forces = multipliers.values, multipliers.penalty, _forces(multipliers, values)
-    acting = np.where(np.isinf(values), 0.0, values)
-    return float((forces @ (2 * (known - penalty * acting) - forces) - known @ known) / (2 * penalty))
 
 
 def _missed(multipliers: ConstraintMultipliers, values: Array) -> float:
@@ -291,15 +284,11 @@ class AugmentedLagrangian:
 
     def evaluate(self, plan: Motion) -> None:
         self._plan, stated = plan, self._work.constraint_values(plan)
-        self.kept = self._work.keeps(stated)
-        excess = [
-            violation_of(multipliers.term, values) - multipliers.term.equality * self._allowed
-            for multipliers, values in zip(self._constraints, stated, strict=True)
-        ]
-        self.nearly = not self.kept and max(excess, default=0.0) <= 0
-        self._values = [
-            values.ravel() - multipliers.margin for multipliers, values in zip(self._constraints, stated, strict=True)
-        ]
+        self.kept, self._values, excess = self._work.keeps(stated), list[Array](), [0.0]
+        for multipliers, values in zip(self._constraints, stated, strict=True):
+            self._values.append(values.ravel() - multipliers.margin)
+            excess.append(violation_of(multipliers.term, values) - multipliers.term.equality * self._allowed)
+        self.nearly = not self.kept and max(excess) <= 0
         self.solved = all(
             _missed(multipliers, values) <= self._tolerance[multipliers.term.equality]
             for multipliers, values in self._each()
@@ -336,7 +325,12 @@ class AugmentedLagrangian:
 
     def added(self) -> float:
         """The augmented Lagrangian's terms in the cost of the plan."""
-        return sum(_added(multipliers, values) for multipliers, values in self._each())
+        added = 0.0
+        for multipliers, values in self._each():
+            known, penalty, forces = multipliers.values, multipliers.penalty, _forces(multipliers, values)
+            acting = np.where(np.isinf(values), 0.0, values)
+            added += float((forces @ (2 * (known - penalty * acting) - forces) - known @ known) / (2 * penalty))
+        return added
 
     def multipliers(self) -> tuple[Multipliers, ...]:
         """The multipliers for a solution, updated for the last plan."""

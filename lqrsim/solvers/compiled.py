@@ -196,6 +196,18 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     return costs
 
 
+def cost_of(problem: Problem, states: Array, controls: Array) -> float:
+    """Stage and final costs of one trajectory, states (T+1, n) and controls (T, m)."""
+    return float(costs_of(problem, states[None], controls[None])[0])
+
+
+def quadratic_at(problem: Problem, cost: CostModel, x: Array, u: Array, step: int) -> tuple[float, Array, Array]:
+    """A cost at one step: its value, gradient (n+m,) and Hessian (n+m, n+m)."""
+    gradient, hessian = np.zeros(len(x) + len(u)), np.zeros((len(x) + len(u),) * 2)
+    value = costs_module(problem).cost_quadratic(x.copy(), u.copy(), step, cost, hessian, gradient)
+    return value, gradient, hessian
+
+
 class CostsByStep:
     """Evaluates a problem's costs one step at a time."""
 
@@ -217,11 +229,7 @@ class CostsByStep:
 
 
 def rollout(problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None) -> Motion:
-    """Roll out the policy u_t = gain_t x + offset_t from a state, by the model.
-
-    Gains (T, m, n), offsets (T, m). `dt` is the control period in seconds,
-    by default the problem's.
-    """
+    """Roll out the policy u_t = gain_t x + offset_t from a state; gains (T, m, n), offsets (T, m)."""
     model = arguments(problem)
     model = model if dt is None else model._replace(dt=float(dt))
     steps = len(gain)

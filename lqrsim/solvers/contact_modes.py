@@ -18,7 +18,9 @@ The plan is optimal if neither is possible; `optimality_in_mode` and `surroundin
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,8 +54,7 @@ class OutOfTime(Exception):
     """No time is left for a descent and its certificate."""
 
 
-@dataclass(frozen=True, eq=False)
-class CostedPlan:
+class CostedPlan(NamedTuple):
     """A plan and its cost: states (T+1, n) and controls (T, m)."""
 
     states: Array
@@ -73,27 +74,21 @@ class ModeModel:
     """
 
     def __init__(self, problem: Problem, modes: ContactModes, plan: CostedPlan) -> None:
-        self.check_time = modes.check_time
+        self.check_time, self._problem, self._plan = modes.check_time, problem, plan
         states, controls, steps = plan.states, plan.controls, problem.steps
         n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
         self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
         self.points, self.motions = np.hstack([states[:-1], controls]), np.empty((steps, n + m, size))
-        data, costs = compiled.arguments(problem), compiled.costs_module(problem)
-
-        def quadratic(x: Array, u: Array, t: int, cost: object) -> tuple[Array, Array]:
-            hessian, gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
-            costs.cost_quadratic(x.copy(), u.copy(), t, cost, hessian, gradient)
-            return hessian, gradient
-
-        self.stages = [quadratic(states[t], controls[t], t, data.stage) for t in range(steps)]
-        last, ends = quadratic(states[steps], np.zeros(m), steps, data.final)
-        self.last = last[:n, :n], ends[:n]
+        data, quadratic = compiled.arguments(problem), partial(compiled.quadratic_at, problem)
+        self.stages = [quadratic(data.stage, states[t], controls[t], t)[1:] for t in range(steps)]
+        _, slope, curve = quadratic(data.final, states[steps], np.zeros(m), steps)
+        self.last = slope[:n], curve[:n, :n]
         space = problem.control_coordinates
         self.low, self.high = (np.broadcast_to(limit, controls.shape) - controls for limit in (space.low, space.high))
         self.gain = self._gains()
         self.hessian, self.gradient, reached = np.zeros((size, size)), np.zeros(size), np.zeros((n, size))
         slopes = []
-        for t, (period, (hessian, gradient)) in enumerate(zip(self.periods, self.stages, strict=True)):
+        for t, (period, (gradient, hessian)) in enumerate(zip(self.periods, self.stages, strict=True)):
             both = self.motions[t]
             both[:n], both[n:] = reached, self.gain[t] @ reached
             both[n:, t * m : (t + 1) * m] += np.eye(m)
@@ -101,9 +96,9 @@ class ModeModel:
             self.gradient += both.T @ gradient
             slopes.append(period.slopes @ both)
             reached = period.jacobian @ both
-        self.hessian += reached.T @ self.last[0] @ reached
+        self.hessian += reached.T @ self.last[1] @ reached
         self.hessian = 0.5 * (self.hessian + self.hessian.T)
-        self.gradient += reached.T @ self.last[1]
+        self.gradient += reached.T @ self.last[0]
         self.slopes, self.responses = np.vstack(slopes), self.motions[:, n:].reshape(size, size)
         self.values = np.concatenate([period.switches.values for period in self.periods])
         self.sides = np.where(self.values < 0, -1.0, 1.0)
@@ -112,11 +107,11 @@ class ModeModel:
 
     def _gains(self) -> Array:
         """Gains (T, m, n) of iLQR; zero for controls at their limits."""
-        n = len(self.last[1])
-        ahead, gains = self.last[0], np.zeros((len(self.periods), self.stages[0][0].shape[0] - n, n))
+        n, ahead = len(self.last[0]), self.last[1]
+        gains = np.zeros((*self.low.shape, n))
         for t in reversed(range(len(self.periods))):
             jacobian = self.periods[t].jacobian
-            hessian = self.stages[t][0] + jacobian.T @ ahead @ jacobian
+            hessian = self.stages[t][1] + jacobian.T @ ahead @ jacobian
             free = np.flatnonzero((self.low[t] < 0) & (self.high[t] > 0))
             if len(free):
                 gains[t, free] = -np.linalg.solve(hessian[np.ix_(n + free, n + free)], hessian[n + free, :n])
@@ -125,9 +120,28 @@ class ModeModel:
             ahead = 0.5 * (ahead + ahead.T)
         return gains
 
+    def changed(self, change: Array) -> CostedPlan:
+        """The plan after a change (T m,) of the offsets of its policy."""
+        controls = self._plan.controls + change.reshape(self._plan.controls.shape)
+        return rolled_out(self._problem, self._plan.states, controls, self.gain)
 
-@dataclass(frozen=True, eq=False)
-class ModeStep:
+    def beyond(self, which: int) -> CostedPlan | None:
+        """The cheapest plan across a switch, on a ray that crosses it by the least change; None without such a ray.
+
+        The ray begins where a control has changed by half of SMALL, and doubles that RAY times.
+        """
+        toward = scipy.linalg.solve(self.hessian, self.slopes[which], assume_a="pos")
+        reach = np.minimum(self.high - self.low, 1e3).ravel()
+        depth = SMALL * float(self.slopes[which] @ toward) / max(float(np.abs(toward / reach).max()), 1e-300)
+        steps = [minimize(self, self.hessian, across=which, depth=part * depth) for part in (0.5, 1.0)]
+        near, far = (None if step is None else step.change for step in steps)
+        if near is None or far is None:
+            return None
+        changes = (near + (2.0**doubled - 1) * (far - near) for doubled in range(RAY + 1))
+        return min(map(self.changed, changes), key=lambda one: one.cost)
+
+
+class ModeStep(NamedTuple):
     """A minimiser of the model, (T m,), and the decrease that it predicts.
 
     Also the multipliers of the switches, (K,), and of the control limits, (T, m), negative for upper limits.
@@ -209,8 +223,8 @@ def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: Mode
     Args:
       earlier: linearised plans, the latest last. step: the step whose multipliers are used.
     """
-    n = len(model.last[1])
-    lacking, costate, signed = np.zeros_like(model.hessian), model.last[1], model.sides * step.multipliers
+    n = len(model.last[0])
+    lacking, costate, signed = np.zeros_like(model.hessian), model.last[0], model.sides * step.multipliers
     for t in reversed(range(len(model.periods))):
         period, pull = model.periods[t], signed[model.first[t] : model.first[t + 1]]
         held = period.switches.names[pull != 0]
@@ -232,7 +246,7 @@ def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: Mode
                     bend += np.outer(residual, residual) / along
             where, before = points[t], rate
         lacking += model.motions[t].T @ bend @ model.motions[t]
-        rate = model.stages[t][1] + rate
+        rate = model.stages[t][0] + rate
         rate[n:] -= step.limits[t]
         costate = rate[:n] + model.gain[t].T @ rate[n:]
     return 0.5 * (lacking + lacking.T)
@@ -303,7 +317,7 @@ class Descent:
         for halvings in range(HALVINGS):
             share = 0.5**halvings
             change, most = share * step.change, cost - ENOUGH * share * step.decrease
-            trial = changed(self._problem, self.plan, model, change)
+            trial = model.changed(change)
             if not trial.cost < most:
                 trial = self._pushed_back(trial, change, step.multipliers)
             if trial.cost < most:
@@ -321,7 +335,7 @@ class Descent:
                 break
             factor = scipy.linalg.cho_factor(self.model.hessian) if factor is None else factor
             change = change + self._push(factor, rows, missing)
-            trial = changed(self._problem, self.plan, self.model, change)
+            trial = self.model.changed(change)
         return trial
 
     def _missing(
@@ -359,7 +373,7 @@ class Descent:
     def _crossed(self, step: ModeStep) -> CostedPlan | None:
         """A cheaper plan across a switch that the present plan is pressed against; None if there is none."""
         for which in np.argsort(-step.multipliers)[: np.count_nonzero(step.multipliers)].tolist():
-            best = beyond(self._problem, self.plan, self.model, which)
+            best = self.model.beyond(which)
             if best is not None and best.cost < self.plan.cost - self._tolerance * abs(self.plan.cost):
                 return best
         return None
@@ -372,6 +386,11 @@ class Descent:
         periods = zip(self.model.periods, parts, strict=True)
         by_period = [Switches(period.switches.names, part) for period, part in periods]
         return by_period, np.zeros_like(self.model.low) if step is None else step.limits
+
+    def result(self, status: Status, **others: Any) -> RunResult:
+        plan = Motion(self.plan.states, self.plan.controls)
+        law = compiled.law_about(*plan, self.model.gain)
+        return RunResult(status=status, plan=plan, law=law, cost=self.plan.cost, violation=0.0, **others)
 
     def _go_to(self, plan: CostedPlan) -> None:
         count = self.model.points.shape[1] - 1
@@ -390,33 +409,11 @@ def linearized(problem: Problem, modes: ContactModes, state: Array, control: Arr
     return Period(end, jacobian, switches, np.zeros((0, jacobian.shape[1])))
 
 
-def changed(problem: Problem, plan: CostedPlan, model: ModeModel, change: Array) -> CostedPlan:
-    """The plan after a change (T m,) of the offsets of its policy."""
-    return rolled_out(problem, plan.states, plan.controls + change.reshape(plan.controls.shape), model.gain)
-
-
 def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> CostedPlan:
     """The plan of the policy with these gains about these states (T+1, n) and controls (T, m)."""
     states, controls = compiled.rollout(problem, *compiled.law_about(states, controls, gain), states[0])
-    cost = compiled.costs_of(problem, states[None], controls[None])[0] if np.isfinite(states).all() else np.inf
-    return CostedPlan(states, controls, float(cost))
-
-
-def beyond(problem: Problem, plan: CostedPlan, model: ModeModel, which: int) -> CostedPlan | None:
-    """The cheapest plan across a switch, on a ray that crosses it by the least change; None if it cannot be crossed.
-
-    The ray begins where a control has changed by half of SMALL, and doubles that RAY times.
-    """
-    toward = scipy.linalg.solve(model.hessian, model.slopes[which], assume_a="pos")
-    reach = np.minimum(model.high - model.low, 1e3).ravel()
-    depth = SMALL * float(model.slopes[which] @ toward) / max(float(np.abs(toward / reach).max()), 1e-300)
-    steps = [minimize(model, model.hessian, across=which, depth=part * depth) for part in (0.5, 1.0)]
-    near, far = (None if step is None else step.change for step in steps)
-    if near is None or far is None:
-        return None
-    changes = (near + (2.0**doubled - 1) * (far - near) for doubled in range(RAY + 1))
-    plans = [changed(problem, plan, model, change) for change in changes]
-    return min(plans, key=lambda one: one.cost)
+    cost = compiled.cost_of(problem, states, controls) if np.isfinite(states).all() else np.inf
+    return CostedPlan(states, controls, cost)
 
 
 def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
@@ -442,27 +439,18 @@ def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
     except OutOfTime:
         if descent is None or descent.plan is plan:
             return None
-        plan = Motion(descent.plan.states, descent.plan.controls)
-        result = RunResult(
-            status=Status.TIME_LIMIT, detail="no time was left for a certificate within its contact modes", plan=plan,
-            law=compiled.law_about(*plan, descent.model.gain), cost=descent.plan.cost, violation=0.0,
-        )  # fmt: skip
-        return run.certified(result)
+        detail = "no time was left for a certificate within its contact modes"
+        return run.certified(descent.result(Status.TIME_LIMIT, detail=detail))
 
 
 def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, status: Status) -> RunResult:
     """The result of a descent that ended with this status, and its certificate."""
-    problem, plan, gain = run.problem, descent.plan, descent.model.gain
-    law = compiled.law_about(plan.states, plan.controls, gain)
-    multipliers, limits = descent.switch_multipliers()
-    optimality, value = optimality_in_mode(problem, modes, plan, gain, multipliers, limits)
-    motion = Motion(plan.states, plan.controls)
-    result = RunResult(
-        status=Status.STALLED, plan=motion, law=law, cost=plan.cost, violation=0.0, values={"cost_to_go": value}
-    )
+    plan, (multipliers, limits) = descent.plan, descent.switch_multipliers()
+    optimality, value = optimality_in_mode(run.problem, modes, plan, descent.model.gain, multipliers, limits)
+    result = descent.result(Status.STALLED, values={"cost_to_go": value})
     certificate = run.certified(result).certificate
     assert certificate is not None
-    contacts = surroundings(problem, descent.model, plan, multipliers)
+    contacts = surroundings(descent.model, plan, multipliers)
     certificate = replace(certificate, optimality=optimality, contacts=contacts)
     detail = f"within its contact modes, against {contacts.pressed} switches"
     if status is Status.CONVERGED:
@@ -491,16 +479,14 @@ def optimality_in_mode(
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]
-    data, costs, space = compiled.arguments(problem), compiled.costs_module(problem), problem.control_coordinates
-    joint, rate = np.zeros((n + m, n + m)), np.zeros(n + m)
-    cost = costs.cost_quadratic(states[steps].copy(), np.zeros(m), steps, data.final, joint, rate)
-    ahead, costate, lagrangian, decrease = joint[:n, :n].copy(), rate[:n].copy(), rate[:n].copy(), 0.0
+    data, space = compiled.arguments(problem), problem.control_coordinates
+    cost, rate, joint = compiled.quadratic_at(problem, data.final, states[steps], np.zeros(m), steps)
+    ahead, costate, lagrangian, decrease = joint[:n, :n].copy(), rate[:n], rate[:n], 0.0
     hessians, slopes, constants = [ahead], [costate], [cost]
     for t in reversed(range(steps)):
-        x, u = states[t].copy(), controls[t].copy()
-        period, hessian, gradient = linearized(problem, modes, x, u), np.zeros((n + m, n + m)), np.zeros(n + m)
-        cost += costs.cost_quadratic(x, u, t, data.stage, hessian, gradient)
-        switches = period.switches
+        u, period = controls[t], linearized(problem, modes, states[t], controls[t])
+        value, gradient, hessian = compiled.quadratic_at(problem, data.stage, states[t], u, t)
+        cost, switches = cost + value, period.switches
         pull = np.nan_to_num(multipliers[t].at(switches.names))
         decrease += float(pull @ np.abs(switches.values))
         signed = np.where(switches.values < 0, -pull, pull)
@@ -521,12 +507,10 @@ def optimality_in_mode(
     return decrease / max(abs(plan.cost), 1e-300), Quadratic(hessian, slope - bent, constant)
 
 
-def surroundings(
-    problem: Problem, model: ModeModel, plan: CostedPlan, multipliers: Sequence[Switches]
-) -> ContactCertificate:
+def surroundings(model: ModeModel, plan: CostedPlan, multipliers: Sequence[Switches]) -> ContactCertificate:
     """The true cost near a plan: across each switch that the plan is pressed against, and at random samples."""
     pressed = np.flatnonzero(np.concatenate([pull.values for pull in multipliers]) > 0).tolist()
-    plans = [beyond(problem, plan, model, which) for which in pressed]
+    plans = map(model.beyond, pressed)
     cheapest = min((crossed.cost for crossed in plans if crossed is not None), default=np.inf)
     draws, reach = np.random.default_rng(0), np.minimum(model.high - model.low, 1e3)
     factor, lowest = scipy.linalg.cholesky(model.hessian, lower=True), np.inf
@@ -534,7 +518,7 @@ def surroundings(
         change = scipy.linalg.solve_triangular(factor.T, draws.standard_normal(len(factor)), lower=False)
         change = change.reshape(reach.shape)
         change *= SMALL / np.abs(change / reach).max()
-        lowest = min(lowest, changed(problem, plan, model, change.ravel()).cost)
+        lowest = min(lowest, model.changed(change.ravel()).cost)
     size = max(abs(plan.cost), 1e-300)
     return ContactCertificate(
         pressed=len(pressed), across=(plan.cost - cheapest) / size, sampled=(plan.cost - lowest) / size,

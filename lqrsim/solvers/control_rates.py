@@ -93,7 +93,7 @@ def _gains(
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
     guess = InitialGuess(gain, controls, multipliers=multipliers)
     run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
-    run.work.set_best(Motion(states, controls), float(compiled.costs_of(problem, states[None], controls[None])[0]))
+    run.work.set_best(Motion(states, controls), compiled.cost_of(problem, states, controls))
     with problem.dynamics.quiet():
         if np.isfinite(run.linearize_about_plan()):
             gain = run.work.arrays.policy.gain.copy()

@@ -57,6 +57,7 @@ _STATUS = {getattr(declarations, status.name): status for status in Status if ha
     declarations.TIMED_OUT: Status.TIME_LIMIT,
     declarations.IN_VALLEY: Status.MAX_ITERATIONS,
 }
+_FAILURES = (declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE, declarations.RISK_TOO_HIGH)
 _DETAILS = {
     declarations.NO_START: "rollout of the initial controls",
     declarations.CYCLING: "the iterations repeat themselves",
@@ -75,7 +76,7 @@ ROUNDING = 1e-9  # relative difference of costs below which two plans are equall
 
 @dataclass(frozen=True)
 class Ending:
-    """The way in which iterations ended: the kernel's outcome, and its texts for users."""
+    """The way in which iterations ended, with its texts for users."""
 
     outcome: int  # in `kernels/declarations.py`
     done: int = 0  # total number of iterations, including earlier ones
@@ -94,9 +95,7 @@ class Ending:
     @property
     def pass_failed(self) -> bool:
         """Whether a pass failed in a further iteration."""
-        return self.outcome in (
-            declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE, declarations.RISK_TOO_HIGH
-        )  # fmt: skip
+        return self.outcome in _FAILURES
 
     def detail(self, steps: int) -> str:
         """Text with the step at which it ended, of that many steps, and the exception of a user's function."""
@@ -176,10 +175,7 @@ class SolveRun:
         cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
         entry: str = "smoother",
     ) -> "SolveRun":  # fmt: skip
-        """A run, if possible in memory that an earlier solve gave back.
-
-        The run overwrites the result of the earlier solve, which must have been copied.
-        """
+        """A run, if possible in memory that an earlier solve gave back, whose result it overwrites."""
         wanted = entry, compiled.core(problem, settings.form), problem.steps
         run = None
         if settings.first_pass == "forward":
@@ -286,11 +282,7 @@ class SolveRun:
         self._loop(*self._arguments(0, 0, self._rows))
 
     def checked_ending(self) -> Ending:
-        """The ending; NOT_FINITE if a function is not finite at the start, which the detail then names.
-
-        Raises:
-          InputError: there is such a function, and the solve is attentive; see `Stop`.
-        """
+        """The ending. If a function is not finite at the start: NOT_FINITE, or InputError if the solve is attentive."""
         first, ending = self._rows["cost"][: min(self._row, 1)], self.ending
         if not np.isfinite(first).all() or (not len(first) and ending.status is Status.NOT_FINITE):
             try:
@@ -302,10 +294,9 @@ class SolveRun:
         return ending
 
     def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0, patient: bool = False) -> RunResult:
-        """Newton's method from the best plan so far; `added` is the part of its cost from the constraints.
+        """Newton's method from the best plan so far; for `added` and `least` see `Workspace.begin_descent`.
 
-        What it promises is relative to the cost, or to `least` if that is more. If no other method can follow, it is
-        `patient`: it takes short steps, too.
+        If no other method can follow, it is `patient`: it takes short steps, too.
         """
         ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.final, added=added, least=least)
         status = ending.status
@@ -346,10 +337,7 @@ class SolveRun:
         return self.damped_result(damped, status, detail)
 
     def damped(self, *, added: float = 0.0, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
-        """Damped iterations from the best plan so far; see `kernels/descent.py`.
-
-        `added` is the constraints' share of its cost; the tolerances of cost and gap are at least `least`.
-        """
+        """Damped iterations from the best plan so far, with tolerances of cost and gap of at least `least`."""
         return self.descend(DAMPED_STEPS, max(self.rough, least[0]), least[1], added=added)
 
     def descend(
@@ -367,10 +355,8 @@ class SolveRun:
         return self.checked_ending()
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
-        """Run more iterations, in separate rows. A prior no longer acts.
-
-        With constraints the least cost is no measure, and a rollout of lower cost is no better plan.
-        """
+        """Run more iterations, in separate rows. A prior no longer acts."""
+        # With constraints the least cost is no measure, and a rollout of lower cost is no better plan.
         self.work.memory["watched"], self.work.memory["plan_cost"] = 0.0, -np.inf
         begin, again = len(self.budget.log), partial(self._arguments, again=True)
         ending = self._iterate(again, self.work.arrays.last, rows, first, last)
@@ -407,10 +393,7 @@ class SolveRun:
         return float(rows["optimality"][0])
 
     def fails_at(self, risk: float) -> int:
-        """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
-
-        Overwrites the arrays of the passes.
-        """
+        """The step at which a pass about the plan in memory fails with another risk, or -1; with noise only."""
         self.work.model.noise.risk[0] = risk
         *_, failed = self._loop(*self._linearize_arguments(np.full(1, np.nan, LOG)))
         self.work.model.noise.risk[0] = self.problem.risk
@@ -491,11 +474,10 @@ class SolveRun:
             certificate = replace(certificate, cost=self.expected_cost(result))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         result = replace(result, certificate=certificate, cost=cost, violation=violation)
-        if not wrong:
-            result = replace(result, certificate=replace(certificate, curvature=self.check_curvature(result).curvature))
+        curvature = Curvature.NOT_CHECKED if wrong else self.check_curvature(result).curvature
         self._release_stages()
         if not wrong:
-            return result
+            return replace(result, certificate=replace(certificate, curvature=curvature))
         if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
             return replace(result, status=Status.NOT_POSITIVE_DEFINITE)
         if result.status is Status.CONVERGED and not self.budget.left:  # where more iterations might have gone on
@@ -611,10 +593,8 @@ class SolveRun:
 
         Compiled code returns after each iteration if there is a callback, a deadline or a constraint to check, and
         otherwise after `ATTENTION` if the solve is attentive. The seconds of an iteration are averaged over the
-        iterations between two returns.
-
-        Args:
-          plan: what an iteration writes. rows: (any,) `LOG`, from `first` on; by default as many as are left.
+        iterations between two returns. An iteration writes `plan`; rows are written from `first` on, by default as many
+        as are left.
         """
         problem, budget, stop = self.problem, self.budget, self.budget.stop
         rows = np.zeros(max(budget.left, 1), LOG) if rows is None else rows
@@ -777,10 +757,9 @@ class Workspace:
         self.memory["plan_cost"] = cost
 
     def begin_descent(self, how: Descent, added: float = 0.0, least: float = 0.0) -> None:
-        """Begin steps from the best plan.
+        """Begin steps from the best plan; `added` is the constraints' share of its cost.
 
-        `added` is the constraints' share of its cost. Its optimality is relative to the cost, or to `least` if that is
-        more.
+        Its optimality is relative to the cost, or to `least` if that is more.
         """
         memory = self.memory
         memory["merit"], memory["least"] = memory["plan_cost"] + added, least
@@ -846,10 +825,7 @@ class Workspace:
         return max((violation_of(multipliers.term, numbers) for multipliers, numbers in pairs), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
-        """Whether a plan with these values keeps all constraints within their tolerance.
-
-        Elastic constraints, which have a price, count as kept.
-        """
+        """Whether a plan with these values keeps all constraints within their tolerance, or at their price."""
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
         pairs = zip(self.multipliers, values, strict=True)
         return self.priced or all(

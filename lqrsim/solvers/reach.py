@@ -68,11 +68,9 @@ def goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
 
 def _final_cost(problem: Problem, state: Array) -> tuple[float, Array, Array]:
     """The final cost, its gradient (n,) and its Hessian (n, n)."""
-    n, m = len(state), len(problem.nominal_control)
-    hessian, gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
-    final = compiled.arguments(problem).final
-    at = state.copy(), np.zeros(m), problem.steps
-    value = compiled.costs_module(problem).cost_quadratic(*at, final, hessian, gradient)
+    n, final = len(state), compiled.arguments(problem).final
+    no_control = np.zeros(len(problem.nominal_control))
+    value, gradient, hessian = compiled.quadratic_at(problem, final, state, no_control, problem.steps)
     return value, gradient[:n], hessian[:n, :n]
 
 

@@ -16,7 +16,6 @@ The budget of each start is `max_iterations`; all starts share one deadline (`bu
 """
 
 import contextlib
-import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Sequence
@@ -95,12 +94,10 @@ Finish = Callable[[SolveRun, Known], RunResult]
 
 
 def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
-    """Solve one problem; the solution can look at its plan between the knots.
-
-    The loops that a problem needs are nested here, the innermost first: each solves problems with the one before.
-    """
+    """Solve one problem; the solution can look at its plan between the knots."""
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
+    # The loops that a problem needs, the innermost first: each solves problems with the one before.
     solve_part: Callable[..., Solution] = partial(solve_fixed, stop=stop)
     if problem.duration is not None:
         solve_part = partial(solve_for_duration, solve=partial(solve_part, trees=False), stop=stop)
@@ -301,11 +298,9 @@ class Search:
         return self._finished[0]
 
     def make_attempts(self, *, trees: bool) -> None:
-        """Make all attempts in turn, as far as they are called for; `trees` if they may grow.
-
-        Some also solve problems with other dynamics, for which they set the number of threads themselves.
-        """
+        """Make all attempts in turn, as far as they are called for; `trees` if they may grow."""
         self.choose_start()
+        # Some also solve problems with other dynamics, for which they set the number of threads themselves.
         with self._problem.dynamics.solving(self._solving):
             if trees and self.may_go_on and self.is_barred:
                 self.grow_trees()
@@ -358,13 +353,10 @@ class Search:
             self._offer(run, self._finish(run))
 
     def _smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
-        """For an arm, say, whose every joint has a motor: if smoothing fails, also smooth from a line of states.
+        """For an arm, say, whose every joint has a motor: if smoothing fails, also from a line of states, if cheaper.
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
-
-        Returns:
-          The run itself, or that from the line if it is cheaper.
         """
         problem = self._problem
         driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
@@ -392,10 +384,9 @@ class Search:
         work, plans = self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in constant_controls(problem):
             missed = float(f"{work.violation(work.constraint_values(plan)):.2g}")
-            plans.append(
-                (missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control)
-            )
-        plans = [entry for entry in plans if np.isfinite(entry[:2]).all()]
+            cost = compiled.cost_of(problem, *plan)
+            if np.isfinite([missed, cost]).all():
+                plans.append((missed, cost, control))
         for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
             self._try(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
             if self.best[1].success or self._budget.stop.due:
@@ -577,9 +568,8 @@ class Search:
         return False
 
     def push_and_approach(self) -> None:
-        """Begin with motions that change states that miss their goal and that no control changes, as of a box.
-
-        These are pushes by one control at a time, and approaches to a body that nothing touches.
+        """Begin with motions that change states that miss their goal and that no control changes, as of a box: pushes
+        by one control at a time, and approaches to a body that nothing touches.
         """
         problem, before, places = self._problem, self.best[1], self._unmoved()
         self._still = before, places
@@ -587,7 +577,7 @@ class Search:
 
         def consider(name: str, begin: InitialGuess, plan: Motion) -> bool:
             """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
-            cost = float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0])
+            cost = compiled.cost_of(problem, *plan)
             if not (np.isfinite(cost) and reach.differ(plan, before, places)):
                 return False
             nearer = self._comes_nearer(plan)
@@ -671,13 +661,12 @@ class Search:
 
     @property
     def risked_too_much(self) -> bool:
-        """Whether the risk was too high for an intermediate plan."""
         too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
         return self._problem.risk > 0 and too_high and self.may_go_on
 
     def retry_without_risk(self) -> None:
         """Solve without risk, and continue from that plan."""
-        riskless = dataclasses.replace(self._problem, risk=0.0)
+        riskless = replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
         riskless_plan = finish(choose(runs, self._threads)[0], Known())
         if not riskless_plan.success or self._budget.stop.due:
@@ -702,8 +691,7 @@ class Search:
         problem, moved = self._problem, self._best_nearer
         begin = self.best[1] if moved is None else moved[1]
         self._soft = [
-            (name, dataclasses.replace(problem, dynamics=dynamics))
-            for name, dynamics in problem.dynamics.softened(begin.states)
+            (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
         ]
         if not self._soft:
             return
@@ -744,9 +732,8 @@ class Search:
     @property
     def is_beside_cheaper(self) -> bool:
         """Whether the best plan ended within its contact modes, though a plan beside it is cheaper."""
-        (run, best), contacts = self.best, None
-        if best.certificate is not None:
-            contacts = best.certificate.contacts
+        run, best = self.best
+        contacts = None if best.certificate is None else best.certificate.contacts
         if best.success or contacts is None or not self.may_go_on:
             return False
         return max(contacts.across, contacts.sampled) > run.final
@@ -771,12 +758,8 @@ class Search:
     ) -> RunResult | None:
         """Continue from these plans for each softness in turn, from fewer at each, and then for the true contacts.
 
-        Args:
-          plans: plans by the ends of their names. before: softnesses that they have passed. most: iterations at most
-            for the true contacts.
-
-        Returns:
-          The plan for the true contacts; None if no time is left for it.
+        The plans, by the ends of their names, have passed the softnesses `before`. Returns the plan for the true
+        contacts, after `most` iterations there at most; None if no time is left for it.
         """
         for name, problem in soft:
             most_soft = LOOK if len(plans) > 1 else SOFT
@@ -808,11 +791,7 @@ class Search:
         return result
 
     def _keep_modes(self, plan: RunResult) -> bool:
-        """Continue from a plan within its contact modes, in which it may end next to a jump or at a kink.
-
-        Returns:
-          Whether this is possible.
-        """
+        """Continue within the contact modes of a plan, where it may end next to a jump or at a kink, if possible."""
         from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
 
         run = self._another(guess_from(plan, "the best plan"))
@@ -853,13 +832,13 @@ class Search:
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
-        name = next((name for name, other in self._named if other is run), None)
-        if name is None:
-            return ""
-        return (
-            f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}:"
-            f" the trajectory of candidate {name!r}, a start to go on from"
-        )
+        for name, other in self._named:
+            if other is run:
+                return (
+                    f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}:"
+                    f" the trajectory of candidate {name!r}, a start to go on from"
+                )
+        return ""
 
     def _with_unmoved_states(self, result: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
@@ -908,8 +887,7 @@ class Search:
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
-        problem = self._problem if problem is None else problem
-        return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
+        return SolveRun(problem or self._problem, self._settings, initial_guess, self._start, self._budget.another())
 
     def _add(self, initial_guess: InitialGuess, name: str | None = None) -> SolveRun:
         """A run from another start that is one of the candidates."""
@@ -956,10 +934,7 @@ class Search:
 
     @property
     def is_poor(self) -> bool:
-        """Whether other starts are to be tried.
-
-        INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-        """
+        """Whether other starts are to be tried. INFEASIBLE is said of the problem, wherever the caller begins."""
         return self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
 
     @property
