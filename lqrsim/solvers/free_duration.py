@@ -12,7 +12,7 @@ rather shorten the duration. The duration of the whole is found from there.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -106,43 +106,61 @@ class DurationSearch:
         with stop.not_counting():  # compiling
             stages = Stages(stated)
             free = with_duration_state(problem)
-        routes, sketches = list(ways(stated, stages)), list[Sketch]()
+        routes, sketches, led = list(ways(stated, stages)), list[tuple[Candidate, bool]](), set[str]()
         spent = dict.fromkeys((way.name for way in routes), 0)
         for fraction, freed in SKETCHED:
             is_last = bool(sketches)
-            for way in [way for way in routes if way.name not in {draft.way for draft in sketches}]:
+            for way in [way for way in routes if way.name not in led]:
                 with stop.reporting("smooth"), stop.heeding():
                     draft = self._sketched(way, fraction, free if freed else None)
                     self._total += draft.iterations
                     spent[way.name] += draft.iterations
                     if np.isfinite(draft.cost):
-                        sketches.append(draft._replace(iterations=spent[way.name]))
+                        led.add(way.name)
+                        sketches.append((replace(draft, iterations=spent[way.name]), freed))
                 if stop.due:
                     return
             if is_last:
                 break
-        failed = spent.keys() - {draft.way for draft in sketches}
-        self.candidates += (
-            Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in routes if way.name in failed
-        )
-        for draft in sorted(sketches, key=lambda draft: draft.cost):
+        failed = (way for way in routes if way.name not in led)
+        self.candidates += (Candidate(way.name, np.inf, spent[way.name], None, way.over(stated)) for way in failed)
+        for draft, freed in sorted(sketches, key=lambda pair: pair[0].cost):
             if stop.due:
                 return
-            if self.best is not None and draft.free and draft.cost > PROMISING * self.best[1].measures.cost:
-                self.candidates.append(Candidate(draft.name, draft.cost, draft.iterations, None, draft.plan))
+            if self.best is not None and freed and draft.cost > PROMISING * self.best[1].measures.cost:
+                self.candidates.append(draft)
             else:
-                self._follow(draft.name, draft.plan)
+                self._follow(draft.start, draft.trajectory)
 
-    def _sketched(self, way: Way, fraction: float, free: Problem | None) -> "Sketch":
-        """What a few iterations make of a way in a fraction of the stated duration, which is free or fixed."""
-        problem = self._problem
+    def _sketched(self, way: Way, fraction: float, free: Problem | None) -> Candidate:
+        """What a few iterations make of a way in a fraction of the stated duration; its cost is infinite if it is far
+        from the constraints. The duration is fixed or, in a problem `with_duration_state`, free.
+        """
+        problem, price = self._problem, self._settings.price
         duration = float(np.clip(fraction * problem.steps * problem.dt, *self._range))
         fixed = problem._of_duration(duration)
-        result = sketch(fixed, way.over(fixed), self._settings.price, self._stop, free)
+        begin, budget = way.over(fixed), Budget(SKETCH, self._stop)
+        n, states, horizon = begin.states.shape[1], begin.states, begin.horizon
+        with self._stop.not_counting():  # compiling
+            stages = Stages.lent(free or fixed)
+        prices = np.full(len(stages.owners), price)
         if free is not None:
-            return result._replace(name=way.name, way=way.name)
-        cost = result.cost + problem.time_weight * duration
-        return result._replace(name=f"{way.name}, {duration:g} s", way=way.name, cost=cost)
+            stages.free[n] = 1.0
+            states = np.column_stack([states, np.full(len(states), horizon)])
+            prices[stages.owners == len(problem.constraint_terms)] = np.inf  # the bounds of the duration
+        point = InteriorPoint(stages, Motion(*map(in_c_order, (states, begin.controls))), STRONG, price=prices)
+        result = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=_recorder(budget))
+        stages.give_back()
+        plan, measures = result.plan, result.measures
+        name, cost = way.name, measures.cost
+        if free is None:
+            name, cost = f"{name}, {duration:g} s", cost + problem.time_weight * duration
+        if not (measures.violation < WORTH and measures.gap < WORTH and np.isfinite(cost)):
+            cost = np.inf
+        elif free is not None:
+            horizon = float(plan.states[0, n])
+        plan = Trajectory(plan.states[:, :n], plan.controls, horizon / problem.steps)
+        return Candidate(name, cost, len(budget.log), None, plan)
 
     def grow_trees(self) -> None:
         """Grow trees while no plan is known, and go on from the ways through them."""
@@ -239,12 +257,11 @@ class DurationSearch:
 
         `fraction` is of the tolerance.
         """
-        problem, settings, before = self._problem, self._settings, len(budget.log)
+        before, settings = len(budget.log), self._settings
         with self._stop.reporting("smooth"):
             ordinary, result = find_duration(
-                problem, begin, tolerance=fraction * settings.final(problem),
-                violation=settings.violation_tolerance(problem), budget=budget, price=settings.price,
-            )  # fmt: skip
+                self._problem, begin, settings, budget, tolerance=fraction * settings.final(self._problem)
+            )
         self._total += len(budget.log) - before
         cheaper = result.solved and (self.best is None or result.measures.cost < self.best[1].measures.cost)
         if cheaper:
@@ -313,44 +330,6 @@ class DurationSearch:
         )
 
 
-class Sketch(NamedTuple):
-    """What a few iterations of the interior point make of a way.
-
-    Attributes:
-      plan: the plan. cost: its cost, infinite if it is far from the constraints. iterations: their number.
-      free: whether the duration was free. way: its name. name: the same, with the duration where that was fixed.
-    """
-
-    plan: Trajectory
-    cost: float
-    iterations: int
-    free: bool
-    way: str = ""
-    name: str = ""
-
-
-def sketch(problem: Problem, way: Trajectory, price: float, stop: Stop, free: Problem | None = None) -> Sketch:
-    """Sketch a way in a problem with its duration, or with a free one, `with_duration_state`."""
-    n, budget, states = way.states.shape[1], Budget(SKETCH, stop), way.states
-    with stop.not_counting():  # compiling
-        stages = Stages.lent(free or problem)
-    prices = np.full(len(stages.owners), price)
-    if free is not None:
-        stages.free[n] = 1.0
-        states = np.column_stack([states, np.full(len(states), way.horizon)])
-        prices[stages.owners == len(problem.constraint_terms)] = np.inf  # the bounds of the duration
-    point = InteriorPoint(stages, Motion(*map(in_c_order, (states, way.controls))), STRONG, price=prices)
-    result = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=_recorder(budget))
-    stages.give_back()
-    cost, duration = result.measures.cost, way.horizon
-    if not (result.measures.violation < WORTH and result.measures.gap < WORTH):
-        cost = np.inf
-    elif free is not None:
-        duration = float(result.plan.states[0, n])
-    plan = Trajectory(result.plan.states[:, :n], result.plan.controls, duration / problem.steps)
-    return Sketch(plan, cost, len(budget.log), free is not None)
-
-
 def _recorder(budget: Budget) -> Callable[[Measures, float], bool]:
     """What the interior point calls after each iteration, which joins the log; at the deadline it ends."""
     laps = Laps(budget)
@@ -370,21 +349,20 @@ def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
 
 
 def find_duration(
-    problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, budget: Budget, price: float
+    problem: Problem, begin: Trajectory, settings: SmootherSettings, budget: Budget, *, tolerance: float
 ) -> tuple[Problem, InteriorResult]:
     """Find the best duration near a plan's duration. Return the problem with it, and the optimum or the last plan.
 
-    `violation` is the tolerance of the constraints. The iterations join the log of the budget, which may end the
-    search. `price` is that of violations, which the cost of the result includes.
+    The iterations join the log of the budget, which may end the search. The cost includes the price of violations.
     """
     assert problem.duration is not None
     low, high = problem.duration
-    by_segment = _with_timed_segments(problem, begin, violation, budget, price) if problem.segments else None
+    by_segment = _with_timed_segments(problem, begin, settings, budget) if problem.segments else None
     if by_segment is not None:
         problem, begin = by_segment
     n = len(problem.dynamics.state_coordinates)
     stages, prices, result = _searched(
-        problem, begin, (), tolerance, violation, budget, price, hold=by_segment is not None
+        problem, begin, settings, budget, tolerance=tolerance, hold=by_segment is not None
     )
     cost = result.measures.cost + _paid(stages, result.plan, prices)
     duration = float(np.clip(result.plan.states[0, n], low, high))
@@ -393,21 +371,20 @@ def find_duration(
     result = replace(
         result, plan=Motion(in_c_order(result.plan.states[:, :n]), result.plan.controls),
         gain=in_c_order(result.gain[:, :, :n]), multipliers=result.multipliers[:-1],
-        measures=result.measures._replace(cost=cost),
-        sizes=result.sizes._replace(rows=rows),
+        measures=result.measures._replace(cost=cost), sizes=result.sizes._replace(rows=rows),
     )  # fmt: skip
     return problem._of_duration(duration), result
 
 
 def _searched(
-    problem: Problem, begin: Trajectory, segments: Sequence[int], tolerance: float, violation: float, budget: Budget,
-    price: float, *, hold: bool = False,
+    problem: Problem, begin: Trajectory, settings: SmootherSettings, budget: Budget, *, tolerance: float,
+    segments: Sequence[int] = (), hold: bool = False,
 ) -> tuple[Stages, Array, InteriorResult]:  # fmt: skip
     """The optimum near a plan with its duration as a state, which jumps where segments end; and the price of rows.
 
     With `hold`, the gaps of the plan are first closed with its duration, which must be that of the problem.
     """
-    n = len(problem.dynamics.state_coordinates)
+    n, violation = len(problem.dynamics.state_coordinates), settings.violation_tolerance(problem)
     with budget.stop.not_counting():  # compiling
         stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
     stages.jump(segments)
@@ -415,7 +392,7 @@ def _searched(
     states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     # The bounds of the duration hold at any price.
-    prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, price)
+    prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, settings.price)
 
     def run(plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()) -> InteriorResult:
         point = InteriorPoint(stages, plan, barrier, price=prices, multipliers=multipliers)
@@ -433,7 +410,7 @@ def _searched(
 
 
 def _with_timed_segments(
-    problem: Problem, begin: Trajectory, violation: float, budget: Budget, price: float
+    problem: Problem, begin: Trajectory, settings: SmootherSettings, budget: Budget
 ) -> tuple[Problem, Trajectory] | None:
     """The problem with its segments at the knots where they end in time, and a plan with these, in equal steps.
 
@@ -441,9 +418,9 @@ def _with_timed_segments(
     found; whether they are the best does not matter here.
     """
     assert problem.duration is not None
-    _, _, result = _searched(problem, begin, problem.segments, NEAR_SEGMENTS, violation, budget, price)
-    feasible = result.measures.violation <= violation and result.measures.gap < NEAR_SEGMENTS
-    if not (result.solved or feasible):
+    _, _, result = _searched(problem, begin, settings, budget, tolerance=NEAR_SEGMENTS, segments=problem.segments)
+    allowed, measures = settings.violation_tolerance(problem), result.measures
+    if not (result.solved or (measures.violation <= allowed and measures.gap < NEAR_SEGMENTS)):
         return None
     steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])
     ends = np.cumsum([0.0, *result.plan.states[:-1, -1] / steps])  # times of the knots
