@@ -12,7 +12,7 @@ from lqrsim.errors import Array
 from lqrsim.problem.linear_quadratic import Stage
 from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
-from lqrsim.solvers import riccati_ode
+from lqrsim.solvers import continuous
 from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
 
 
@@ -317,7 +317,7 @@ class TestEndings:
         assert np.isfinite(found.policy(np.zeros(3), 3.0)).all()
 
     def test_an_integration_that_takes_too_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(riccati_ode, "_EVALUATIONS", 20)
+        monkeypatch.setattr(continuous, "_EVALUATIONS", 20)
         found = smooth_continuous(scalar())
         assert found.status is Status.MAX_ITERATIONS
         assert "forward pass of iteration 1, at " in found.detail

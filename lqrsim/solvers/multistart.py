@@ -53,15 +53,12 @@ def sinusoidal_name(cycles: int) -> str:
 
 
 def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
-    """The starts of a search and their names: paths to the goal, the straight path first.
+    """The starts of a search and their names: paths to the goal, the straight path first; by default `STARTS`.
 
     A problem without obstacles, or without a start and a goal, has one start, the nominal control. The paths are paths
     of the position. For a robot of collision spheres without a position, they are paths of the states that move the
     spheres, such as the angles of an arm. The other states of a robot that stands on contacts are also drawn to a
     straight line.
-
-    Args:
-      count: the number of starts; by default `STARTS` if there are obstacles.
     """
     weight_of_path = path_weight(problem)
     if weight_of_path == 0 or problem.start is None or problem.goal is None:
@@ -113,8 +110,7 @@ def _holding(problem: Problem) -> Array:
 def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]:
     """Paths to the goal that bend to the sides, by name; none without a position, or if the goal is at the start.
 
-    Args:
-      count: the number of starts including the straight path, which is not returned; by default `DETOURS`.
+    The number of starts, by default `DETOURS`, includes the straight path, which is not returned.
     """
     place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
@@ -129,12 +125,10 @@ def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]
 
 
 def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[str, InitialPrior]:
-    """Starts whose first iterations follow paths from start to goal, by name; none without two such ends.
+    """Starts whose first iterations follow paths of some states from start to goal, by name; none without such ends.
 
-    After smoothing they are feasible motions on one side of an obstacle or the other; a path alone is not feasible.
-
-    Args:
-      moving: the states that follow the paths. cost: typical cost of a plan.
+    After smoothing they are feasible motions on one side of an obstacle or the other; a path alone is not feasible. The
+    cost is typical of a plan.
     """
     begin, goal, place = problem.start, problem.goal, list(moving)
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
@@ -158,8 +152,7 @@ def passable(problem: Problem) -> list[bool]:
 
 
 def reweighted(problem: Problem, times: float) -> Problem:
-    """The problem with larger weights of obstacles and goal, whose plans go round obstacles and arrive even if controls
-    are expensive.
+    """The problem with larger weights of obstacles and goal: plans then go round and arrive at any price of controls.
 
     Only numbers change, so nothing is compiled. The constraints do not act in its solves.
     """
@@ -171,8 +164,7 @@ def reweighted(problem: Problem, times: float) -> Problem:
 def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
     """Controls (T, m) that oscillate about the nominal ones, with a phase shift from each to the next.
 
-    Args:
-      cycles: their number along the plan; negative for controls that begin the other way.
+    If the number of cycles along the plan is negative, they begin the other way.
     """
     (low, high), nominal = problem.applied_coordinates.limits, problem.nominal_control
     margin = np.minimum(high - nominal, nominal - low)
@@ -200,10 +192,7 @@ def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
 
 
 def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
-    """Plans in which one control at a time is away from its nominal value, for a part of the time: names, controls.
-
-    There are none without a start.
-    """
+    """Plans in which one control at a time leaves its nominal value for a part of the time; none without a start."""
     space, start, steps = problem.applied_coordinates, problem.start, problem.steps
     if start is None:
         return
@@ -254,11 +243,8 @@ def bends(way: Array, count: int, *, ring: float = RING, unit: str = "m") -> lis
     """Offsets of the middle of each path from the straight path, with names: first none, then to the sides.
 
     In space the other paths form a ring about the straight path; in the plane, pairs to the left and the right; in more
-    dimensions, pairs along directions orthogonal to the straight path and to each other.
-
-    Args:
-      way: vector from start to goal, (k,). unit: unit of its numbers, for the names.
-      ring: bend of paths in more than two dimensions, relative to the way.
+    dimensions, pairs along directions orthogonal to the straight path and to each other. `ring` is the bend in more
+    than two dimensions, relative to the way (k,) from start to goal, whose unit the names tell.
     """
     distance = float(np.linalg.norm(way))
     straight: list[tuple[str, Array]] = [("straight", np.zeros(len(way)))]

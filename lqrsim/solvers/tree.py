@@ -73,14 +73,12 @@ def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Sto
     Its states follow the dynamics, those of the second part to the accuracy of Runge-Kutta steps backwards, but for a
     jump between the trees: in the root mean square of the states, it is below `NEAR` of half their ranges.
     Inequalities of states alone hold at the knots and in the middles between them. It takes as many steps as it takes;
-    `in_steps_of` turns it into a start for the problem. The same seed leads to the same way; other seeds lead to
-    others.
+    `in_steps_of` turns it into a start for the problem. The same seed leads to the same way.
 
     Args:
       problem: one with a start and a goal, whose dynamics run backwards and whose constraints stand still. States
         without a goal are to end as they begin.
-      seed: of the random states. extensions: the largest number of extensions of both trees.
-      stop: ends it early.
+      extensions: the largest number, of both trees.
     """
     ends = _ends(problem)
     if ends is None:
@@ -125,24 +123,17 @@ def in_steps_of(problem: Problem, way: Trajectory) -> Trajectory:
 
 
 class Reach(NamedTuple):
-    """Where a node leads, for each number of steps: the costs `constant + 1/2 |root x - mean|^2` to be near states x.
+    """Where a node leads, for each number of steps: costs `constant + 1/2 |root x - mean|^2` to be near states x."""
 
-    Attributes:
-      root: (ARRIVALS, n, n). mean: (ARRIVALS, n). constant: (ARRIVALS,).
-    """
-
-    root: Array
+    root: Array  # (ARRIVALS, n, n)
     mean: Array
-    constant: Array
+    constant: Array  # (ARRIVALS,)
 
 
 class LocalPlanner:
-    """Short plans of LQR smoothing from state to state, and what may be in their way.
+    """Short plans of LQR smoothing from state to state, in one of the numbers of steps `arrivals`.
 
     A step costs 1, and another 1/2 for each control that is at the end of its range.
-
-    Attributes:
-      arrivals: numbers of steps that a plan may take. controls: the number of controls.
     """
 
     def __init__(self, problem: Problem, start: Array, goal: Array, longest: int) -> None:
@@ -201,8 +192,7 @@ class LocalPlanner:
 
     def plan(self, state: Array, target: Array, sign: int, steps: int) -> Motion:
         """A plan from a state towards a target, forwards or backwards in time; empty if it is not finite."""
-        run = self._smoothed(state, sign, steps, ITERATIONS, target)
-        states, controls = (part.copy() for part in run.work.last)
+        states, controls = map(np.copy, self._smoothed(state, sign, steps, ITERATIONS, target).work.last)
         good = np.isfinite(states).all()
         return Motion(states, controls) if good else Motion(states[:0], controls[:0])
 
@@ -235,11 +225,7 @@ class LocalPlanner:
 
 
 class Tree:
-    """States that plans reach, each from another one, from roots (R, n), forwards in time or with -1 backwards.
-
-    Attributes:
-      states: (N, n), of which the first are the roots. roots: their number.
-    """
+    """States (N, n) that plans reach, each from another one, from roots (R, n), forwards in time or, by -1, backwards."""
 
     def __init__(self, planner: LocalPlanner, roots: Array, sign: int, most: int) -> None:
         self._planner, self._sign, n = planner, sign, roots.shape[1]
@@ -298,9 +284,5 @@ def _joined(forwards: list[Motion], backwards: list[Motion], dt: float) -> Traje
     Where they meet, the state is that of the other tree.
     """
     plans = [*forwards[::-1], *(Motion(plan.states[::-1], plan.controls[::-1]) for plan in backwards)]
-    states = [plan.states[:-1] for plan in plans[:-1]]
-    return Trajectory(
-        in_c_order(np.concatenate([*states, plans[-1].states[-1:]])),
-        np.concatenate([plan.controls for plan in plans]),
-        dt,
-    )
+    states = np.concatenate([*(plan.states[:-1] for plan in plans[:-1]), plans[-1].states[-1:]])
+    return Trajectory(in_c_order(states), np.concatenate([plan.controls for plan in plans]), dt)

@@ -163,11 +163,7 @@ def _headings(problem: Problem) -> Headings:
 
 
 class Grid:
-    """Cells of the space of the position.
-
-    Attributes:
-      cell: their size in m. shape: their number along each axis. points: (N, 2 or 3), their centres.
-    """
+    """Cells of the space of the position, of a size in m, with centres `points` (N, 2 or 3)."""
 
     def __init__(self, low: Array, high: Array, cell: float) -> None:
         axes = [a + cell * np.arange(1 + int(np.ceil((b - a) / cell))) for a, b in zip(low, high, strict=True)]
@@ -182,8 +178,7 @@ class Grid:
     def shortest(self, begin: Array, end: Array, free: "Fits", length: Array) -> Array | None:
         """The shortest path between two places, as the cells' centres (K, 2 or 3); None if there is none.
 
-        Args:
-          length: (N,) by how much longer the way through a cell counts.
+        The way through each cell counts longer by its factor in `length`, (N,).
         """
         index, length = np.arange(len(self.points)).reshape(self.shape), length.reshape(self.shape)
         rows, columns, weights = [], [], []
@@ -223,14 +218,11 @@ class Grid:
 
 
 class Fits(NamedTuple):
-    """The cells into which a robot fits: (A, N) with each attitude.
+    """The cells into which a robot fits."""
 
-    Attributes:
-      turns: whether the attitudes are headings, one after another from that of the first axis on, and the robot has
-        that of its motion, or `backwards` the opposite; else it may have any.
-    """
-
-    each: npt.NDArray[np.bool_]
+    each: npt.NDArray[np.bool_]  # (A, N) with each attitude
+    # Whether the attitudes are headings, one after another from that of the first axis on, and the robot has that of
+    # its motion, or `backwards` the opposite; else it may have any.
     turns: bool
     backwards: bool = False
 
@@ -306,11 +298,8 @@ def _extent(problem: Problem, begin: Array, end: Array) -> tuple[Array, Array]:
 def _fits(stages: Stages, headings: Headings, ends: Array, points: Array) -> npt.NDArray[np.bool_]:
     """Whether the constraints that can be passed on one side or another hold with the position at points (N, d).
 
-    Args:
-      ends: (2, n), start and goal.
-
-    Returns:
-      (attitudes, N): headings along the axes and between, or the attitudes of start and goal and each angle turned.
+    The result is (attitudes, N): headings along the axes and between, or the attitudes of start and goal, the `ends`
+    (2, n), and each angle turned.
     """
     problem, start, turn = stages.problem, ends[0], 2 * np.pi * np.arange(TURNS)[:, None] / TURNS
     space, entries = problem.dynamics.state_coordinates, np.arange(len(start))
