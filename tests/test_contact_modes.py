@@ -293,7 +293,7 @@ def test_secants_are_the_second_derivatives_that_mujoco_does_not_have(seed: int)
     assert step is not None
     assert len(model.values) == 4 * steps
     pulls = draws.uniform(0, 100, len(model.values))
-    lacking = secant_curvature(model, earlier, replace(step, multipliers=pulls, limits=0 * step.limits))
+    lacking = secant_curvature(model, earlier, step._replace(multipliers=pulls, limits=0 * step.limits))
 
     def lagrangian(change: Array) -> float:
         controls = change.reshape(steps, 1).copy()

@@ -49,14 +49,10 @@ class Measures(NamedTuple):
 
 
 class Barrier(NamedTuple):
-    """The barrier with which an interior point begins.
+    """The barrier with which an interior point begins."""
 
-    The parameter of each row is a fraction of the cost divided by the number of rows. The least slack is relative to a
-    row's size, or to a control's range.
-    """
-
-    parameter: float
-    slack: float
+    parameter: float  # of each row, as a fraction of the cost divided by the number of rows
+    slack: float  # the least, relative to a row's size, or to a control's range
 
 
 # For plans that are far from an optimum, for those with a duration that is found now, and next to an optimum.
@@ -85,7 +81,6 @@ class InteriorPoint:
     """Runs the interior point from one plan.
 
     Args:
-      stages: stages of a problem with constraints, limits, or neither.
       plan: initial states (T+1, n) and controls (T, m), which need satisfy neither dynamics nor constraints.
       price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
         hold. Or a price for each row, (R,); or a function of the typical sizes that returns these.
@@ -130,9 +125,8 @@ class InteriorPoint:
         """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
 
         Args:
-          tolerance: tolerance of stationarity, gaps and complementarity. violation: tolerance of the constraints, in
-            their units.
-          most: largest number of iterations. near: whether the plan may be next to the answer.
+          tolerance: of stationarity, gaps and complementarity. violation: that of the constraints, in their units.
+          near: whether the plan may be next to the answer.
           watch: called with the measures of each iteration, and its seconds; True ends the run.
           hurried: whether it is to be called after each iteration, rather than after `ATTENTION` seconds.
         """
@@ -187,7 +181,7 @@ class ActiveSet:
 
     Args:
       plan: states (T+1, n) and controls (T, m), not necessarily feasible; the first state is the start.
-      multipliers: multipliers of the constraints, (T+1, rows) each, or none.
+      multipliers: of the constraints, (T+1, rows) each, or none.
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:

@@ -42,13 +42,9 @@ UPDATES = 5  # largest number of updates of the multipliers, if Newton's last st
 
 
 class InteriorRun:
-    """The interior point for the problem of a run, and the tolerance of its constraints.
+    """The interior point for the problem of a run, and the tolerance of its constraints."""
 
-    Attributes:
-      idle: whether the last plan did not press against any constraint.
-    """
-
-    idle = False
+    idle = False  # whether the last plan did not press against any constraint
     _flat: RunResult | None = None  # the last result where the cost no longer changed
 
     def __init__(self, run: SolveRun) -> None:
@@ -58,9 +54,9 @@ class InteriorRun:
     def run_from(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
     ) -> RunResult | None:
-        """The result from a plan; None if the budget is over, or there is no result. The iterations go to the log.
+        """The result from a plan; None if there is none, or the budget is over. The iterations go to the log.
 
-        `stale` is the number of iterations without a new least stationarity that ends it; by default it may take any.
+        `stale` iterations without a new least stationarity end it.
         """
         budget, run, result = self._budget, self._run, None
         if budget.left < 2 or budget.stop.due:
@@ -146,10 +142,8 @@ class InteriorRun:
 
     def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
         """The rollout of a plan with gains about it, or without gains if this violates the constraints less."""
-        candidates = []
-        for gains in (gain.copy(), np.zeros_like(gain)):
-            law = compiled.law_about(*plan, gains)
-            candidates.append(self.result(self._run.work.roll_out(law, plan.states[0]), law))
+        laws = [compiled.law_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
+        candidates = (self.result(self._run.work.roll_out(law, plan.states[0]), law) for law in laws)
         return min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
 
     def _polished(self, interior: InteriorResult) -> RunResult | None:

@@ -145,11 +145,7 @@ class PreparedSolver(OneVersion):
 
     @checked
     def check(self, problem: Problem) -> Problem:
-        """Check that a problem needs no compiling: only numbers may differ from the prepared one.
-
-        Raises:
-          InputError: the problem would have to be compiled, or has a free duration.
-        """
+        """Check that a problem needs no compiling: only numbers may differ from the prepared one."""
         _check_fixed(problem)
         other = (problem.control_rate is None) != (self._wide is None)
         if other or compiled.structure(problem) != self._structure:
@@ -304,8 +300,7 @@ class _Finder:
 
     Attributes:
       laps: the times of its iterations; the last iteration may be an abandoned step.
-      may_be_far: whether it found nothing, and there is time to look for a plan that is not next to the given one, as
-        when an obstacle has come into its way.
+      may_be_far: whether it found nothing, and there is time to look elsewhere, as when an obstacle is in the way.
     """
 
     def __init__(self, run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
@@ -442,21 +437,16 @@ class _Yielding(_Finder):
         self._prices = np.where(self._yields, PRICE * sizes.cost / sizes.rows, np.inf)
         return self._prices
 
-    def _missed(self, plan: Motion) -> float:
-        """The largest violation of the constraints that do not give way, beyond what is allowed."""
-        values = self._run.work.constraint_values(plan)
-        pairs = zip(self._run.problem.constraint_terms, values, strict=True)
-        hard = ((term, number) for term, number in pairs if not term.yields)
-        return max(
-            [0.0, *(violation_of(term, number) - allowed_violation(term, self._allowed) for term, number in hard)]
-        )
-
     def _rank(self, plan: Motion, cost: float) -> tuple[bool, float, float]:
         """Sort key, best first: violation of what does not give way, then the cost with the prices of violations."""
-        values, stages = self._run.stages.values(plan), self._run.stages
+        values, stages, missed = self._run.stages.values(plan), self._run.stages, 0.0
+        pairs = zip(self._run.problem.constraint_terms, self._run.work.constraint_values(plan), strict=True)
+        for term, numbers in pairs:
+            if not term.yields:
+                missed = max(missed, violation_of(term, numbers) - allowed_violation(term, self._allowed))
         short = np.where(stages.live & self._yields, np.maximum(-values, 0.0), 0.0)
         paid = float((short * np.where(self._yields, self._prices, 0.0)).sum())
-        return not np.isfinite(plan.states).all(), self._missed(plan), cost + paid
+        return not np.isfinite(plan.states).all(), missed, cost + paid
 
 
 def _finder(run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> _Finder:
@@ -467,8 +457,8 @@ class _Best:
     """The best plan so far, initially the plan that the solve starts from. It is called after each iteration.
 
     Attributes:
-      cost_to_go, multipliers: of the law; None if unknown, and those with which it was found. before: the cost of the
-        first plan. improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
+      cost_to_go: of the law; None if unknown. multipliers: those with which it was found. before: the cost of the first
+        plan. improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
     """
 
     def __init__(self, run: SolveRun) -> None:
@@ -499,7 +489,7 @@ class _Best:
         arrays, cost = self._work.arrays, iteration.cost
         if iteration.method == "smooth":
             cost = _cost_of(self._run, cost, arrays.last, arrays.last_policy)
-        if self._beaten_by(cost, iteration.violation):
+        if self._better(cost, iteration.violation, self.cost, self.violation):
             if iteration.method == "newton":
                 parts = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
             else:
@@ -516,18 +506,15 @@ class _Best:
 
     def consider(self, result: RunResult) -> None:
         """Adopt the final result if it converged and is as good as the best, or if it is better."""
-        cheaper = self._better(self.cost, self.violation, result.cost, result.violation)
-        as_good = result.success and (self.violation > self._none or not cheaper)
-        if as_good or self._beaten_by(result.cost, result.violation):
+        pair, own = (result.cost, result.violation), (self.cost, self.violation)
+        as_good = result.success and (self.violation > self._none or not self._better(*own, *pair))
+        if as_good or self._better(*pair, *own):
             self.adopt(result)
 
     def adopt(self, result: RunResult) -> None:
         parts = *result.plan, *result.law, *(self._work.arrays.to_go if result.values else ())
         self._keep(result.cost, result.violation, parts)
         self.multipliers = result.multipliers
-
-    def _beaten_by(self, cost: float, violation: float) -> bool:
-        return self._better(cost, violation, self.cost, self.violation)
 
     def _better(self, cost: float, violation: float, than_cost: float, than_violation: float) -> bool:
         """Whether one plan is better than another: constraints first, then the cost, beyond rounding.

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,13 +15,12 @@ from lqrsim.solvers.budget import ATTENTION
 from lqrsim.solvers.stages import Sizes, Stages
 
 
-@dataclass(frozen=True)
-class Restored:
-    """A trajectory; whether its violation is stationary (`stationary`), and whether it is nearly feasible (`near`)."""
+class Restored(NamedTuple):
+    """A trajectory, and two facts about it."""
 
     plan: Motion
-    stationary: bool
-    near: bool
+    stationary: bool  # whether its violation is
+    near: bool  # whether it is nearly feasible
 
 
 def restore(
@@ -29,20 +28,14 @@ def restore(
     watch: Callable[[float, float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
     hurried: bool = True,
 ) -> Restored | None:  # fmt: skip
-    """Descend from the rollout of the controls (T, m) of a plan; its first state is the start.
+    """Descend from the rollout of a plan's controls (T, m); None if a trajectory is not finite, or there is no step.
 
     Args:
-      price: price of violating a constraint by its typical size, in units of the typical cost. most: largest number of
-        iterations.
-      watch: called with cost, violation, relative predicted decrease and seconds of each iteration; True ends the
-        descent.
+      price: of violating a constraint by its typical size, in units of the typical cost.
+      watch: called with cost, violation, relative predicted decrease and seconds of each iteration; True ends it.
       stationary: called once the predicted decrease is negligible; returns whether the violation of a trajectory is
-        stationary. It gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends
-        the descent.
+        stationary, which ends it. It gets each constraint's multipliers relative to the price, (T+1, rows), in -1 to 1.
       hurried: whether `watch` is to be called after each iteration, rather than after `ATTENTION` seconds.
-
-    Returns:
-      None if a trajectory is not finite, or there is no step.
     """
     work, memory = stages.restoration
     stages.resize(sizes)

@@ -191,10 +191,9 @@ class Stages:
 
     def call(self, name: str, *arguments: Any) -> Any:
         """Call a compiled function, reusing the layout of its arguments."""
-        call = self._calls.get(name)
-        if call is None:
-            call = self._calls[name] = self._module.lay_out(name, *arguments)
-        return call(*arguments)
+        if name not in self._calls:
+            self._calls[name] = self._module.lay_out(name, *arguments)
+        return self._calls[name](*arguments)
 
     def values(self, plan: Motion) -> Array:
         """The rows' values (T+1, R); undefined for rows that do not act."""
@@ -208,18 +207,14 @@ class Stages:
         return self.call("evaluate_plan", self.about, Motion(*map(in_c_order, plan)), arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
-        """Compute the models about a plan, with costates (T+1, n) and multipliers (T+1, R).
-
-        Constraints with multipliers up to `least` count as linear.
-        """
+        """Compute the models about a plan; constraints with multipliers up to `least` count as linear."""
         self.force[...] = multipliers
         self.call("write_models", self.about, plan, costates, float(least))
 
     def least_curvatures(self, weights: Array, held: Array) -> Array | None:
         """The least curvature (m,) of each control along the plan; None unless the reduced Hessian is definite.
 
-        Args:
-          weights: (T+1, R) on rows that are held. held: (T, m) controls that stay at limits.
+        Rows are held by weights (T+1, R), controls (T, m) at limits.
         """
         least = np.empty(self.m)
         good = self.call(

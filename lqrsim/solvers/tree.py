@@ -225,7 +225,7 @@ class LocalPlanner:
 
 
 class Tree:
-    """States (N, n) that plans reach, each from another one, from roots (R, n), forwards in time or, by -1, backwards."""
+    """States (N, n) that plans reach from roots (R, n), forwards in time or, by a sign of -1, backwards."""
 
     def __init__(self, planner: LocalPlanner, roots: Array, sign: int, most: int) -> None:
         self._planner, self._sign, n = planner, sign, roots.shape[1]
