@@ -1,6 +1,5 @@
 """Plans at the edges of contact modes: switches and derivatives of periods, and what is called optimal there."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
