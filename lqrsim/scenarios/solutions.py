@@ -17,9 +17,8 @@ from lqrsim.results.save_load import load
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.initial_guess import InitialPrior, is_function, resolve
-from lqrsim.solvers.smoother import smooth
+from lqrsim.solvers.smoother import ilqr, smooth
 from lqrsim.versions import other_lqrsim
 
 SOLVERS: Mapping[str, Callable[..., Solution]] = {"smooth": smooth, "ilqr": ilqr}

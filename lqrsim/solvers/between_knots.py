@@ -184,6 +184,7 @@ def solve_between_knots(
     search goes on from the plan `begin` from the second round on.
     """
     at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.violation_tolerance(problem)
+    accuracy = problem.accuracy or np.inf
     rows = [Rows(np.zeros((problem.steps, term.rows)), np.zeros(term.rows)) for term in problem.constraint_terms]
 
     def again(last: Solution) -> Solution:
@@ -205,29 +206,26 @@ def solve_between_knots(
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)
         errors = plan_errors(at_knots, solution.trajectory)
-        coarse = problem.accuracy is not None and errors.step_error > problem.accuracy
+        coarse = errors.step_error > accuracy
         missed = problem.between_knots and errors.missed > tolerance
         if not (coarse or missed):
             break
         if rounds >= ROUNDS or stop.due:
             status, remedy = Status.STALLED, "use twice as many steps"
             if coarse:
-                assert problem.accuracy is not None
-                times = math.ceil((2 * errors.step_error / problem.accuracy) ** (1 / ORDER))
-                remedy = f"use {times} times as many steps, or a larger accuracy than {problem.accuracy:g}"
+                times = math.ceil((2 * errors.step_error / accuracy) ** (1 / ORDER))
+                remedy = f"use {times} times as many steps, or a larger accuracy than {accuracy:g}"
             if stop.due:
                 status, remedy = Status.TIME_LIMIT, "raise time_limit"
-            wrong = errors.record(at_knots)._faults(tolerance, problem.accuracy or np.inf)
+            wrong = errors.record(at_knots)._faults(tolerance, accuracy)
             detail = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
             ended = {"status": status, "remedy": remedy, "detail": detail}
             break
         if coarse:
-            assert problem.accuracy is not None
-            finer = at_knots.dynamics.with_substeps(_substeps(at_knots, errors.step_error / problem.accuracy))
+            finer = at_knots.dynamics.with_substeps(_substeps(at_knots, errors.step_error / accuracy))
             at_knots = replace(at_knots, dynamics=finer)
         if missed:
-            pairs = zip(rows, errors.worst, strict=True)
-            rows = [added.against(worst, tolerance) for added, worst in pairs]
+            rows = [added.against(worst, tolerance) for added, worst in zip(rows, errors.worst, strict=True)]
         solution = again(solution)
         rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
     ordinary = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)

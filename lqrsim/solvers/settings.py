@@ -1,8 +1,7 @@
 """The options of the solvers, with defaults and checks."""
 
-import logging
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
 
 MOST_STARTS = 10_000
-_log = logging.getLogger("lqrsim")
 ROUGH, FINE = 1e-4, 1e-8  # default tolerances of smoothing and of Newton's method
 LEARNED = 1e-5  # the same of the interior point with MuJoCo's steps: their derivatives are right to some 1e-6
 INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the tolerance
@@ -99,21 +97,3 @@ def can_be_exact(problem: Problem) -> bool:
 def has_curvature(problem: Problem) -> bool:
     """Whether the dynamics have second derivatives; the steps of an MJCF have none."""
     return not problem.dynamics.by_mujoco
-
-
-S = TypeVar("S", bound=Settings)
-
-
-def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
-    """Make settings from keyword arguments. Raises TypeError for one that there is not."""
-    names = [field.name for field in fields(kind)]
-    for name in options:
-        if name not in names:
-            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}, want {', '.join(names)}")
-    return kind(**options)
-
-
-def warn_of_goal(problem: Problem) -> None:
-    """Log a warning if the goal is inside an obstacle."""
-    if where := problem.goal_inside:
-        _log.warning("the goal is %s: a plan that ends there collides", where)

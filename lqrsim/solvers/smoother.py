@@ -1,20 +1,43 @@
-"""`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. `strategy.py` describes what they try."""
+"""`smooth`, iterated LQR smoothing (Sec. V of the paper), and its baseline `ilqr`; both also for many problems.
 
+`strategy.py` describes what `smooth` tries.
+"""
+
+import contextlib
+import logging
 from collections.abc import Callable, Iterable
+from concurrent.futures import as_completed
+from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
-from lqrsim.annotations import checked
-from lqrsim.errors import InputError, check_memory
+import numpy as np
+
+from lqrsim.annotations import Progress, checked
+from lqrsim.errors import InputError, check_items, check_kind, check_memory, check_number
+from lqrsim.kernels import declarations
+from lqrsim.kernels.records import Policy
+from lqrsim.problem.derivative_check import check_functions, functions_of
 from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.solvers.budget import Callback, Stop
-from lqrsim.solvers.initial_guess import StartLike
+from lqrsim.results.solution_parts import Status
+from lqrsim.results.value_functions import Quadratic
+from lqrsim.solvers import compiled
+from lqrsim.solvers.assembly import assemble
+from lqrsim.solvers.budget import Budget, Callback, Stop, reported
+from lqrsim.solvers.control_rates import solve_with_rates
+from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.multistart import STARTS, check_starts
-from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
-from lqrsim.solvers.settings import SmootherSettings, settings_from, warn_of_goal
+from lqrsim.solvers.parallel import check_threads, workers
+from lqrsim.solvers.risk import name_risk
+from lqrsim.solvers.settings import Settings, SmootherSettings
 from lqrsim.solvers.strategy import solve
+
+ILQR_TOLERANCE = 1e-4  # default tolerance of iLQR
+_log = logging.getLogger("lqrsim")
 
 
 @checked
@@ -109,8 +132,8 @@ def smooth(
         constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish, elastic=elastic,
     )  # fmt: skip
     problem = problem.driven_by(noise, risk)
-    _check(problem, settings)
-    warn_of_goal(problem)
+    _check_smooth(problem, settings)
+    _warn_of_goal(problem)
     return solve(problem, settings, Stop(callback, check_threads(threads), attentive=True))
 
 
@@ -144,12 +167,80 @@ def smooth_many(
       InputError: a refused problem is named by its index in the list. A problem that is only not finite at its start
         ends as NOT_FINITE, and its detail says where.
     """
-    settings = settings_from(SmootherSettings, "smooth_many", options)
-    return solve_all(all_driven_by(problems, noise, risk), settings, _check, solve, threads=threads, progress=progress)
+    settings = _settings_from(SmootherSettings, "smooth_many", options)
+    listed = _driven_by(problems, noise, risk)
+    return _solve_all(listed, settings, _check_smooth, solve, threads=threads, progress=progress)
 
 
 @checked
-def _check(problem: Problem, settings: SmootherSettings) -> None:
+def ilqr(
+    problem: Problem,
+    *,
+    stop: str = "optimal",
+    tolerance: float = ILQR_TOLERANCE,
+    max_iterations: int = 500,
+    time_limit: float | None = None,
+    start: StartLike = None,
+    noise: Noise | None = None,
+    risk: float | None = None,
+    callback: Callback | None = None,
+) -> Solution:
+    """Compute a locally optimal feedback policy by iterative LQR with a line search that halves the step.
+
+    Each iteration is a backward pass about a feasible trajectory and the accepted rollout of its policy. The start is
+    fixed: the state of a `FixedState`, or the state at which the initial cost is zero. The cost never rises. Control
+    limits are respected; constraints are not supported.
+
+    The other arguments are as in `smooth`.
+
+    Args:
+      problem: a problem with a start that is given exactly, or by the initial cost.
+      stop: as in `smooth`; the gap is zero here, because every iterate is feasible.
+      tolerance: tolerance of the relative change of cost, and of the optimality, as in `smooth`.
+      start: controls of the first trajectory: (m,) or (T, m), by default the problem's nominal control; the controls of
+        a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
+      noise: as in `smooth`; with noise this is iLQG.
+
+    Returns:
+      A Solution, as `smooth` returns, but without cost-to-come and inverse policy. A hard problem raises no
+      exception.
+
+    Raises:
+      InputError: the problem names no start.
+    """
+    settings = Settings(
+        stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
+    )
+    problem = problem.driven_by(noise, risk)
+    _check_ilqr(problem, settings)
+    _warn_of_goal(problem)
+    with problem.dynamics.solving(check_threads(None)):
+        return _solve_ilqr(problem, settings, Stop(callback, attentive=True))
+
+
+def ilqr_many(
+    problems: Iterable[Problem],
+    *,
+    threads: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
+    noise: Noise | None = None,
+    risk: float | None = None,
+    **options: Any,
+) -> list[Solution]:
+    """Solve many problems as `ilqr` does, on several threads.
+
+    The arguments are as in `smooth_many`; the options are those of `ilqr`.
+
+    Returns:
+      One Solution per problem, in their order.
+    """
+    settings = _settings_from(Settings, "ilqr_many", {"tolerance": ILQR_TOLERANCE, **options})
+    listed = _driven_by(problems, noise, risk)
+    return _solve_all(listed, settings, _check_ilqr, _solve_ilqr, threads=threads, progress=progress)
+
+
+@checked
+def _check_smooth(problem: Problem, settings: SmootherSettings) -> None:
     if problem.control_rate is not None:
         for option, got, want in (("form", settings.form, "dual"), ("first_pass", settings.first_pass, "forward")):
             if got != want:
@@ -160,15 +251,13 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
         raise InputError(f"between_knots: got True without an interior point that keeps all constraints, want {want}")
     if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
         if problem.constraints:
-            why = 'None without finish="newton" and stop="optimal"'
-            if settings.finish and settings.stop == "optimal":
-                why = "None with noise"
-            raise InputError(f"elastic: got {settings.elastic:g}, want {why}")
+            noisy = settings.finish and settings.stop == "optimal"
+            why = "with noise" if noisy else 'without finish="newton" and stop="optimal"'
+            raise InputError(f"elastic: got {settings.elastic:g}, want None {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     if problem.duration is not None and not settings.second_order(problem):
         raise InputError('duration: got a free one without the interior point, want finish="newton" and stop="optimal"')
-    several = settings.start is None and len(problem.obstacle_costs) > 0
-    starts = settings.starts or (STARTS if several else 1)
+    starts = settings.starts or (STARTS if settings.start is None and problem.obstacle_costs else 1)
     check_memory("starts", starts, problem.steps * problem.bytes_per_step)
     if settings.form == "primal" and problem.dynamics.discrete:
         raise InputError(f"form: got 'primal' for {problem.dynamics.name}, whose steps have no inverse, want 'dual'")
@@ -179,3 +268,121 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
         )
     if settings.start is None:
         check_starts(problem, settings.starts)
+
+
+_NO_PRIOR = "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
+
+
+@checked
+def _check_ilqr(problem: Problem, settings: Settings) -> None:
+    check_number("tolerance", settings.tolerance, above=0.0)
+    if isinstance(settings.start, InitialPrior):
+        raise InputError(_NO_PRIOR)
+    if problem.duration is not None:
+        raise InputError("duration: got a free duration, want None for ilqr; use `smooth`, which solves for it")
+    if problem.accuracy is not None or problem.between_knots:
+        raise InputError("accuracy, between_knots: got one of them, want neither for ilqr; use smooth")
+    if problem.constraints or (problem.control_rate is not None and problem.control_rate.limits is not None):
+        raise InputError(
+            "constraints: got a problem with constraints, want none for ilqr, which keeps only limits; use smooth"
+        )
+    if problem.start is None:
+        raise InputError(
+            "initial: got a cost that names no start, want FixedState(x) or QuadraticCost(weight, about=x)"
+        )
+
+
+def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) -> Solution:
+    if problem.control_rate is not None:
+        return solve_with_rates(problem, settings, partial(_solve_ilqr, stop=stop))
+    assert problem.start is not None
+    stop = Stop() if stop is None else stop
+    stop.begin(settings.time_limit)
+    budget = Budget(settings.max_iterations, stop, callback=stop.callback)
+    with stop.not_counting():
+        guess = resolve(settings.start, problem)
+        if guess.prior is not None:  # a function may return one
+            raise InputError(_NO_PRIOR)
+        start = problem.start.copy()
+        check_functions(problem, start, guess.offset[0].copy())
+        options = SmootherSettings(stop=settings.stop, tolerance=settings.tolerance, finish=None)
+        run = SolveRun.lent(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
+        run.work.fixed = True  # if by the initial cost alone
+    with stop.reporting("ilqr"):
+        ending = run.ilqr()
+    log, work = budget.log, run.work
+    complete = len(log) > 0 and ending.failed < 0
+    if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was made about the previous trajectory
+        if not log:
+            run.roll_out()
+        complete = bool(np.isfinite(run.linearize_about_plan()))
+    (states, controls), gain = work.best, work.arrays.policy.gain
+    # Without a pass about the trajectory the policy has no feedback.
+    law = compiled.law_about(states, controls, gain) if complete else Policy(np.zeros_like(gain), controls)
+    result = RunResult(
+        status=ending.status, detail=ending.detail(problem.steps), plan=work.best, law=law, cost=work.cost,
+        violation=0.0, gap=0.0,
+        values={"cost_to_go": Quadratic(*work.arrays.to_go)} if complete else {},
+    )  # fmt: skip
+    result = run.certified(result)
+    if result.status is Status.RISK_TOO_HIGH:
+        result = replace(result, detail=name_risk(run, result))
+    solution = assemble(problem, result, log, solver="ilqr", options=settings.options(guess))
+    run.give_back()
+    return stop.finish(solution)
+
+
+def _settings_from(kind: type[Settings], function: str, options: dict[str, Any]) -> Settings:
+    """Make settings from keyword arguments. Raises TypeError for one that there is not."""
+    names = [field.name for field in fields(kind)]
+    for name in options:
+        if name not in names:
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}, want {', '.join(names)}")
+    return kind(**options)
+
+
+def _warn_of_goal(problem: Problem) -> None:
+    """Log a warning if the goal is inside an obstacle."""
+    if where := problem.goal_inside:
+        _log.warning("the goal is %s: a plan that ends there collides", where)
+
+
+def _driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
+    """The problems as a list, with noise and risk replaced if given. Raises InputError for anything else."""
+    listed = list(check_items("problems", problems, object, "a list of Problem"))
+    if noise is None and risk is None:
+        return listed
+    return [check_kind("problems", problem, Problem, "Problems").driven_by(noise, risk) for problem in listed]
+
+
+@checked
+def _solve_all(
+    problems: list[Problem],
+    settings: Settings,
+    check: Callable[[Problem, Any], None],
+    solve: Callable[..., Solution],
+    *,
+    threads: int | None,
+    progress: Progress | None,
+) -> list[Solution]:
+    """Solve each problem with `solve(problem, settings)`, on several threads; return the solutions in order."""
+    threads = check_threads(threads)
+    for i, problem in enumerate(problems):
+        try:
+            check(problem, settings)
+            start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
+            check_functions(problem, start, resolve(settings.start, problem).offset[0])
+            compiled.core(problem, getattr(settings, "form", "dual"))
+            compiled.arguments(problem)  # this compiles numba functions
+        except InputError as error:
+            raise InputError(f"problems[{i}]: {error}") from None
+    functions = [function for problem in problems for function in functions_of(problem)]
+    with workers(threads, functions) as pool:
+        futures = [pool.submit(solve, problem, settings) for problem in problems]
+        done = 0
+        report = reported("solving", lambda: f"{done} of {len(futures)} problems done")
+        with report if progress is None else contextlib.nullcontext():
+            for done, _ in enumerate(as_completed(futures), start=1):
+                if progress is not None:
+                    progress(done, len(futures))
+        return [future.result() for future in futures]
