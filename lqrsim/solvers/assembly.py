@@ -42,14 +42,9 @@ ROUNDING = 1e-6  # of an eigenvalue by MuJoCo's differences, relative to its siz
 
 
 def assemble(
-    problem: Problem,
-    result: RunResult,
-    log: Sequence[Iteration],
-    *,
-    solver: str,
-    options: dict[str, object],
+    problem: Problem, result: RunResult, log: Sequence[Iteration], *, solver: str, options: dict[str, object],
     candidates: tuple[Candidate, ...] = (),
-) -> Solution:
+) -> Solution:  # fmt: skip
     """Copy the result of a run into a Solution."""
     assert result.certificate is not None
     falls = bool(log) and result.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
@@ -59,7 +54,7 @@ def assemble(
     law = Policy(*map(np.copy, result.law))
     inverse_law = result.values.get("inverse_law")
     if inverse_law is not None:
-        inverse_law = inverse_law[0].copy(), inverse_law[1].copy()
+        inverse_law = Policy(*map(np.copy, inverse_law))
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
     policy = partial(compiled.policy_of, problem)
@@ -273,11 +268,11 @@ def remedy_of(
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
     step, met = problem.dynamics.grazed(result.states) if np.isfinite(result.states).all() else (0, [])
     if met:
-        grazed = (
-            f"the plan grazes {' and '.join(met)} at {step * problem.dt:.4g} s: if that is only to be passed, let it"
-        )
         more = {Status.TIME_LIMIT: "; or raise time_limit", Status.MAX_ITERATIONS: "; or raise max_iterations"}
-        return f"{grazed} be among the obstacles= of MjcfRobot, with a clearance{more.get(status, '')}"
+        return (
+            f"the plan grazes {' and '.join(met)} at {step * problem.dt:.4g} s: if that is only to be passed, let it"
+            f" be among the obstacles= of MjcfRobot, with a clearance{more.get(status, '')}"
+        )
     if status is Status.TIME_LIMIT and log:
         took = sum(iteration.seconds for iteration in log)
         similar = "or begin with start=solution of a similar problem"
@@ -286,9 +281,9 @@ def remedy_of(
         fell = log[-1].improvement * abs(log[-1].cost)
         costs = f"by {fell:.2g}; the plan costs {result.cost:.6g}"
         return f"raise max_iterations: the cost still fell in the last one, {costs}"
-    limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
     paper = options.get("finish", "newton") is None or options["stop"] == "cost"
-    bounded = bool(problem.constraints) or limited
+    space = problem.control_coordinates
+    bounded = bool(problem.constraints) or bool(np.isfinite([space.low, space.high]).any())
     helps = status is Status.NOT_POSITIVE_DEFINITE or (bounded and status is not Status.NOT_FINITE)
     if paper and can_be_exact(problem) and helps and status is not Status.TIME_LIMIT:
         better = "the interior point" if bounded else "Newton's method"

@@ -72,14 +72,11 @@ def _sizes(dynamics: Dynamics) -> dict[str, int]:
 
 def structure(problem: Problem) -> tuple[Any, ...]:
     """A key that is equal for problems that share all their compiled code."""
-    costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in _FIELDS)
+    fields = "initial", "stage_cost", "final_cost"
+    costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in fields)
     constraints = tuple((term.code, term.uses_control, term.equality, term.shared) for term in problem.constraint_terms)
-    term = problem.noise_term
-    noise = None if term is None else term.code
+    noise = None if problem.noise_term is None else problem.noise_term.code
     return problem.dynamics.step_source, tuple(_sizes(problem.dynamics).items()), costs, constraints, noise
-
-
-_FIELDS = ("initial", "stage_cost", "final_cost")
 
 
 def arguments(
@@ -117,10 +114,8 @@ def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
 def _cost(problem: Problem, field: str, constraints: Sequence["ConstraintMultipliers"]) -> CostModel:
     terms, sizes = cost_terms(problem, field), tuple(_sizes(problem.dynamics).items())
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
-    stated = tuple(
-        (term.code, term.shared, term.equality, term.uses_control)
-        for term in (constraint.term for constraint in constraints)
-    )
+    kept = (constraint.term for constraint in constraints)
+    stated = tuple((term.code, term.shared, term.equality, term.uses_control) for term in kept)
     acting = Constraints(
         _constraint_functions(stated, sizes), tuple(numbers_of(constraint.term) for constraint in constraints),
         tuple(constraint.array for constraint in constraints), len(constraints),
@@ -135,9 +130,8 @@ _Sizes = tuple[tuple[str, int], ...]
 @functools.lru_cache(maxsize=1024)
 def _term_functions(terms: tuple[tuple[Source, tuple[int, ...] | None], ...], sizes: _Sizes) -> tuple[Array, float]:
     """`CostModel.functions` and `project` of the terms of a cost."""
-    rows = []
-    for code, _ in terms:
-        rows.append(module_of(code, f"a cost: {code.what}", **dict(sizes)).addresses("value", "derivatives"))
+    modules = [module_of(code, f"a cost: {code.what}", **dict(sizes)) for code, _ in terms]
+    rows = [module.addresses("value", "derivatives") for module in modules]
     support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
     project = 0.0
     if support:

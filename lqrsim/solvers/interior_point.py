@@ -113,15 +113,9 @@ class InteriorPoint:
         self._call(BEGIN, 0)
 
     def run(
-        self,
-        *,
-        tolerance: float,
-        violation: float,
-        most: int,
-        near: bool = False,
+        self, *, tolerance: float, violation: float, most: int, near: bool = False, hurried: bool = True,
         watch: Callable[[Measures, float], bool] = lambda measures, seconds: False,
-        hurried: bool = True,
-    ) -> InteriorResult:
+    ) -> InteriorResult:  # fmt: skip
         """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
 
         Args:
