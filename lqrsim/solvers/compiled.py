@@ -22,18 +22,10 @@ from lqrsim.kernels import (
     entry_points,
     model_functions,
     projection,
+    records,
 )
 from lqrsim.kernels.declarations import FIRST, FORM, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
-from lqrsim.kernels.records import (
-    Constraints,
-    CostModel,
-    DynamicsModel,
-    Limits,
-    Motion,
-    NoiseModel,
-    Policy,
-    ProblemModel,
-)
+from lqrsim.kernels.records import CostModel, DynamicsModel, Motion, NoiseModel, Policy, ProblemModel
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -92,7 +84,7 @@ def arguments(
         dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
         initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", acting),
         final=_cost(problem, "final_cost", [constraint for constraint in acting if not constraint.term.uses_control]),
-        limits=Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
+        limits=records.Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
         noise=() if term is None else _noise(problem, term),
     )  # fmt: skip
 
@@ -116,7 +108,7 @@ def _cost(problem: Problem, field: str, constraints: Sequence["ConstraintMultipl
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
     kept = (constraint.term for constraint in constraints)
     stated = tuple((term.code, term.shared, term.equality, term.uses_control) for term in kept)
-    acting = Constraints(
+    acting = records.Constraints(
         _constraint_functions(stated, sizes), tuple(numbers_of(constraint.term) for constraint in constraints),
         tuple(constraint.array for constraint in constraints), len(constraints),
     )  # fmt: skip

@@ -14,12 +14,8 @@ from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
-from lqrsim.solvers.augmented_lagrangian import (
-    AugmentedLagrangian,
-    by_multipliers,
-    damped_from_rollout,
-    meet_constraints,
-)
+from lqrsim.solvers import augmented_lagrangian
+from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
@@ -100,7 +96,7 @@ class ConstrainedRun:
             yield self._interior(copied(start), WEAK, multipliers=multipliers)
         if self._stay and self._guided:
             with budget.limited(REFINED):
-                result = damped_from_rollout(run)
+                result = augmented_lagrangian.damped_from_rollout(run)
             yield self._after_multipliers(result)
         if self._keeps_start:  # a trajectory or a policy that the caller gave
             yield self._from_given()
@@ -121,7 +117,7 @@ class ConstrainedRun:
             yield self._at_a_price(copied(start))
         if hard and not (self._converged or self._curved):
             self._point.without_multipliers()
-            result = by_multipliers(run)
+            result = augmented_lagrangian.by_multipliers(run)
             yield self._remember(result if result.success else None)
         if not self._converged:
             yield self._from_best_without_constraints()
@@ -201,7 +197,7 @@ class ConstrainedRun:
         """
         run = self._run
         with self._budget.limited(AUGMENTED):
-            result = meet_constraints(run, run.result(run.ending), stale=STALE)
+            result = augmented_lagrangian.meet_constraints(run, run.result(run.ending), stale=STALE)
         if result.success and not self._curved:
             return self._remember(run.certified(result))
         return self._after_multipliers(result, most=self._start.cost)

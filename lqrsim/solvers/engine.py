@@ -13,27 +13,9 @@ import numpy as np
 from lqrsim.codegen.compiled_module import Call, in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels import declarations
+from lqrsim.kernels import declarations, records
 from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
-from lqrsim.kernels.records import (
-    CERTIFICATE,
-    LOG,
-    MEMORY,
-    NO_DESCENT,
-    CostModel,
-    CostToCome,
-    CostToGo,
-    Descent,
-    IterationSettings,
-    Motion,
-    Policy,
-    Prior,
-    ProblemModel,
-    SmootherArrays,
-    SmootherGains,
-    StructuredArray,
-    zeros_of,
-)
+from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Motion, Policy, Prior, StructuredArray, zeros_of
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of
 from lqrsim.problem.problem import FixedState, Problem
@@ -350,7 +332,7 @@ class SolveRun:
 
     def ilqr(self) -> Ending:
         """Iterations of iLQR, from the rollout of the first policy; with the entry "ilqr". The ending is checked."""
-        arguments = partial(self._plan_arguments, declarations.ITERATE, NO_DESCENT, self.final, 0.0)
+        arguments = partial(self._plan_arguments, declarations.ITERATE, records.NO_DESCENT, self.final, 0.0)
         self.ending, self._row = self._iterate(arguments, self.work.best, self._rows), len(self.budget.log)
         return self.checked_ending()
 
@@ -507,7 +489,7 @@ class SolveRun:
         multipliers = stages.of_constraints([multipliers.values for multipliers in result.multipliers])
         return curvature_at(stages, plan, result.law.gain, multipliers)
 
-    def _without_penalties(self) -> ProblemModel:
+    def _without_penalties(self) -> records.ProblemModel:
         """The model without constraints, whose noise is weighed by its own cost-to-go."""
         model = self.work.model
         stage, final = (
@@ -536,8 +518,8 @@ class SolveRun:
         task, first, last, options, _, *_ = self._linearize_arguments(rows)
         apart = arrays._replace(
             best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
-            x_hats=arrays.x_hats.copy(), policy=Policy(*map(np.copy, arrays.policy)),
-            to_come=CostToCome(*map(np.copy, arrays.to_come)), smoothing=SmootherGains(*map(np.copy, arrays.smoothing)),
+            x_hats=arrays.x_hats.copy(), policy=deepcopy(arrays.policy),
+            to_come=deepcopy(arrays.to_come), smoothing=deepcopy(arrays.smoothing),
         )  # fmt: skip
         *_, failed = self._loop(task, first, last, options, self._without_penalties(), apart, memory, rows)
         if failed < 0:
@@ -672,7 +654,7 @@ class SolveRun:
         **arrays: Any,
     ) -> tuple[Any, ...]:  # fmt: skip
         """Arguments for at most one iteration per row, with other options than the run's, and other arrays."""
-        work, settings = self.work, IterationSettings(
+        work, settings = self.work, records.IterationSettings(
             steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
             gap_tolerance=self.settings.gap_tolerance, optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
             rounding=self.problem.dynamics.rounding**2,
@@ -704,12 +686,12 @@ class Workspace:
         self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
         self._evaluation: Call | None = None
         self._rollout: Call | None = None
-        self.memory_rows = np.zeros(1, MEMORY)
+        self.memory_rows = np.zeros(1, records.MEMORY)
         self.memory = self.memory_rows[0]
         sizes = {"T": problem.steps, "N": len(start), "M": initial_guess.offset.shape[1]}
         self.no_prior = zeros_of(Prior, **sizes)
         stated = {"homotopy_scaled": None, "prior": self.no_prior, "certificate": np.zeros(1, CERTIFICATE)}
-        self.arrays = zeros_of(SmootherArrays, stated, **sizes, S=problem.steps if self._dual else 1)
+        self.arrays = zeros_of(records.SmootherArrays, stated, **sizes, S=problem.steps if self._dual else 1)
         self.start, self.trial = self.arrays.start, zeros_of(Motion, **sizes)
         self.best, self.last = self.arrays.best, self.arrays.last
         self.begin(problem, settings, initial_guess, start)
@@ -783,7 +765,7 @@ class Workspace:
                 law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
-    def homotopy_scaled(self, fraction: float) -> CostModel:
+    def homotopy_scaled(self, fraction: float) -> records.CostModel:
         """The stage cost with its homotopy-scaled terms at that fraction; see `CostTerm.factor`."""
         if fraction == 1:
             return self.model.stage

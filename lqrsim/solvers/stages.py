@@ -15,23 +15,9 @@ import numpy as np
 from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import entry_points
+from lqrsim.kernels import entry_points, records
 from lqrsim.kernels.interior_point import LATELY
-from lqrsim.kernels.records import (
-    ACTIVE_SET,
-    INTERIOR,
-    MEASURES,
-    RESTORATION,
-    ActiveSetArrays,
-    InteriorArrays,
-    Motion,
-    PlanBeginning,
-    PlanStages,
-    RestorationArrays,
-    StageRows,
-    StructuredArray,
-    zeros_of,
-)
+from lqrsim.kernels.records import ACTIVE_SET, INTERIOR, RESTORATION, Motion, StructuredArray, zeros_of
 from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, LINEAR, RANGE, SIDE, SIGN
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
@@ -89,11 +75,11 @@ class Stages:
         self._lengths = {"T": steps, "N": n, "M": m, "W": n + m, "R": rows, "K": (steps + 1) * rows, "C": len(counts)}
         self._module = module_of(source_of(entry_points), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
-        stage_rows = zeros_of(StageRows, {"size": rows}, **self._lengths)
+        stage_rows = zeros_of(records.StageRows, {"size": rows}, **self._lengths)
         stage_rows.limits[...], stage_rows.first[...] = np.inf, np.cumsum([0, *counts])[:-1]
         values = tuple(np.zeros((steps + 1) * count) for count in counts)
         stated = {"steps": steps, "soft": 0, "learns": 0, "model": None, "values": values, "rows": stage_rows}
-        self.about = zeros_of(PlanStages, stated, **self._lengths)
+        self.about = zeros_of(records.PlanStages, stated, **self._lengths)
         self.about.state_size[...], self.about.control_size[...] = 1.0, 1.0
         self.models = self.about.models
         self.slopes = self.models.slopes.reshape(steps + 1, rows, n + m)
@@ -179,10 +165,10 @@ class Stages:
         """Compile what a solve needs of the stages, with the interior point, together."""
         about, plan = self.about, self.about.changes
         arrays, memory = self.interior
-        begun = PlanBeginning(plan, about.rows.force, False, 0.0, 0.0, 0.0)
+        begun = records.PlanBeginning(plan, about.rows.force, False, 0.0, 0.0, 0.0)
         costates, slopes = about.to_go.gradient, plan.controls
         self._module.prepare(
-            interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, MEASURES)),
+            interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, records.MEASURES)),
             determine_scales=(about, plan), write_models=(about, plan, costates, 0.0),
             adjoint=(about, costates, slopes), evaluate_plan=(about, plan, about.models.arrived),
             read_rows=(about, plan, about.rows.numbers),
@@ -267,19 +253,19 @@ class Stages:
     # The memory of the methods; solves of one structure use it in turn.
 
     @functools.cached_property
-    def active_set(self) -> tuple[ActiveSetArrays, StructuredArray]:
+    def active_set(self) -> tuple[records.ActiveSetArrays, StructuredArray]:
         """Arrays of an active set, and its state between calls."""
-        return zeros_of(ActiveSetArrays, **self._lengths), np.zeros(1, ACTIVE_SET)
+        return zeros_of(records.ActiveSetArrays, **self._lengths), np.zeros(1, ACTIVE_SET)
 
     @functools.cached_property
-    def interior(self) -> tuple[InteriorArrays, StructuredArray]:
+    def interior(self) -> tuple[records.InteriorArrays, StructuredArray]:
         active, memory = self.active_set
         crossover = {"active": active, "active_memory": memory}
-        return zeros_of(InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(1, INTERIOR)
+        return zeros_of(records.InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(1, INTERIOR)
 
     @functools.cached_property
-    def restoration(self) -> tuple[RestorationArrays, StructuredArray]:
-        return zeros_of(RestorationArrays, **self._lengths), np.zeros(1, RESTORATION)
+    def restoration(self) -> tuple[records.RestorationArrays, StructuredArray]:
+        return zeros_of(records.RestorationArrays, **self._lengths), np.zeros(1, RESTORATION)
 
 
 _pool = Pool[Stages]()

@@ -32,7 +32,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Curvature, Iteration, Status, Trajectory
-from lqrsim.solvers import compiled, reach
+from lqrsim.solvers import compiled, multistart, reach
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.between_knots import between_knots, solve_between_knots
@@ -45,21 +45,7 @@ from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 from lqrsim.solvers.interior_point import STRONG, WEAK
 from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
-from lqrsim.solvers.multistart import (
-    FOLLOW,
-    SWAYS,
-    along_paths,
-    choose,
-    constant_controls,
-    detours,
-    guides,
-    passable,
-    path_weight,
-    pushes,
-    reweighted,
-    sinusoidal_controls,
-    sinusoidal_name,
-)
+from lqrsim.solvers.multistart import SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.tree import ways_by_trees
@@ -278,7 +264,7 @@ class Search:
         )  # fmt: skip
         self._callback, self._threads = self._budget.stop.callback, self._budget.stop.threads
         self._solving = self._threads if len(named) == 1 else 1
-        self._guided = path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
+        self._guided = multistart.path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
         self._default = self._settings.start is None and self._settings.starts is None
         self.tried = not self._settings.safeguard
         self._finished: list[tuple[SolveRun, RunResult]] = []
@@ -382,7 +368,7 @@ class Search:
             return
         self._known.from_start = False
         work, plans = self.best[0].work, list[tuple[float, float, Array]]()
-        for control, plan in constant_controls(problem):
+        for control, plan in multistart.constant_controls(problem):
             missed = float(f"{work.violation(work.constraint_values(plan)):.2g}")
             cost = compiled.cost_of(problem, *plan)
             if np.isfinite([missed, cost]).all():
@@ -401,7 +387,7 @@ class Search:
         for times in HEAVIER:
             if stop.due:
                 return
-            heavier = reweighted(self._problem, times)
+            heavier = multistart.reweighted(self._problem, times)
             runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
             try:
                 heaviest = choose(runs, self._threads)[0].run_to_end()
@@ -469,12 +455,12 @@ class Search:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
         problem, cost = self._problem, self.best[1].cost
         motions = list[tuple[float, str, Trajectory]]()
-        for name, prior in along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
+        for name, prior in multistart.along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
             if self._budget.stop.due:
                 break
             run = self._another(resolve(prior, problem))
             run.budget.report_to(None)  # it is not run to its end
-            run.smooth(FOLLOW)
+            run.smooth(multistart.FOLLOW)
             plan = copied(run.work.arrays.last)
             if np.isfinite(plan.states).all():
                 missed = run.work.violation(run.work.constraint_values(plan))
@@ -515,7 +501,7 @@ class Search:
     def try_detours(self) -> None:
         """Finish plans from paths to the left and to the right."""
         problem, tried = self._problem, {name for name, _ in self._named}
-        for name, trajectory in detours(problem, self._settings.starts).items():
+        for name, trajectory in multistart.detours(problem, self._settings.starts).items():
             if name not in tried and not self._budget.stop.due:
                 self._try(name, trajectory)
 
@@ -584,7 +570,7 @@ class Search:
             plans.append((not nearer, cost, name, begin))
             return nearer and cost < SAVES * before.cost
 
-        for name, controls, plan in pushes(problem):
+        for name, controls, plan in multistart.pushes(problem):
             consider(name, resolve(controls, problem), plan)
         for name, through in reach.approaches(problem, before, places):
             if self._budget.stop.due:
