@@ -80,7 +80,7 @@ FLOORS_WITHIN = {
         ("certify", "settings", "stages"),
         ("curvature",),
         ("engine", "interior_point", "parallel"),
-        ("assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
+        ("assembly", "augmented_lagrangian", "contact_modes", "multistart"),
         ("control_rates", "interior_run", "restoration", "risk", "tree", "ways"),
         ("between_knots", "constrained", "free_duration", "reach"),
         ("strategy",),

@@ -37,11 +37,10 @@ from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.between_knots import between_knots, solve_between_knots
 from lqrsim.solvers.budget import Budget, Stop
-from lqrsim.solvers.constrained import ConstrainedRun, Known
+from lqrsim.solvers.constrained import ConstrainedRun, Evidence, Known, alike
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
-from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 from lqrsim.solvers.interior_point import STRONG, WEAK
 from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
