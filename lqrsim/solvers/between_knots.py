@@ -222,8 +222,10 @@ def solve_between_knots(
             ended = {"status": status, "remedy": remedy, "detail": detail}
             break
         if coarse:
-            finer = at_knots.dynamics.with_substeps(_substeps(at_knots, errors.step_error / accuracy))
-            at_knots = replace(at_knots, dynamics=finer)
+            # As many Runge-Kutta steps in a period as make errors half of what is allowed.
+            finer = 2 ** max(math.ceil(math.log2(2 * errors.step_error / accuracy) / ORDER), 1)
+            substeps = min(at_knots.dynamics.substeps * finer, MOST)
+            at_knots = replace(at_knots, dynamics=at_knots.dynamics.with_substeps(substeps))
         if missed:
             rows = [added.against(worst, tolerance) for added, worst in zip(rows, errors.worst, strict=True)]
         solution = again(solution)
@@ -266,8 +268,3 @@ class Rows(NamedTuple):
         again = np.where(missed & (self.acts > 0), worst, 0.0).max(axis=0)
         more = np.where(again > 0, SPARED * again, 0.0)
         return Rows(np.maximum(self.acts, near), np.maximum(self.spares, 0.5 * tolerance) + more)
-
-
-def _substeps(problem: Problem, times: float) -> int:
-    """The number of Runge-Kutta steps in a period with which errors, now so many times too large, are half as large."""
-    return min(problem.dynamics.substeps * 2 ** max(math.ceil(math.log2(2 * times) / ORDER), 1), MOST)

@@ -95,7 +95,13 @@ def gradients(
     sizes = np.maximum(np.abs(point), SMALLEST) if scale is None else check_array("scale", scale, point.shape)
     if not (sizes > 0).all():
         raise InputError(f"scale: got {sizes.min():g}, want numbers above 0")
-    _check_solution(solution, plan)
+    if solution.status is not Status.CONVERGED:
+        raise InputError(f"solution: got one that is {solution.status.name}, want a CONVERGED one")
+    if solution.certificate.contacts is not None:
+        raise InputError("solution: got a plan at the edge of its contact modes, want one within them")
+    if plan and solution.curvature is not Curvature.MINIMUM:
+        got = solution.curvature.name
+        raise InputError(f"plan: got a solution whose curvature is {got}, want MINIMUM, or plan=False")
     problem = _problem_at(make, point)
     if problem.accuracy is not None or problem.between_knots:
         raise InputError("make: got a problem with accuracy= or between_knots=True, want one with neither")
@@ -120,18 +126,6 @@ def gradients(
     partials = [np.stack(derivatives, axis=-1) for derivatives in zip(*columns, strict=True)]
     moves = optimum.sensitivities(*partials[1:]) if plan else (None, None)
     return Gradients(partials[0], np.array(errors), optimum.changing, *moves)
-
-
-def _check_solution(solution: Solution, plan: bool) -> None:
-    """Raises InputError unless a solution has a gradient of its cost, and if asked for, of its plan."""
-    if solution.status is not Status.CONVERGED:
-        raise InputError(f"solution: got one that is {solution.status.name}, want a CONVERGED one")
-    if solution.certificate.contacts is not None:
-        raise InputError("solution: got a plan at the edge of its contact modes, want one within them")
-    if plan and solution.curvature is not Curvature.MINIMUM:
-        raise InputError(
-            f"plan: got a solution whose curvature is {solution.curvature.name}, want MINIMUM, or plan=False"
-        )
 
 
 def _problem_at(make: Callable[[Array], Problem], point: Array) -> Problem:

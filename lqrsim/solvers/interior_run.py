@@ -158,19 +158,18 @@ class InteriorRun:
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(work.best)
         with self._budget.joined_with_last(NAME):
-            if has_curvature(self._problem):
-                updates = 0
-                while True:
-                    result = self._run.newton(added=lagrangian.added(), least=interior.scale)
-                    lagrangian.evaluate(result.plan)
-                    if lagrangian.kept or not result.success or updates == UPDATES:
-                        break
+            result = None
+            for updates in range(1 + UPDATES if has_curvature(self._problem) else 0):
+                if updates:
                     lagrangian.update(growth=1.0)
-                    updates += 1
-                if not (result.success and lagrangian.kept):  # as where no other plan takes as little time
-                    work.set_best(plan, cost)
-                    result = self._ended_inside(lagrangian, interior)
-            else:
+                result = self._run.newton(added=lagrangian.added(), least=interior.scale)
+                lagrangian.evaluate(result.plan)
+                if lagrangian.kept or not result.success:
+                    break
+            if result is None or not (
+                result.success and lagrangian.kept
+            ):  # as where no other plan takes as little time
+                work.set_best(plan, cost)
                 result = self._ended_inside(lagrangian, interior)
         detail = ""
         if self._run.settings.elastic is not None and result.violation > self.allowed:

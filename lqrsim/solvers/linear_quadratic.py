@@ -58,10 +58,11 @@ def smooth_lq(
         part[~np.isfinite(part)] = 0.0  # as where the pass did not get, for a policy in a file is finite
     start, detail = _start(passes, failure, initial)
     states, controls, value = _rollout(parts, passes.policy, start)
-    value += float(final(states[-1])) + _cost_at(initial, states[0])
+    begun = float(initial(states[0])) if isinstance(initial, Quadratic) else 0.0
+    value += float(final(states[-1])) + begun
     gap, residual, optimality = np.inf, np.inf, np.inf
     if not detail:
-        predicted = float(Quadratic(*(part[0] for part in passes.to_go))(start)) + _cost_at(initial, start)
+        predicted = float(Quadratic(*(part[0] for part in passes.to_go))(start)) + begun
         with np.errstate(all="ignore"):
             # If terms of the cost at the origin or of the cost-to-go cancel, a rounding error relative to them remains.
             terms = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
@@ -161,20 +162,13 @@ def _off_plan(parts: tuple[Array, ...], passes: RiccatiArrays, states: Array) ->
     return gap, float((np.abs(x_hat[1:] - reached) / scale).max())
 
 
-def _cost_at(initial: Quadratic | FixedState, state: Array) -> float:
-    """The initial cost of a state; 0 if the start is fixed."""
-    return float(initial(state)) if isinstance(initial, Quadratic) else 0.0
-
-
 def _policy(gain: Array, offset: Array, nominal: Array, dt: float) -> AffinePolicy:
     _, m, n = gain.shape
-    states, controls = (
-        Coordinates(names=tuple(f"{letter}{i}" for i in range(size)), units=("",) * size)
-        for letter, size in (("x", n), ("u", m))
-    )
     return AffinePolicy(
-        gain=gain, offset=offset, nominal=nominal, dt=dt, state_coordinates=states, control_coordinates=controls
-    )
+        gain=gain, offset=offset, nominal=nominal, dt=dt,
+        state_coordinates=Coordinates(names=tuple(f"x{i}" for i in range(n)), units=("",) * n),
+        control_coordinates=Coordinates(names=tuple(f"u{i}" for i in range(m)), units=("",) * m),
+    )  # fmt: skip
 
 
 @checked

@@ -255,7 +255,7 @@ def _paths(
         for free in (Fits(any_heading, False), *narrow, Fits(fits, False)):
             for path in _routes(grid, begin, end, free, BESIDE * distance):
                 dense = _drawn(path, DENSE)
-                if all(_apart(dense, other) > BESIDE * distance for other in known):
+                if all(KDTree(other).query(dense)[0].max() > BESIDE * distance for other in known):
                     known.append(dense)
                     yield path, backwards
 
@@ -270,11 +270,6 @@ def _routes(grid: Grid, begin: Array, end: Array, free: Fits, beside: float) -> 
         near = KDTree(cells).query(grid.points, distance_upper_bound=beside)[0] < beside
         length = np.where(near, AVOIDED * length, length)
         yield np.vstack([begin, grid.cut(cells, free)[1:-1], end])
-
-
-def _apart(path: Array, other: Array) -> float:
-    """The largest distance of a path's points (K, d) from another path's (L, d)."""
-    return float(KDTree(other).query(path)[0].max())
 
 
 def _extent(problem: Problem, begin: Array, end: Array) -> tuple[Array, Array]:
