@@ -166,9 +166,8 @@ class InteriorRun:
                 lagrangian.evaluate(result.plan)
                 if lagrangian.kept or not result.success:
                     break
-            if result is None or not (
-                result.success and lagrangian.kept
-            ):  # as where no other plan takes as little time
+            # Newton's method may fail where no other plan takes as little time.
+            if result is None or not (result.success and lagrangian.kept):
                 work.set_best(plan, cost)
                 result = self._ended_inside(lagrangian, interior)
         detail = ""

@@ -1,8 +1,8 @@
 """The attempts of `smooth`, in order, until one converges.
 
-`Search.make_attempts` says what is tried in which order, and when. Loops around these attempts (`solve`) find a free
-duration (`free_duration.py`), put right what a plan does between its knots (`between_knots.py`), and leave the last
-command out of a plan with a `control_rate` (`control_rates.py`).
+`Search.make_attempts` says what is tried in which order, and each attempt when it is called for. Loops around these
+(`solve`) find a free duration (`free_duration.py`), put right what a plan does between its knots (`between_knots.py`),
+and leave the last command out of a plan with a `control_rate` (`control_rates.py`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
@@ -289,23 +289,14 @@ class Search:
         with self._problem.dynamics.solving(self._solving):
             if trees and self.may_go_on and self.is_barred:
                 self.grow_trees()
-            if self.touches:
-                self.try_detours()
+            self.try_detours()
             self.leave_saddles()
-        if self._default and self.may_go_on and self._unmoved():
-            self.push_and_approach()
-        if self.risked_too_much:
-            with self._problem.dynamics.solving(self._solving):
-                self.retry_without_risk()
-        if self.may_soften:
-            self.soften_contacts()
-        if self.has_left_given:
-            self.keep_given()
-        if self.may_go_on and not self.best[1].success:
-            self.alternate_softness()
-        if self.is_beside_cheaper:
-            with self._problem.dynamics.solving(self._solving):
-                self.leave_contact_modes()
+        self.push_and_approach()
+        self.retry_without_risk()
+        self.soften_contacts()
+        self.keep_given()
+        self.alternate_softness()
+        self.leave_contact_modes()
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
@@ -489,17 +480,14 @@ class Search:
         self._offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._budget.stop.due
 
-    @property
-    def touches(self) -> bool:
-        """Whether the best plan touches a constraint that may be passed on another side."""
-        if self._settings.start is not None or not self.best[0].second_order or self._guided:
-            return False
-        touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
-        return any(multipliers.values.any() for multipliers in touched)
-
     def try_detours(self) -> None:
-        """Finish plans from paths to the left and to the right."""
+        """Where the plan touches a constraint that may be passed on another side, also from paths to the left and right."""
         problem, tried = self._problem, {name for name, _ in self._named}
+        if self._settings.start is not None or not self.best[0].second_order or self._guided:
+            return
+        touched = itertools.compress(self.best[1].multipliers, passable(problem))
+        if not any(multipliers.values.any() for multipliers in touched):
+            return
         for name, trajectory in multistart.detours(problem, self._settings.starts).items():
             if name not in tried and not self._budget.stop.due:
                 self._try(name, trajectory)
@@ -556,6 +544,8 @@ class Search:
         """Begin with motions that change states that miss their goal and that no control changes, as of a box: pushes
         by one control at a time, and approaches to a body that nothing touches.
         """
+        if not (self._default and self.may_go_on and self._unmoved()):
+            return
         problem, before, places = self._problem, self.best[1], self._unmoved()
         self._still = before, places
         plans = list[tuple[bool, float, str, InitialGuess]]()
@@ -618,21 +608,17 @@ class Search:
             self._unmoved_of = best, places
         return self._unmoved_of[1]
 
-    @property
-    def has_left_given(self) -> bool:
-        """Whether the best plan is worse than the plan that the caller gave, or has left what that moved."""
-        (run, best), given = self.best, self._given
-        return given is not None and (
-            reach.differ(best, given, self._unmoved())
-            or run.is_worse(best, given)
-            or reach.goal_left(self._problem, best, given)
-        )
-
     def keep_given(self) -> None:
-        """Descend from the plan that the caller gave; return it, if none is better."""
+        """Where the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan.
+
+        It is the answer if none is better.
+        """
         (run, best), given = self.best, self._given
-        assert given is not None
+        if given is None:
+            return
         still = reach.differ(best, given, self._unmoved())
+        if not (still or run.is_worse(best, given) or reach.goal_left(self._problem, best, given)):
+            return
         if not self._budget.stop.due:
             run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
@@ -644,23 +630,20 @@ class Search:
             detail = "no plan was found that is better than the given one, which is returned"
             self._offer(run, replace(given, status=status, detail=detail), better=True)
 
-    @property
-    def risked_too_much(self) -> bool:
-        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
-        return self._problem.risk > 0 and too_high and self.may_go_on
-
     def retry_without_risk(self) -> None:
-        """Solve without risk, and continue from that plan."""
-        riskless = replace(self._problem, risk=0.0)
-        runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-        riskless_plan = finish(choose(runs, self._threads)[0], Known())
-        if not riskless_plan.success or self._budget.stop.due:
+        """Where the risk was too high for an intermediate plan, solve without risk, and continue from that plan."""
+        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
+        if not (self._problem.risk > 0 and too_high and self.may_go_on):
             return
-        begin = guess_from(riskless_plan, "a plan without risk")
-        run = self._add(
-            replace(begin, cost_to_go=riskless_plan.values["cost_to_go"], multipliers=riskless_plan.multipliers)
-        )
-        result = self._finish(run)
+        riskless = replace(self._problem, risk=0.0)
+        with self._problem.dynamics.solving(self._solving):
+            runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
+            plan = finish(choose(runs, self._threads)[0], Known())
+            if not plan.success or self._budget.stop.due:
+                return
+            begin = guess_from(plan, "a plan without risk")
+            run = self._add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
+            result = self._finish(run)
         # Of plans whose risk is too high, this one is near an optimum.
         self._offer(run, result, better=result.rank <= self.best[1].rank)
 
@@ -673,8 +656,11 @@ class Search:
         are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
         less: for the softest contacts, it would leave the body alone again.
         """
-        problem, moved = self._problem, self._best_nearer
-        begin = self.best[1] if moved is None else moved[1]
+        problem, moved, best = self._problem, self._best_nearer, self.best[1]
+        alone = moved is not None and not self._comes_nearer(best)
+        if not (self._default and self.may_go_on and (alone or not best.success)):
+            return
+        begin = best if moved is None else moved[1]
         self._soft = [
             (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
         ]
@@ -698,6 +684,8 @@ class Search:
         Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
         again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
         """
+        if self.best[1].success or not self.may_go_on:
+            return
         optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
         for _ in range(ROUNDS):
             before = self._cheapest
@@ -714,19 +702,16 @@ class Search:
             if not optimum.cost < before.cost - FELL * abs(before.cost):
                 return
 
-    @property
-    def is_beside_cheaper(self) -> bool:
-        """Whether the best plan ended within its contact modes, though a plan beside it is cheaper."""
+    def leave_contact_modes(self) -> None:
+        """Descend from a best plan that ended within its contact modes, if a plan beside it is cheaper, out of them."""
         run, best = self.best
         contacts = None if best.certificate is None else best.certificate.contacts
         if best.success or contacts is None or not self.may_go_on:
-            return False
-        return max(contacts.across, contacts.sampled) > run.final
-
-    def leave_contact_modes(self) -> None:
-        """Descend from the best plan whatever its contact modes are."""
-        run = self._add(guess_from(self.best[1], "the best plan"), "the best plan, out of its contact modes")
-        with run.budget.limited(SOFT):
+            return
+        if not max(contacts.across, contacts.sampled) > run.final:
+            return
+        run = self._add(guess_from(best, "the best plan"), "the best plan, out of its contact modes")
+        with self._problem.dynamics.solving(self._solving), run.budget.limited(SOFT):
             result = self._finish(run, refine)
         self._offer(run, result, better=self._is_better(result))
 
@@ -900,13 +885,6 @@ class Search:
     def may_go_on(self) -> bool:
         """Whether other starts may be tried: by default, as long as there is time."""
         return self._settings.safeguard and not self._budget.stop.due
-
-    @property
-    def may_soften(self) -> bool:
-        """Whether softer contacts may lead to a better plan: none has converged, or the best leaves a body alone."""
-        best = self.best[1]
-        alone = self._best_nearer is not None and not self._comes_nearer(best)
-        return self._default and self.may_go_on and (alone or not best.success)
 
     @property
     def _cut_short(self) -> bool:
