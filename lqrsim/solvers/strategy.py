@@ -481,7 +481,7 @@ class Search:
         self.tried = not self._budget.stop.due
 
     def try_detours(self) -> None:
-        """Where the plan touches a constraint that may be passed on another side, also from paths to the left and right."""
+        """Where the plan touches a constraint that may be passed on another side, finish plans from paths to the sides."""
         problem, tried = self._problem, {name for name, _ in self._named}
         if self._settings.start is not None or not self.best[0].second_order or self._guided:
             return
