@@ -96,10 +96,7 @@ def parts_of(problem: Problem) -> dict[str, str]:
 
 
 def _usable(problem: Problem, result: RunResult, options: dict[str, object]) -> str:
-    """What the certificate says of a plan that is finished but not optimal, because time or iterations ended; or empty.
-
-    It is empty for a plan that misses a constraint, which the detail names.
-    """
+    """What the certificate says of a plan for which time or iterations ended, or empty if it misses a constraint."""
     plan, tolerance, allowed = result.certificate, options.get("tolerance"), options.get("constraint_tolerance")
     if result.status not in (Status.TIME_LIMIT, Status.MAX_ITERATIONS) or plan is None or not np.isfinite(plan.cost):
         return ""
@@ -253,10 +250,7 @@ def _reach(rate: complex) -> float:
 def remedy_of(
     problem: Problem, result: RunResult, log: Sequence[Iteration], options: dict[str, object], *, shorter: str
 ) -> str:
-    """The remedy for this case; if none is known, the usual one for the status. Empty for a success that needs none.
-
-    `shorter` names the steps to take where those of the plan are unstable.
-    """
+    """The remedy for this case, such as `shorter` steps, or else the usual one; empty for a success that needs none."""
     status = result.status
     lost = status in (Status.NOT_FINITE, Status.NOT_POSITIVE_DEFINITE, Status.DIVERGED)
     if lost and options.get("safeguard") is False:

@@ -66,10 +66,7 @@ class Known:
 
 
 class ConstrainedRun:
-    """Tries one plan after another as the beginning of the interior point, until it converges.
-
-    With `stay`, only plans from the rollout of the first policy are tried.
-    """
+    """Tries plans in turn, with `stay` from the rollout of the first policy, until the interior point converges."""
 
     def __init__(self, run: SolveRun, known: Known, *, stay: bool = False) -> None:
         self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
@@ -350,11 +347,8 @@ def evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) 
 def _violation_slopes(
     run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes
 ) -> tuple[float, Array, Array, list[tuple[float, str]]]:
-    """The total violation, relative to the rows' sizes, and its slopes.
-
-    Returns:
-      The violation; slopes (T+1, n+m) of all rows with their multipliers, and of the violated rows alone; and the rows
-      in words, each with its fraction.
+    """The total violation, relative to the rows' sizes; its slopes (T+1, n+m) of all rows with their multipliers and of
+    the violated rows alone; and the rows in words, each with its fraction.
     """
     problem, work, states, controls = run.problem, run.work, plan.states, plan.controls
     allowed = run.settings.violation_tolerance(problem)

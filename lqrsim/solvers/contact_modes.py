@@ -156,8 +156,7 @@ class ModeStep(NamedTuple):
 def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, depth: float = 0.0) -> ModeStep | None:
     """Minimise `gradient d + 1/2 d curvature d` with all switches and limits on their sides; None if that fails.
 
-    Args:
-      across: a switch that must be crossed by `depth` instead; the change is then as small as possible.
+    If a switch `across` must be crossed by `depth` instead, the change is as small as possible.
     """
     model.check_time()
     try:
@@ -217,11 +216,8 @@ Linearized = tuple[Array, list[Period]]  # points and periods of a plan
 def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: ModeStep) -> Array:
     """The part of the Lagrangian's Hessian that the model lacks, (T m, T m): second derivatives of periods, switches.
 
-    Each period's matrix is built by symmetric updates of rank one (SR1), from zero, over the earlier plans in which the
-    period had the same mode.
-
-    Args:
-      earlier: linearised plans, the latest last. step: the step whose multipliers are used.
+    Each period's matrix is built by symmetric updates of rank one (SR1), from zero, over the earlier plans, the latest
+    last, in which the period had the same mode. The multipliers are those of the step.
     """
     n = len(model.last[0])
     lacking, costate, signed = np.zeros_like(model.hessian), model.last[0], model.sides * step.multipliers
@@ -260,11 +256,7 @@ def bent(curvature: Array, lacking: Array) -> Array:
 
 
 class Descent:
-    """Descent from a plan, mode by mode.
-
-    Attributes:
-      plan: the best plan so far. model: the model about it.
-    """
+    """Descent from a plan, mode by mode, with the best `plan` so far and the model about it."""
 
     def __init__(
         self, problem: Problem, modes: ContactModes, plan: CostedPlan, tolerance: float, budget: Budget
@@ -471,11 +463,8 @@ def optimality_in_mode(
 
     By duality: half the square of the Lagrangian's gradient in the offsets, weighed as in `kernels/certificate.py`, and
     the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives in
-    a separate recursion, not the model from which the plan was found.
-
-    Args:
-      multipliers: nonnegative, of the switches of each period, by name. limits: multipliers of the control limits,
-        (T, m), negative for upper limits.
+    a separate recursion, not the model from which the plan was found. Multipliers of switches are nonnegative, those of
+    the control limits, (T, m), negative for upper limits.
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]

@@ -71,9 +71,8 @@ def _narrow(plan: Trajectory, problem: Problem) -> Trajectory:
 def feedback(
     problem: Problem, plan: Trajectory, multipliers: tuple[Multipliers, ...] = ()
 ) -> tuple[AffinePolicy, Quadratic | None]:
-    """A policy about a plan, and its cost-to-go: those of the problem with the quadratic in place of the rates' cost.
-
-    Without feedback, if there is none. The states of the plan have the last command.
+    """A policy about a plan that has the last command, if possible with feedback, and its cost-to-go: those of the
+    problem with the quadratic in place of the rates' cost.
     """
     states, controls = _narrow(plan, problem).states, plan.controls
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None

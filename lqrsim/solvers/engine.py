@@ -276,10 +276,7 @@ class SolveRun:
         return ending
 
     def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0, patient: bool = False) -> RunResult:
-        """Newton's method from the best plan so far; for `added` and `least` see `Workspace.begin_descent`.
-
-        If no other method can follow, it is `patient`: it takes short steps, too.
-        """
+        """Newton's method from the best plan so far; if no other method can follow, with short steps too."""
         ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.final, added=added, least=least)
         status = ending.status
         if ending.outcome == declarations.STALLED:

@@ -79,12 +79,7 @@ def solve_for_duration(
 
 
 class DurationSearch:
-    """A search for the best duration, from one plan after another.
-
-    Attributes:
-      best: the cheapest optimum so far: the problem with its duration, and what the interior point found; or None.
-      candidates: what was tried.
-    """
+    """A search for the best duration, from one plan after another."""
 
     def __init__(
         self, problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution],
@@ -94,8 +89,9 @@ class DurationSearch:
         self._problem, self._settings, self._solve = problem, settings, solve
         self._range, self._stop = problem.duration, stop
         self._budget = Budget(settings.max_iterations, stop, callback=stop.callback)
+        # The cheapest optimum so far: the problem with its duration, and what the interior point found.
         self.best: tuple[Problem, InteriorResult] | None = None
-        self.candidates = list[Candidate]()
+        self.candidates = list[Candidate]()  # what was tried
         self._log = list[Iteration]()  # of the search that led to the best plan
         self._fixed, self._total = list[Solution](), 0
 
@@ -253,10 +249,7 @@ class DurationSearch:
             begin = again.trajectory
 
     def _find(self, begin: Trajectory, budget: Budget, fraction: float = 1.0) -> tuple[bool, Problem, InteriorResult]:
-        """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan.
-
-        `fraction` is of the tolerance.
-        """
+        """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
         before, settings = len(budget.log), self._settings
         with self._stop.reporting("smooth"):
             ordinary, result = find_duration(
@@ -437,11 +430,7 @@ def _with_timed_segments(
 
 
 def with_duration_state(problem: Problem, *, by_segment: bool = False) -> Problem:
-    """The problem with its duration as the last state; or with that of a plan of steps as long as the segment's.
-
-    Raises:
-      InputError: a part of the problem cannot be stated with one more state.
-    """
+    """The problem with its duration as the last state; or with that of a plan of steps as long as the segment's."""
     assert problem.duration is not None
     dynamics, n = problem.dynamics, len(problem.dynamics.state_coordinates)
     stated, (low, high) = problem.steps * problem.dt, problem.duration

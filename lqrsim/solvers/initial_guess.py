@@ -122,8 +122,7 @@ class InitialGuess:
     def rolled_out(self, problem: Problem, x: Array) -> "InitialGuess":
         """This guess with the trajectory of its policy from a state (n,), about which a backward pass can begin.
 
-        If the rollout is not finite, the last finite state and control are repeated; the trajectory need not be
-        feasible.
+        It need not be feasible: if the rollout is not finite, the last finite state and control are repeated.
         """
         states, controls = [x], []
         with np.errstate(all="ignore"):
@@ -138,16 +137,12 @@ class InitialGuess:
         return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
     def penalised(self, problem: Problem, penalty: float | None) -> "InitialGuess":
-        """This guess with a penalty for all constraints from the first iteration on; unchanged for None.
-
-        Raises:
-          InputError: the problem has no constraints, or there is a prior, during whose iterations constraints are off.
-        """
+        """This guess with a penalty for all constraints from the first iteration on; unchanged for None."""
         if penalty is None:
             return self
         if not problem.constraints:
             raise InputError(f"penalty: got {penalty:g} for a problem without constraints, want None")
-        if self.prior is not None:
+        if self.prior is not None:  # during whose iterations constraints are off
             raise InputError(f"penalty: got {penalty:g} beside an InitialPrior, want another start")
         known = [multipliers.values for multipliers in self.multipliers]
         values = known or [np.zeros((problem.steps + 1, term.rows)) for term in problem.constraint_terms]

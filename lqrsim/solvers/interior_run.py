@@ -54,10 +54,7 @@ class InteriorRun:
     def run_from(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
     ) -> RunResult | None:
-        """The result from a plan; None if there is none, or the budget is over. The iterations go to the log.
-
-        `stale` iterations without a new least stationarity end it.
-        """
+        """The result from a plan, or None; `stale` iterations without a new least stationarity end it."""
         budget, run, result = self._budget, self._run, None
         if budget.left < 2 or budget.stop.due:
             return None

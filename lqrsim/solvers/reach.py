@@ -26,11 +26,7 @@ NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
 
 def unmoved(problem: Problem, states: Array, controls: Array, cost: float, allowed: float) -> list[int]:
-    """The states that miss their goal and that no control changes along a plan.
-
-    Args:
-      states: (T+1, n), finite. controls: (T, m). cost: of the plan. allowed: tolerance of constraints.
-    """
+    """The states that miss their goal, of a constraint by more than `allowed`, and that no control of a plan changes."""
     end, goal, start = states[-1], problem.goal, states[0]
     sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
     sizes = np.where(sizes > 0, sizes, 1.0)
@@ -93,9 +89,8 @@ def comes_nearer(problem: Problem, plan: RunResult | Motion, other: RunResult, p
 
 def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
     """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
-    body to its goal, in words. Their solutions are starts in which the robot touches the body.
-
-    The goals of the body itself are left out of the constraints, as it does not move there.
+    body to its goal, in words. Their solutions are starts in which the robot touches the body, whose own goals are left
+    out of the constraints, as it does not move there.
     """
     constraints = [part for part in problem.constraints if not part.final_states(problem.dynamics)]
     shortfall = missing(problem, result.states[-1], places)

@@ -248,12 +248,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 
 
 class Search:
-    """Several runs, the most promising of which are finished. The answer must not be worse than the plan `given`.
-
-    Attributes:
-      best: the run with the best result so far, and that result. tried: whether other starts were tried, as far as
-        they are to be.
-    """
+    """Several runs, the most promising of which are finished. The answer must not be worse than the plan `given`."""
 
     def __init__(self, named: list[tuple[str, SolveRun]], given: RunResult | None = None) -> None:
         first = named[0][1]
@@ -265,7 +260,7 @@ class Search:
         self._solving = self._threads if len(named) == 1 else 1
         self._guided = multistart.path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
         self._default = self._settings.start is None and self._settings.starts is None
-        self.tried = not self._settings.safeguard
+        self.tried = not self._settings.safeguard  # whether other starts were tried, as far as they are to be
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._unmoved_of: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
         # A plan and states that miss their goal, which no control changes along it; the best plan that brings them
@@ -280,6 +275,7 @@ class Search:
 
     @property
     def best(self) -> tuple[SolveRun, RunResult]:
+        """The run with the best result so far, and that result."""
         return self._finished[0]
 
     def make_attempts(self, *, trees: bool) -> None:
@@ -481,7 +477,7 @@ class Search:
         self.tried = not self._budget.stop.due
 
     def try_detours(self) -> None:
-        """Where the plan touches a constraint that may be passed on another side, finish plans from paths to the sides."""
+        """Finish plans from paths to the sides, if the best touches a constraint that may be passed on another side."""
         problem, tried = self._problem, {name for name, _ in self._named}
         if self._settings.start is not None or not self.best[0].second_order or self._guided:
             return
@@ -589,11 +585,9 @@ class Search:
         return self._still is not None and reach.comes_nearer(self._problem, plan, *self._still)
 
     def _is_better(self, result: RunResult) -> bool:
-        """Whether a plan is better than the best.
-
-        Where only one of them moves a body that was out of reach, the cost decides. To leave it alone converges easily.
-        """
+        """Whether a plan is better than the best."""
         best = self.best[1]
+        # Where only one of them moves a body that was out of reach, cost decides: to leave it alone converges easily.
         if self._comes_nearer(result) == self._comes_nearer(best):
             return result.rank < best.rank
         return result.violation <= best.violation and result.cost < best.cost
@@ -609,10 +603,7 @@ class Search:
         return self._unmoved_of[1]
 
     def keep_given(self) -> None:
-        """Where the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan.
-
-        It is the answer if none is better.
-        """
+        """If the best plan is worse than the caller's, or has left what that moved, descend from the latter, or keep it."""
         (run, best), given = self.best, self._given
         if given is None:
             return
