@@ -603,7 +603,7 @@ class Search:
         return self._unmoved_of[1]
 
     def keep_given(self) -> None:
-        """If the best plan is worse than the caller's, or has left what that moved, descend from the latter, or keep it."""
+        """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
         (run, best), given = self.best, self._given
         if given is None:
             return
