@@ -113,16 +113,12 @@ class Stop:
 
 
 class Budget:
-    """Iterations, time and callback of one run. Runs of one solve share a `Stop`; each has its own iterations.
-
-    Attributes:
-      log: the iterations so far, by any method.
-    """
+    """Iterations, time and callback of one run. Runs of one solve share a `Stop`; each has its own iterations."""
 
     def __init__(self, most: int, stop: Stop | None = None, *, callback: Callback | None = None) -> None:
         self._most, self._callback, self._reported = most, callback, 0
         self.stop = Stop() if stop is None else stop
-        self.log: list[Iteration] = []
+        self.log: list[Iteration] = []  # the iterations so far, by any method
 
     def another(self) -> "Budget":
         """A budget for another run, with the same number of iterations."""
@@ -208,13 +204,9 @@ class Budget:
 
 
 class Laps:
-    """Records the iterations of a method that Python runs itself, with their seconds and improvements.
+    """Records the iterations of a method that Python runs itself, with their seconds and improvements on a first cost.
 
-    Args:
-      budget: the budget whose log they join. cost: the cost that the first iteration improves on.
-
-    Attributes:
-      ended: time at which the last iteration ended, on the clock of `time.perf_counter`.
+    The last iteration has `ended` at that time of `time.perf_counter`.
     """
 
     def __init__(self, budget: Budget, cost: float = np.inf) -> None:
@@ -306,8 +298,8 @@ def reported(
 
     Args:
       what: name of the activity, such as "smooth".
-      progress: function that returns the results so far, and the time that is left, as text.
-      called: function that returns the time at which a callback was last called, on the clock of `time.perf_counter`.
+      progress: returns the results so far, and the time that is left, as text.
+      called: returns the time at which a callback was last called, on the clock of `time.perf_counter`.
       begun: time at which the activity began, on the same clock; by default now.
     """
     return _watch.watching(_Activity(what, progress, called, time.perf_counter() if begun is None else begun))

@@ -58,10 +58,8 @@ def faults(
 ) -> str:
     """List, in words, all contradictions to a claim of convergence; empty if there are none.
 
-    Args:
-      claimed: the last cost in the log. rounding: the error of a cost whose terms cancel.
-      tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether all constraints are kept
-        within their tolerances, so that a violation above 0 is no fault.
+    The cost is to be the last in the log, but for the rounding of terms that cancel. The tolerance of the optimality is
+    None if only the cost was tested. If all constraints are kept within tolerances, a violation above 0 is no fault.
     """
     contradictions = []
     if certificate.start != 0:

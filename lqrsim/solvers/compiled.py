@@ -243,9 +243,8 @@ class ConstraintMultipliers:
     """A constraint's multipliers, in the memory that compiled code reads. Initially the constraint does not act.
 
     Attributes:
-      margin: margin with which an inequality is to be kept. price: of a violation, in cost per unit. first: the first
-        step at which it acts.
-      array: all numbers, in the layout of `kernels/augmented_lagrangian.py`. values: ((T+1) rows,) multipliers in it.
+      margin: with which an inequality is to be kept. price: of a violation, in cost per unit. first: step at which it
+        acts. array: all numbers, as in `kernels/augmented_lagrangian.py`. values: ((T+1) rows,) multipliers in it.
     """
 
     def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:

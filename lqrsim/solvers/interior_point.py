@@ -171,12 +171,9 @@ class InteriorPoint:
 
 
 class ActiveSet:
-    """Steps from one plan.
+    """Steps from one plan, not necessarily feasible, whose first state is the start.
 
-    Args:
-      plan: states (T+1, n) and controls (T, m), not necessarily feasible; the first state is the start.
-      multipliers: of the constraints, (T+1, rows) each, or none.
-      violation: tolerance of equalities; a fraction of it is the margin of inequalities.
+    The violation is the tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
       plan: the current plan, which steps overwrite. held: (T+1, R) 1 for rows held at their targets, else 0.
@@ -202,10 +199,8 @@ class ActiveSet:
     def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
         """Take steps until the measures are within tolerance; return whether they are.
 
-        Args:
-          tolerance: tolerance of stationarity, gaps and complementarity.
-          watch: called with the measures after each step; True ends it.
-          late: called before a piece of work with its expected duration in seconds; True abandons the step.
+        After each step `watch` may end it. Called before a piece of work with its expected duration in seconds, `late`
+        may abandon the step.
         """
         ended = False
         for _ in range(STEPS):

@@ -297,17 +297,15 @@ class _Finder:
       run: a run with the initial law and multipliers. best: the plan that the law leads to.
       plan: states and controls to which the law belongs; the first state is the start.
       closing: duration of the work after the last iteration, in s.
-
-    Attributes:
-      laps: the times of its iterations; the last iteration may be an abandoned step.
-      may_be_far: whether it found nothing, and there is time to look elsewhere, as when an obstacle is in the way.
     """
+
+    may_be_far = False  # whether it found nothing, and there is time to look elsewhere: an obstacle may be in the way
 
     def __init__(self, run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
         self._run, self._stages, self._plan, self._best = run, run.stages, plan, best
         self._closing, self._budget = closing, run.budget
         self._allowed = run.settings.violation_tolerance(run.problem)
-        self.laps, self.may_be_far, self._out_of_time = Laps(run.budget), False, False
+        self.laps, self._out_of_time = Laps(run.budget), False  # the last iteration may be an abandoned step
         for function in functions_of(run.problem):
             function.forget()
 
@@ -454,26 +452,21 @@ def _finder(run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) ->
 
 
 class _Best:
-    """The best plan so far, initially the plan that the solve starts from. It is called after each iteration.
-
-    Attributes:
-      cost_to_go: of the law; None if unknown. multipliers: those with which it was found. before: the cost of the first
-        plan. improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
-    """
+    """The best plan so far, initially the plan that the solve starts from. It is called after each iteration."""
 
     def __init__(self, run: SolveRun) -> None:
         self._run, self._work, guess = run, run.work, run.initial_guess
         clock = time.perf_counter()
         run.roll_out()
-        self.rolling_out = time.perf_counter() - clock
+        self.rolling_out = time.perf_counter() - clock  # of the first plan, in s
         values = self._work.constraint_values(self._work.last)
         self.cost = _cost_of(run, self._work.cost, self._work.last, self._work.arrays.last_policy)
         self.violation = self._work.violation(values)
-        self.before = self.cost
+        self.before = self.cost  # of the first plan
         self.plan = copied(self._work.last)
         self.law = Policy(guess.gain, guess.offset)
         self.cost_to_go, self.multipliers = guess.cost_to_go, guess.multipliers
-        self.improved = False
+        self.improved = False  # whether it differs from the first plan
         # Equalities are kept only within a tolerance.
         allowed = run.settings.violation_tolerance(run.problem)
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
