@@ -33,8 +33,7 @@ from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.policy import AffinePolicy
 
-# The forms of the cost-to-come, with their kernels.
-FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
+FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}  # of the cost-to-come, with their kernels
 
 
 def core(problem: Problem, form: str = "dual") -> CompiledModule:

@@ -38,11 +38,9 @@ from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.linear_quadratic import WEIGH_MORE
 
 NO_MINIMUM, FLAT = "S + Sbar is not positive definite", "R is not positive definite"
-
 # Largest number of evaluations of one right-hand side, a few seconds. A trajectory that needs more diverges or is far
 # too stiff.
 _EVALUATIONS = 100_000
-
 # The dense output of DOP853 is a polynomial of degree 7 per step, which eight points determine.
 _NODES = 0.5 * (1.0 - np.cos(np.pi * np.arange(8) / 7))
 _FIT = np.linalg.inv(np.vander(_NODES))

@@ -603,9 +603,8 @@ class SolveRun:
             for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
                 cost, improvement, gap, optimality, residual, method = row
                 violation = missed if i == done or not problem.constraints else float("nan")
-                budget.record(
-                    Iteration(cost, improvement, gap, optimality, residual, violation, seconds, _METHODS[int(method)])
-                )
+                name = _METHODS[int(method)]
+                budget.record(Iteration(cost, improvement, gap, optimality, residual, violation, seconds, name))
             stop.pace = time.perf_counter() - clock
             if stop.error is not None:
                 outcome = declarations.TIMED_OUT
@@ -806,10 +805,8 @@ class Workspace:
     def keeps(self, values: list[Array]) -> bool:
         """Whether a plan with these values keeps all constraints within their tolerance, or at their price."""
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
-        pairs = zip(self.multipliers, values, strict=True)
-        return self.priced or all(
-            violation_of(multipliers.term, numbers) <= allowed(multipliers.term) for multipliers, numbers in pairs
-        )
+        pairs = zip((multipliers.term for multipliers in self.multipliers), values, strict=True)
+        return self.priced or all(violation_of(term, numbers) <= allowed(term) for term, numbers in pairs)
 
 
 def _cost_of(iteration: Iteration | None) -> float:

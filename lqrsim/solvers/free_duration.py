@@ -252,9 +252,8 @@ class DurationSearch:
         """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
         before, settings = len(budget.log), self._settings
         with self._stop.reporting("smooth"):
-            ordinary, result = find_duration(
-                self._problem, begin, settings, budget, tolerance=fraction * settings.final(self._problem)
-            )
+            tolerance = fraction * settings.final(self._problem)
+            ordinary, result = find_duration(self._problem, begin, settings, budget, tolerance=tolerance)
         self._total += len(budget.log) - before
         cheaper = result.solved and (self.best is None or result.measures.cost < self.best[1].measures.cost)
         if cheaper:
@@ -354,9 +353,8 @@ def find_duration(
     if by_segment is not None:
         problem, begin = by_segment
     n = len(problem.dynamics.state_coordinates)
-    stages, prices, result = _searched(
-        problem, begin, settings, budget, tolerance=tolerance, hold=by_segment is not None
-    )
+    held = by_segment is not None
+    stages, prices, result = _searched(problem, begin, settings, budget, tolerance=tolerance, hold=held)
     cost = result.measures.cost + _paid(stages, result.plan, prices)
     duration = float(np.clip(result.plan.states[0, n], low, high))
     # Remove everything that belongs to the duration.

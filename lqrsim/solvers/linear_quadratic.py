@@ -20,6 +20,9 @@ from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.versions import versions
 
+ACCURACY = 1e-6  # relative accuracy of cost and states that a solved problem must have
+ROUNDING = 1e-14  # of a cost in which larger terms cancel, the part of these terms that is taken for rounding
+_WHICH = ("backward pass", "forward pass", "minimum of the total cost")  # the passes that `lq_passes` numbers
 WEIGH_MORE = "raise the weights of states or controls, or shorten the horizon: the cost has no single minimum"
 
 
@@ -99,16 +102,6 @@ def smooth_lq(
         problem_digest=_digest(parts, initial, final),
         versions=versions(),
     )
-
-
-# Relative accuracy of cost and states that a solved problem must have.
-ACCURACY = 1e-6
-
-# Of a cost in which larger terms cancel, the part of these terms that is taken for rounding.
-ROUNDING = 1e-14
-
-# The passes that `lq_passes` numbers.
-_WHICH = ("backward pass", "forward pass", "minimum of the total cost")
 
 
 def _passes(

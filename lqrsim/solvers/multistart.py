@@ -222,9 +222,8 @@ def check_starts(problem: Problem, count: int | None) -> None:
 def path_weight(problem: Problem) -> float:
     """The weight of the path in the first iteration; 0 if there is nothing to go round."""
     moving = _moving(problem)
-    if not moving or problem.start is None or problem.goal is None:
-        return 0.0
-    if np.array_equal(problem.start[moving], problem.goal[moving]):
+    start, goal = problem.start, problem.goal
+    if not moving or start is None or goal is None or np.array_equal(start[moving], goal[moving]):
         return 0.0
     costs = [cost for cost in problem.obstacle_costs if len(cost.kept_clear.world)]
     return max((PATH_WEIGHT * cost.contact_curvature for cost in costs), default=0.0)

@@ -118,30 +118,24 @@ class PreparedSolver(OneVersion):
         return f"PreparedSolver({n} states, {m} controls, {steps} steps)"
 
     def _compile(self) -> None:
-        n, steps = len(self.problem.dynamics.state_coordinates), self.problem.steps
+        n, guess = len(self.problem.dynamics.state_coordinates), resolve(None, self.problem)
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
-        control = self.problem.nominal_control.copy()
-        law = Policy(np.zeros((steps, len(control), n)), np.tile(control, (steps, 1)))
-        guess, budget = InitialGuess(*law), Budget(self.settings.max_iterations)
-        run = SolveRun(self.problem, self.settings, guess, state, budget)
+        run = SolveRun(self.problem, self.settings, guess, state, Budget(self.settings.max_iterations))
         run.roll_out()
-        compiled.rollout(self.problem, *law, state)
+        compiled.rollout(self.problem, guess.gain, guess.offset, state)
         clearance_of(self.problem, run.work.last.states)  # a solution that is shifted has it
         run.work.constraint_values(run.work.best)
         for which in range(len(self.problem.constraint_terms)):
-            run.work.constraint_slope(which, 0, state, control, 0)
+            run.work.constraint_slope(which, 0, state, guess.offset[0], 0)
         if self.problem.constraints and run.second_order:
             stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
             _finder(run, plan, best).find()
             if _can_yield(self.problem):
                 return
             # Another solve may need code that this solve did not need.
-            InteriorPoint(stages, plan).run(
-                tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
-            )
-            restore(
-                stages, plan, stages.sizes(plan), price=1.0, most=1, watch=lambda *_: True, stationary=lambda *_: False
-            )
+            allowed, sizes = run.settings.violation_tolerance(self.problem), stages.sizes(plan)
+            InteriorPoint(stages, plan).run(tolerance=run.final, violation=allowed, most=1)
+            restore(stages, plan, sizes, price=1.0, most=1, watch=lambda *_: True, stationary=lambda *_: False)
 
     @checked
     def check(self, problem: Problem) -> Problem:
@@ -189,9 +183,8 @@ class PreparedSolver(OneVersion):
         if time_limit is not None:
             stop.deadline = clock + time_limit
         budget = Budget(self.settings.max_iterations, stop)
-        run = SolveRun.lent(
-            problem, self.settings, resolve(start, problem), np.asarray(state, dtype=np.float64), budget
-        )
+        begin = np.asarray(state, dtype=np.float64)
+        run = SolveRun.lent(problem, self.settings, resolve(start, problem), begin, budget)
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
             if problem.constraints and run.second_order:
@@ -235,9 +228,8 @@ class PreparedSolver(OneVersion):
             time_limit = max(left, 1e-9)
         wide_plan = solver.solve(wide.start, widened(start, problem, wide), problem=wide, time_limit=time_limit)
         ended = time.perf_counter()
-        plan = narrowed(
-            wide_plan, problem, *feedback(problem, wide_plan.trajectory, wide_plan.multipliers), seconds=0.0
-        )
+        policy, cost_to_go = feedback(problem, wide_plan.trajectory, wide_plan.multipliers)
+        plan = narrowed(wide_plan, problem, policy, cost_to_go, seconds=0.0)
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return replace(plan, seconds=time.perf_counter() - clock)
 
@@ -369,10 +361,8 @@ class _Neighbour(_Finder):
         if not np.isfinite(active.measures).all():
             return replace(_unchanged(self._best), status=self._unsolved, detail=raised_by(functions_of(problem)))
         plan, gain, cost, values = active.carried_out()
-        pairs = zip(problem.constraint_terms, values, strict=True)
-        solved = solved and all(
-            violation_of(term, numbers) <= allowed_violation(term, self._allowed) for term, numbers in pairs
-        )
+        for term, numbers in zip(problem.constraint_terms, values, strict=True):
+            solved = solved and violation_of(term, numbers) <= allowed_violation(term, self._allowed)
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,

@@ -66,6 +66,7 @@ class Stages:
         R, n+m) of its rows.
       force, held: (T+1, R) multipliers of the rows, and 1 for rows that an active set holds.
       limits: for each row that is a limit, its sign, the control, and the value of the limit.
+      free: (n,) 1 for the states of the start that are free, else 0. row_sizes: (R,) typical sizes of the rows.
       about: `records.PlanStages`, the argument of the kernels; it has the last step.
     """
 
@@ -86,6 +87,7 @@ class Stages:
         by_step = (array.reshape(steps + 1, rows) for array in stage_rows[4:])
         self._acts, self._live, self.held, self._kinds, *others = by_step
         self._sizes, self._targets, self._prices, _, self.force = others
+        self.free, self.row_sizes = self.about.free, self._sizes[0]
         self._read_problem(problem)
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign
@@ -137,11 +139,6 @@ class Stages:
             self._prices[...] = np.where(limit, np.inf, price)
         if margin is not None:
             self._targets[...] = np.where(limit | self.equality, 0.0, margin)
-
-    @property
-    def free(self) -> Array:
-        """(n,) 1 for the states of the start that are free, else 0."""
-        return self.about.free
 
     def jump(self, knots: Sequence[int]) -> None:
         """Let the last state jump at some knots, each after the first."""
@@ -220,10 +217,6 @@ class Stages:
         self.live[...] = self._live > 0
         about = self.about
         return Sizes(about.state_size.copy(), about.control_size.copy(), self.row_sizes.copy(), cost)
-
-    @property
-    def row_sizes(self) -> Array:
-        return self._sizes[0]
 
     def resize(self, sizes: Sizes) -> None:
         self.about.state_size[...], self.about.control_size[...] = sizes.states, sizes.controls

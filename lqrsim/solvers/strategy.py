@@ -913,11 +913,10 @@ class Search:
             return run.budget.left > 0
         if space.position:
             place = list(space.position)
-            arrived = np.linalg.norm(best.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
+            far = not np.linalg.norm(best.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
         else:
-            target = Target(space, problem.weighed_goal, best.states)
-            arrived = target.distance(best.states[-1]) <= TOLERANCE
-        if not arrived:
+            far = not Target(space, problem.weighed_goal, best.states).distance(best.states[-1]) <= TOLERANCE
+        if far:
             return True
         clearance = clearance_of(problem, best.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius
