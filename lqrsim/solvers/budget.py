@@ -206,7 +206,7 @@ class Budget:
 class Laps:
     """Records the iterations of a method that Python runs itself, with their seconds and improvements on a first cost.
 
-    The last iteration has `ended` at that time of `time.perf_counter`.
+    `ended` is the time of `time.perf_counter` at which the last of them ended.
     """
 
     def __init__(self, budget: Budget, cost: float = np.inf) -> None:

@@ -53,7 +53,7 @@ def sinusoidal_name(cycles: int) -> str:
 
 
 def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
-    """The starts of a search and their names: paths to the goal, the straight path first; by default `STARTS`.
+    """The starts of a search, by default `STARTS`, and their names: paths to the goal, the straight path first.
 
     A problem without obstacles, or without a start and a goal, has one start, the nominal control. The paths are paths
     of the position. For a robot of collision spheres without a position, they are paths of the states that move the

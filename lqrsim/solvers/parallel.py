@@ -1,4 +1,4 @@
-"""Threads."""
+"""Threads, and their number."""
 
 import contextlib
 from collections.abc import Iterable, Iterator

@@ -26,7 +26,7 @@ NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
 
 def unmoved(problem: Problem, states: Array, controls: Array, cost: float, allowed: float) -> list[int]:
-    """The states that miss their goal, of a constraint by more than `allowed`, and that no control changes."""
+    """States that miss their goal, of a constraint by more than `allowed`, and that no control of a plan changes."""
     end, goal, start = states[-1], problem.goal, states[0]
     sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
     sizes = np.where(sizes > 0, sizes, 1.0)

@@ -190,7 +190,7 @@ class Stages:
         return self.call("evaluate_plan", self.about, Motion(*map(in_c_order, plan)), arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
-        """Compute the models about a plan; constraints with multipliers up to `least` count as linear."""
+        """Compute the models about a plan; constraints with multipliers (T+1, R) up to `least` count as linear."""
         self.force[...] = multipliers
         self.call("write_models", self.about, plan, costates, float(least))
 

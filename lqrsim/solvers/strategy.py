@@ -325,7 +325,7 @@ class Search:
             self._offer(run, self._finish(run))
 
     def _smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
-        """For an arm, say, whose every joint has a motor: if smoothing fails, also from a line of states, if cheaper.
+        """If smoothing fails for an arm, say, whose every joint has a motor, the run from a line of states, if cheaper.
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
