@@ -66,7 +66,7 @@ class Known:
 
 
 class ConstrainedRun:
-    """Tries plans in turn, with `stay` only from the rollout of the first policy, until the interior point converges."""
+    """Tries plans, with `stay` only from the rollout of the first policy, until the interior point converges."""
 
     def __init__(self, run: SolveRun, known: Known, *, stay: bool = False) -> None:
         self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
