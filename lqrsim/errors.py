@@ -4,6 +4,7 @@ Every message is one line with the field, the value that it got, the value that 
 The command line prints that line and exits with 2.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import inspect
@@ -55,10 +56,9 @@ def check_opengl(error: BaseException) -> None:
     """
     failed = "mujoco" not in sys.modules and any(name.startswith("mujoco.") for name in sys.modules)
     if failed and "MUJOCO_GL" in os.environ and not isinstance(error, InputError):
-        raise InputError(
-            f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
-            f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
-        ) from None
+        why = f"with which MuJoCo cannot be imported here ({' '.join(str(error).split())})"
+        want = "it unset: lqrsim finds an OpenGL by itself"
+        raise InputError(f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, {why}, want {want}") from None
 
 
 def keep(record: object, **values: object) -> None:
@@ -68,12 +68,7 @@ def keep(record: object, **values: object) -> None:
 
 
 def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...], *, infinite: bool = False) -> Array:
-    """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
-
-    Raises:
-      InputError: the value is not real numbers (as text, complex numbers or a generator), has another shape, or has a
-        NaN entry or, unless allowed, an infinite one.
-    """
+    """Real numbers without NaN as a read-only C-ordered float64 copy of the given shape (None matches any length)."""
     array = numbers_of(field, value, f"numbers of shape {_shape(shape)}")
     check_shape(field, array, shape)
     bad = np.isnan(array) if infinite else ~np.isfinite(array)
@@ -163,14 +158,12 @@ def check_number(
     below: float | None = None,
 ) -> float:
     """`value` as a finite float within the bounds. Raises InputError otherwise, including for text and bools."""
-    number = float("nan")
-    try:
+    number = math.nan
+    with contextlib.suppress(Exception):  # an object may raise anything in its conversion
         if type(value) is float:  # the most frequent
             number = value
         elif not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
             number = float(value)  # pyright: ignore[reportArgumentType]
-    except Exception:  # an object may raise anything in its conversion
-        number = float("nan")
     good = (
         math.isfinite(number)
         and (above is None or number > above)
@@ -208,10 +201,8 @@ def check_seed(field: str, value: object) -> int:
 def check_memory(field: str, count: int, each: int, what: str = "whose arrays") -> None:
     """Raises InputError if `count` items of `each` bytes do not fit into this machine's memory."""
     if count * each > (available := memory()):
-        raise InputError(
-            f"{field}: got {excerpt(count)}, {what} would take {_bytes(count * each)}, want at most {available // each}"
-            f" for the {_bytes(available)} of this machine"
-        )
+        want = f"at most {available // each} for the {_bytes(available)} of this machine"
+        raise InputError(f"{field}: got {excerpt(count)}, {what} would take {_bytes(count * each)}, want {want}")
 
 
 def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: str) -> Any:
@@ -235,9 +226,8 @@ def check_function(field: str, value: object, want: str, *, arguments: int | Non
     except ValueError:  # a built-in function without a signature
         return
     except TypeError as error:
-        raise InputError(
-            f"{field}: got {excerpt(value)}, which does not take {arguments} arguments ({error}), want {want}"
-        ) from None
+        got = f"{excerpt(value)}, which does not take {arguments} arguments ({error})"
+        raise InputError(f"{field}: got {got}, want {want}") from None
     except Exception:  # an object may raise anything when it is inspected
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
 
@@ -332,8 +322,7 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
 def check_symmetric(field: str, matrices: Array) -> Array:
     """Finite matrices (..., n, n) that are symmetric up to rounding, without that rounding, as a read-only array.
 
-    Raises:
-      InputError: entries across the diagonal differ by more than 1e-9 of the largest entry of their matrix.
+    Entries across the diagonal may differ by 1e-9 of the largest entry of their matrix.
     """
     across = np.swapaxes(matrices, -1, -2)
     skew = np.abs(matrices - across)
@@ -344,10 +333,8 @@ def check_symmetric(field: str, matrices: Array) -> Array:
         worst = np.argmax(skew[(*first,)])
         i, j = (int(k) for k in np.unravel_index(worst, skew.shape[-2:]))
         place, mirror = [*first, i, j], [*first, j, i]
-        raise InputError(
-            f"{field}: got {matrices[tuple(place)]:g} at {place} and {matrices[tuple(mirror)]:g} at {mirror}, want a"
-            " symmetric matrix"
-        )
+        got = f"{matrices[tuple(place)]:g} at {place} and {matrices[tuple(mirror)]:g} at {mirror}"
+        raise InputError(f"{field}: got {got}, want a symmetric matrix")
     symmetric = np.ascontiguousarray(0.5 * (matrices + across))
     symmetric.setflags(write=False)
     return symmetric
@@ -436,9 +423,8 @@ def brief(value: object, depth: int = 0) -> str:
         return "{" + ", ".join(f"{name}: {brief(entry, depth + 1)}" for name, entry in value.items()) + "}"
     if isinstance(value, (list, tuple)):
         listed = [brief(item, depth + 1) for item in value]
-        text = (
-            f"{listed[0]}, ... {len(listed)} times" if len(listed) > 3 and len(set(listed)) == 1 else ", ".join(listed)
-        )
+        same = len(listed) > 3 and len(set(listed)) == 1
+        text = f"{listed[0]}, ... {len(listed)} times" if same else ", ".join(listed)
         return f"[{text}]" if isinstance(value, list) else f"({text})"
     return getattr(value, "__qualname__", None) or without_addresses(repr(value))
 

@@ -38,10 +38,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     Attributes:
       length: length of the segment, without the round ends, in metres; 0 for a ball.
       radius: radius of the capsule and of each ball, in metres.
-      tolerance: largest protrusion of the capsule from the balls, in metres, more than 0.
-
-    Raises:
-      InputError: a number is out of range, or more than 10 000 balls would be needed.
+      tolerance: largest protrusion of the capsule from the balls, in metres, more than 0, for at most 10 000 balls.
     """
 
     __slots__ = ()
@@ -83,12 +80,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     def between(self, start: Sequence[Any], end: Sequence[Any]) -> list[list[Any]]:
         """The centre of each ball on the segment from `start` to `end`: SymPy expressions or numbers.
 
-        Args:
-          start: one end of the segment, 2 or 3 coordinates in metres.
-          end: the other end, with the same number of coordinates.
-
-        Returns:
-          `count` lists with the same number of coordinates.
+        The ends have 2 or 3 coordinates in metres, and so has each centre.
         """
         try:
             first, last = (list(itertools.islice(iter(point), 4)) for point in (start, end))
@@ -97,23 +89,19 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
         if len(first) != len(last) or len(first) not in (2, 3):
             got = f"{excerpt(start)} and {excerpt(end)}"
             raise InputError(f"between: got {got}, want two points of 2 or 3 coordinates")
-        most = max(self.count - 1, 1)
+        pairs, most = list(zip(first, last, strict=True)), max(self.count - 1, 1)
         try:
-            return [
-                [((most - k) * a + k * b) / most for a, b in zip(first, last, strict=True)] for k in range(self.count)
-            ]
+            return [[((most - k) * a + k * b) / most for a, b in pairs] for k in range(self.count)]
         except Exception as error:  # entries that are not numbers
-            got = f"{excerpt(start)} and {excerpt(end)}"
-            raise InputError(f"between: got {got} ({type(error).__name__}), want points of expressions") from None
+            got = f"{excerpt(start)} and {excerpt(end)} ({type(error).__name__})"
+            raise InputError(f"between: got {got}, want points of expressions") from None
 
 
 class Box(namedtuple("Box", ("length", "width", "height"))):
     """A box, for the hulls of `CollisionSpheres`.
 
     Attributes:
-      length: its extent along its first axis, in metres, above 0.
-      width: its extent along the second, in metres, above 0.
-      height: its extent along the third, in metres, above 0; None in the plane.
+      length, width, height: its extents along its axes, in metres, above 0; the height is None in the plane.
     """
 
     __slots__ = ()

@@ -34,15 +34,7 @@ AXES = "x", "y", "z"
 
 
 def rotate(r: Vector, v: Vector) -> list[Any]:
-    """The vector `exp([r]) v`, v rotated by r: three SymPy expressions, or three numbers.
-
-    Args:
-      r: rotation vector, 3 entries.
-      v: vector, 3 entries.
-
-    Returns:
-      3 entries.
-    """
+    """The vector `exp([r]) v`, v rotated by the rotation vector r: three SymPy expressions, or three numbers."""
     r, v = _three("r", r), _three("v", v)
     sine, cosine, _ = (_ratio(name, _dot(r, r)) for name in RATIOS)
     once = _cross(r, v)
@@ -53,14 +45,8 @@ def rotate(r: Vector, v: Vector) -> list[Any]:
 def vector_rate(r: Vector, w: Vector) -> list[Any]:
     """The rate of the rotation vector r of a body with angular velocity w: three SymPy expressions or numbers.
 
-    Paper: Sec. VI-B, `rdot = w + 1/2 [r] w + (1 - 1/2 |r| / tan(1/2 |r|)) [r]^2 w / |r|^2`.
-
-    Args:
-      r: rotation vector, 3 entries.
-      w: angular velocity in rad/s, 3 entries, in body axes.
-
-    Returns:
-      3 entries.
+    Paper: Sec. VI-B, `rdot = w + 1/2 [r] w + (1 - 1/2 |r| / tan(1/2 |r|)) [r]^2 w / |r|^2`, with w in rad/s in the axes
+    of the body.
     """
     r, w = _three("r", r), _three("w", w)
     cotangent = _ratio("cotangent_ratio", _dot(r, r))
@@ -73,12 +59,8 @@ def quaternion(rotation_vector: npt.ArrayLike, *, turns_about: str | None = None
     """The unit quaternions (..., 4), scalar first as in MuJoCo, of rotation vectors (..., 3).
 
     Args:
-      rotation_vector: (..., 3), in radians.
       turns_about: "x", "y" or "z", if the entry along this axis is a turn about it, after a tilt by the vector of the
         other two.
-
-    Raises:
-      InputError: the argument is not numbers of this shape, or there is no such axis.
     """
     rotation = vectors_of("rotation_vector", rotation_vector, 3)
     if turns_about is not None:
@@ -94,12 +76,8 @@ def rotation_vector(quaternion: npt.ArrayLike, *, turns_about: str | None = None
     """The rotation vectors (..., 3), at most half a turn in radians, of quaternions (..., 4), scalar first, any size.
 
     Args:
-      quaternion: (..., 4), scalar first.
       turns_about: "x", "y" or "z", for a turn about this axis in the entry along it, after a tilt by the vector of the
         other two; both are at most half a turn.
-
-    Raises:
-      InputError: the argument is not numbers of this shape, or there is no such axis.
     """
     rows = vectors_of("quaternion", quaternion, 4)
     # Times a power of two, which is exact, so that squares neither underflow nor overflow.
@@ -135,13 +113,8 @@ def _turned(quaternion: Array, along: int, half: Array) -> Array:
     turn[along] = 1.0
     cosine, sine = np.cos(half)[..., None], np.sin(half)[..., None]
     scalar, vector = quaternion[..., :1], quaternion[..., 1:]
-    return np.concatenate(
-        [
-            cosine * scalar - sine * vector[..., along : along + 1],
-            cosine * vector + sine * (scalar * turn + np.cross(turn, vector)),
-        ],
-        axis=-1,
-    )
+    turned = cosine * scalar - sine * vector[..., along : along + 1]
+    return np.concatenate([turned, cosine * vector + sine * (scalar * turn + np.cross(turn, vector))], axis=-1)
 
 
 def _three(field: str, vector: Vector) -> tuple[Any, ...]:
