@@ -85,17 +85,13 @@ class NoisySensors:
 
 
 class _Step(NamedTuple):
-    """A step of a belief in operations: their names.
-
-    Attributes:
-      after: mean and root, (N,). columns: of the noise of the uncertain means, Y of them.
-    """
+    """A step of a belief in operations: their names."""
 
     operations: Operations
     x: list[Any]
     u: list[Any]
-    after: list[Any]
-    columns: list[list[Any]]
+    after: list[Any]  # mean and root, (N,)
+    columns: list[list[Any]]  # of the noise of the uncertain means, Y of them
 
 
 class Belief(Dynamics):
@@ -117,7 +113,7 @@ class Belief(Dynamics):
         are the measured ones. With position and velocity alone a quadrotor has 12 + 21 states in place of 90.
 
     Attributes:
-      rows: the numbers of the uncertain states. known: those of the others.
+      size: n, the number of the robot's states. rows: the numbers of the uncertain states. known: those of the others.
     """
 
     @checked
@@ -133,6 +129,7 @@ class Belief(Dynamics):
         dynamics.check_period(dt)
         noise.bind(dynamics)  # raises an exception if it does not fit
         self.robot, self.process, self.sensors, self.averaged = dynamics, noise, sensors, averaged
+        self.size = len(dynamics.state_coordinates)
         space, controls = dynamics.state_coordinates, dynamics.control_coordinates
         names, units = space.names, space.units
         chosen = names if uncertain is None else check_items("Belief: uncertain", uncertain, str, "names of states")
@@ -155,11 +152,6 @@ class Belief(Dynamics):
             control_limits=(controls.low, controls.high),
             period=dt,
         )
-
-    @property
-    def size(self) -> int:
-        """n, the number of the robot's states."""
-        return len(self.robot.state_coordinates)
 
     def state(self, mean: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
         """The belief (N,) of a mean (n,) and a covariance (n, n), positive definite in the uncertain states; or (n,)
@@ -189,22 +181,16 @@ class Belief(Dynamics):
         return root @ root.swapaxes(-1, -2)
 
     def uncertainty(self, weights: Mapping[str, float]) -> dict[str, float]:
-        """Weights of a `QuadraticCost` that is half the weighted sum of the variances of some states.
+        """The weights of a `QuadraticCost`, by entry of the root, that is half the weighted sum of some variances.
 
         Args:
           weights: name of a state of the robot -> weight of its variance.
-
-        Returns:
-          Name of an entry of the root -> its weight.
         """
-        names = [self.robot.state_coordinates.names[i] for i in self.rows]
-        for name in weights:
-            check_name("weights", name, names)
-        return {
-            f"root_{name}_{names[j]}": weight
-            for name, weight in weights.items()
-            for j in range(names.index(name) + 1)
-        }  # fmt: skip
+        names, entries = [self.robot.state_coordinates.names[i] for i in self.rows], {}
+        for name, weight in weights.items():
+            before = names.index(check_name("weights", name, names)) + 1
+            entries |= {f"root_{name}_{other}": weight for other in names[:before]}
+        return entries
 
     @property
     def innovations(self) -> Noise:
@@ -226,8 +212,8 @@ class Belief(Dynamics):
         standard deviation along its gradient times a quantile.
 
         Args:
-          function: as in `SymbolicConstraint`, with x the robot's state. Each of its entries has the chance.
-          chance: largest chance that an entry is negative, below a half.
+          function: as in `SymbolicConstraint`, with x the robot's state.
+          chance: largest chance that an entry of it is negative, below a half.
         """
         values: Mapping[str, float] = {} if parameters is None else parameters
         check_kind("chance_constraint: parameters", values, Mapping, "a dictionary by name")
@@ -344,9 +330,8 @@ class Belief(Dynamics):
         if process.matrix is None:
             entries, _, _ = self._formulas(lambda x, u, p: [*chain(*process._rows(process.function(x, u, p), size))])
         else:
-            entries = [
-                sympy.Float(number) if number else sympy.Integer(0) for number in process.matrix.ravel().tolist()
-            ]
+            numbers = process.matrix.ravel().tolist()
+            entries = [sympy.Float(number) if number else sympy.Integer(0) for number in numbers]
         strength = sympy.Float(process.strength) if process.strength != 1 else sympy.Integer(1)
         shaken = [[name(strength * entry) for entry in entries[i * process.size :][: process.size]] for i in rows]
         mean, slopes = _step_jacobian(operations, rates, means, rows, self.robot, float(self.period or 0))
@@ -413,21 +398,17 @@ class _Innovations(Noise):
 
         step, belief = self._belief._step(), self._belief
         strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)
-        rows = belief.rows
-        name = step.operations.name
+        rows, name = belief.rows, step.operations.name
         flat = [name(strength * entry) for column in step.columns for entry in column]
         slopes = jacobian_of(step.operations, flat, [*step.x, *step.u])
         active = sorted({j for _, j in slopes})
         values = {f"out[{i}, {k}]": flat[k * len(rows) + i] for i in range(len(rows)) for k in range(self.size)}
-        changes = {
-            f"slopes[{at // len(rows)}, {at % len(rows)}, {active.index(j)}]": slope
-            for (at, j), slope in slopes.items()
-        }  # fmt: skip
-        of = f"innovations of {belief.name}"
-        source = [
-            _written("noise_values", "x, u, data, out", values, step, of, data="data"),
-            _written("noise_slopes", "x, u, data, out, slopes", values | changes, step, of, data="data"),
-        ]
+        changes = values.copy()
+        for (at, j), slope in slopes.items():
+            changes[f"slopes[{at // len(rows)}, {at % len(rows)}, {active.index(j)}]"] = slope
+        write = functools.partial(_written, step=step, of=f"innovations of {belief.name}", data="data")
+        source = [write("noise_values", "x, u, data, out", values)]
+        source.append(write("noise_slopes", "x, u, data, out, slopes", changes))
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
 
@@ -452,10 +433,8 @@ def _together(*given: Mapping[str, float]) -> dict[str, float]:
     parameters: dict[str, float] = {}
     for mapping in given:
         for name, value in mapping.items():
-            if parameters.setdefault(name, value) != value:
-                raise InputError(
-                    f"Belief: parameters: got {name!r} twice, {parameters[name]:g} and {value:g}, want one"
-                )
+            if (first := parameters.setdefault(name, value)) != value:
+                raise InputError(f"Belief: parameters: got {name!r} twice, {first:g} and {value:g}, want one")
     return parameters
 
 

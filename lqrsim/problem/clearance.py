@@ -31,14 +31,10 @@ class Clearance(KeepsClear, Constraint):
 
     Args:
       world: the obstacles. For a robot in a plane they are reduced to that plane; see `World.seen_by`.
-      radius: radius of the robot in metres, as for an ObstacleCost. Give exactly one of `radius`, `balls` and `geoms`.
-      balls: the robot's balls, as for an ObstacleCost: one distance for each ball, or for each hull of several, and
-        obstacle.
-      geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
-        obstacle.
-      margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
-        Margins of knots belong to their times: when a `Replanner` plans again, they shift as a reference does; see
-        `QuadraticCost`.
+      radius, balls, geoms: exactly one of them, as for an ObstacleCost: one distance for each ball, each hull of
+        several, or each body, and obstacle.
+      margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O). Margins
+        of knots move with time when a `Replanner` plans again, as the rows of a `QuadraticCost`.
     """
 
     @checked
@@ -52,12 +48,13 @@ class Clearance(KeepsClear, Constraint):
         margin: float | npt.ArrayLike = 0.0,
     ) -> None:
         self._set_shape(world, radius, balls, geoms)
-        numbers = real("Clearance: margin", margin)
-        self.margin: float | Array = check_number("Clearance: margin", margin) if numbers.ndim == 0 else numbers
-        if numbers.ndim:
-            self.margin = check_array("Clearance: margin", margin, (None,) * min(numbers.ndim, 2))
+        self.margin: float | Array
+        if axes := min(real("Clearance: margin", margin).ndim, 2):
+            self.margin = check_array("Clearance: margin", margin, (None,) * axes)
             if not self.margin.size:
                 raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
+        else:
+            self.margin = check_number("Clearance: margin", margin)
 
     @property
     def by_knot(self) -> bool:
@@ -72,7 +69,8 @@ class Clearance(KeepsClear, Constraint):
         return self._bind_at(dynamics, np.zeros(len(np.atleast_1d(self.margin))), {})
 
     def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
-        margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
+        margins = np.atleast_1d(self.margin)
+        margins = margins.reshape(len(margins), -1)
         shape = self.in_world(dynamics)
         world = shape.world
         if len(margins) not in (1, len(times)):

@@ -45,11 +45,7 @@ class CollisionGeoms(abc.ABC):
 
     @abc.abstractmethod
     def in_world(self, dynamics: Dynamics, world: World) -> "ShapeInWorld":
-        """The geoms among obstacles.
-
-        Raises:
-          InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF.
-        """
+        """The geoms among obstacles, which must be in the robot's MJCF; the dynamics are the robot's."""
 
     @abc.abstractmethod
     def of_scene(self, scene: Scene) -> bool:
@@ -88,9 +84,9 @@ class ShapeInWorld:
         return len(self.dynamics.state_coordinates.position) == 2 if self.centers is None else self.centers.in_plane
 
     def distances(self, reach: float) -> GeomDistances | None:
-        """The distances of geoms up to `reach` in m; None for balls, whose distances have second derivatives.
+        """The distances of geoms up to `reach` in m, among obstacles that stand still.
 
-        Raises InputError for geoms among obstacles that move.
+        None for balls, whose distances have second derivatives.
         """
         return None
 
@@ -112,7 +108,6 @@ class ShapeInWorld:
 
     @property
     def balls(self) -> int:
-        """The number of balls."""
         return sum(self.sizes)
 
     @property
@@ -211,9 +206,8 @@ def shape_in(
         seen = seen.upright() if centers.in_plane else seen
         for obstacle in seen.obstacles:
             if obstacle.kind == "box" and np.isinf(obstacle.size).sum() > 1:
-                raise InputError(
-                    f"obstacle {obstacle.name!r}: got a box that is infinite in two directions, want one of them"
-                )
+                got = "a box that is infinite in two directions"
+                raise InputError(f"obstacle {obstacle.name!r}: got {got}, want one of them")
         return ShapeInWorld(dynamics, seen, radii, balls.names, centers, balls.hulls)
     seen = world.seen_by(space.plane, space.offset) if space.position else World()
     if seen.has_meshes:

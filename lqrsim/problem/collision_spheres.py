@@ -45,7 +45,7 @@ from lqrsim.results.coordinates import Coordinates
 @checked
 @dataclass(frozen=True, eq=False)
 class SphereCenters(Term):
-    """Positions of balls, for one system: the source to compile, and its data.
+    """Positions of balls, for one system.
 
     The source defines `places(x, data, out)`, which writes three coordinates per ball, ball by ball, and
     `places_jacobian(x, data, out, slopes)`, which writes the coordinates, and the nonzero derivatives in the states (3
@@ -107,8 +107,7 @@ class CollisionSpheres:
       places: `places(x, p)`, at one of the levels of `Dynamics`; returns the centre of each of K balls, as 3
         coordinates in the world, in metres. Unless the robot has a position in space, a centre may have 2 coordinates,
         in the plane of the position or, without one, in the horizontal plane; obstacles are then seen as for the
-        position, see `World.seen_by`. The parameters of the dynamics are
-        attributes of p.
+        position, see `World.seen_by`. The parameters of the dynamics are attributes of p.
       radii: (K,) radii of the balls, in metres; with hulls also one for all.
       hulls: number of balls of each hull, in the order of the balls. Balls of one hull have one radius. By default each
         ball is by itself. Obstacles of hulls in a plane stand upright on it.
@@ -119,11 +118,9 @@ class CollisionSpheres:
         (K, 3 or 2, n), which are zero on entry. Without a jacobian, central differences are used; JAX derives it.
       depends_on: names of the states that the centres depend on, for the compiled and the plain level; all by default.
         The fewer, the faster.
-      level: as in `Dynamics`; by default compiled if `places` is a numba function, else symbolic.
+      level: as in `Dynamics`.
 
-    Raises:
-      InputError: a radius is negative, there are no balls, names are not one per ball and different, or the level does
-        not fit the function. The result of `places` is checked when it is first needed.
+    The result of `places` is checked when it is first needed.
     """
 
     def __init__(
@@ -146,8 +143,8 @@ class CollisionSpheres:
         self._set_balls(radii, names, sites, hulls)
         self.depends_on = check_depends_on("CollisionSpheres", depends_on, "states")
         if self.depends_on is not None and self.level == "symbolic":
-            wanted = "None: they are derived"
-            raise InputError(f"CollisionSpheres: depends_on: got names for a symbolic function, want {wanted}")
+            got = "names for a symbolic function"
+            raise InputError(f"CollisionSpheres: depends_on: got {got}, want None: they are derived")
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self)} balls, radii {brief(self.radii.tolist())} m)"
@@ -176,9 +173,8 @@ class CollisionSpheres:
                 raise InputError(f"CollisionSpheres: hulls: got {sum(self.hulls)} balls in all, want {count}, as radii")
             for k, hull_radii in enumerate(np.split(self.radii, np.cumsum(self.hulls)[:-1])):
                 if np.ptp(hull_radii):
-                    raise InputError(
-                        f"CollisionSpheres: radii: got {hull_radii.tolist()} in hull {k}, want one for all of it"
-                    )
+                    got = f"{hull_radii.tolist()} in hull {k}"
+                    raise InputError(f"CollisionSpheres: radii: got {got}, want one for all of it")
         part, parts = ("ball", count) if self.hulls is None else ("hull", len(self.hulls))
         wanted = f"{parts} different texts, one per {part}"
         self.names = tuple(f"{part} {k}" for k in range(parts))
@@ -206,7 +202,6 @@ class CollisionSpheres:
 
     @property
     def name(self) -> str:
-        """The function's name in messages."""
         return f"{name_of(self.function)}(x, p)"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
@@ -239,18 +234,17 @@ class CollisionSpheres:
 
         (size,) = sizes
         values: dict[str, Any] = {f"out[{3 * k + i}]": sympy.Integer(0) for k in range(len(self)) for i in range(3)}
-        values |= {f"out[{3 * (i // size) + i % size}]": entry for i, entry in enumerate(entries)}
-        slopes = {
-            f"slopes[{3 * (i // size) + i % size}, {j}]": entry.diff(symbol)
-            for i, entry in enumerate(entries)
-            for j, symbol in enumerate(x)
-        }
-        slopes = {target: slope for target, slope in slopes.items() if slope != 0}
+        slopes, depends_on = {}, set[int]()
+        for i, entry in enumerate(entries):
+            row = 3 * (i // size) + i % size
+            values[f"out[{row}]"] = entry
+            nonzero = {j: slope for j, symbol in enumerate(x) if (slope := entry.diff(symbol)) != 0}
+            slopes |= {f"slopes[{row}, {j}]": slope for j, slope in nonzero.items()}
+            depends_on |= nonzero.keys()
         function = functools.partial(symbolic.write_function, data="data", of=self.name)
         places = function("places", "x, data, out", assignments=values)
         jacobian = function("places_jacobian", "x, data, out, slopes", assignments=values | slopes)
-        depends_on = sorted({int(target[:-1].split(", ")[1]) for target in slopes})
-        return {"source": f"{places}\n\n{jacobian}", "size": size, "depends_on": depends_on}
+        return {"source": f"{places}\n\n{jacobian}", "size": size, "depends_on": sorted(depends_on)}
 
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
         names, size, called = dynamics.state_coordinates.names, self._size_of(dynamics), dynamics.calling
@@ -281,7 +275,6 @@ class CollisionSpheres:
         return size
 
     def _check_plane(self, size: int, space: Coordinates) -> None:
-        """Raises InputError for points in a plane if the robot's position is in space."""
         if size == 2 and len(space.position) == 3:
             raise InputError(f"{self.name}: got points of 2 coordinates for a position in space, want 3")
 
@@ -308,9 +301,7 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
 
 
 def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:
-    """Centres of this number of balls (K, count, 3), and their derivatives in the states (K, count, 3, n), at states
-    (K, n).
-    """
+    """The same at states (K, n), and their derivatives in these, (K, count, 3, n)."""
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
     _call(places, "jacobians_of", flat, out, slopes)
@@ -326,9 +317,7 @@ def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> N
 
 
 def _points(returned: Any, count: int) -> list[list[Any]]:
-    """The points that a function returned. Raises InputError unless their number is right and all have 2, or all 3,
-    coordinates.
-    """
+    """The points that a function returned, if they are that many, and all have 2, or all 3, coordinates."""
     points = rows_of(returned, count, f"{count} points of 3 coordinates, one for each of radii", "points")
     sizes = {len(point) for point in points}
     if sizes not in ({2}, {3}):

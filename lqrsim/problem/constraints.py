@@ -70,14 +70,12 @@ class ConstraintTerm(Term):
 
     @property
     def digested(self) -> list[str | Array]:
-        set_of_values = [repr((self.equality, self.final_only))] if self.equality or self.final_only else []
-        return [*super().digested, *set_of_values]
+        kind = self.equality, self.final_only
+        return [*super().digested, *([repr(kind)] if any(kind) else [])]
 
     def __post_init__(self) -> None:
-        if self.names and len(self.names) != self.rows:
-            raise InputError(
-                f"ConstraintTerm: names: got {len(self.names)}, want none, or one for each of {self.rows} rows"
-            )
+        if (count := len(self.names)) not in (0, self.rows):
+            raise InputError(f"ConstraintTerm: names: got {count}, want none, or one for each of {self.rows} rows")
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")
         super().__post_init__()
@@ -97,15 +95,9 @@ class ConstraintTerm(Term):
         rows = source_of(kernel, AT=residual.numbers, ROWS=shared)
         return cls(
             residual.filling(rows.filled(value=(rows, "row_value"), slope=(rows, "row_slope"))),
-            np.concatenate([residual.data, least.shape, columns, least.ravel()]),
-            residual.rows,
-            describe,
-            equality=equality,
-            final_only=final_only,
-            shared=shared,
-            functions=residual.functions,
-            names=residual.parts,
-        )
+            np.concatenate([residual.data, least.shape, columns, least.ravel()]), residual.rows, describe,
+            equality=equality, final_only=final_only, shared=shared, functions=residual.functions, names=residual.parts,
+        )  # fmt: skip
 
 
 class Constraint(ProblemPart[ConstraintTerm]):
@@ -135,9 +127,7 @@ class Constraint(ProblemPart[ConstraintTerm]):
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
-    """The final values that all constraints require, by the index of the state. Raises InputError if two of them
-    contradict each other.
-    """
+    """The final values that all constraints require, by the index of the state. None may contradict another."""
     goals: dict[int, float] = {}
     for constraint in constraints:
         for i, number in constraint.final_states(dynamics).items():
@@ -171,10 +161,8 @@ def _check_bounds(all_bounds: Sequence[Mapping[int, tuple[Side, Side]]], dynamic
         low, high = (np.broadcast_to(side, knots) for side in sides)
         if crossed := np.flatnonzero(~(low < high)).tolist():
             t, where = crossed[0], "" if len(crossed) == knots else f" at knot {crossed[0]}"
-            raise InputError(
-                f"constraints: got {names[i]} of at least {low[t]:g} and at most {high[t]:g}{where}, want bounds with"
-                " room between them"
-            )
+            got = f"{names[i]} of at least {low[t]:g} and at most {high[t]:g}{where}"
+            raise InputError(f"constraints: got {got}, want bounds with room between them")
 
 
 def names_of(constraint: Constraint, term: ConstraintTerm) -> list[str]:

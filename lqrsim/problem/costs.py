@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 @checked
 @dataclass(frozen=True, eq=False)
 class CostTerm(Term):
-    """A cost term, for one system: the source to compile, and the numbers that it reads.
+    """A cost term, for one system.
 
     The source defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
     cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls.
@@ -72,13 +72,10 @@ class CostTerm(Term):
         """
         sizes = {"ROWS": max(1, residual.rows), "LEADING_STATES": residual.leading_states, "FIRST_STEP": first}
         return cls(
-            residual.filling(source_of(kernel, **sizes).filled(loss=loss)),
-            np.concatenate([residual.data, numbers]),
-            nonconvex_in=nonconvex_in or None,
-            factor=None if factor is None else len(residual.data) + factor,
-            functions=residual.functions,
-            exact_hessian=False,
-        )
+            residual.filling(source_of(kernel, **sizes).filled(loss=loss)), np.concatenate([residual.data, numbers]),
+            nonconvex_in=nonconvex_in or None, factor=None if factor is None else len(residual.data) + factor,
+            functions=residual.functions, exact_hessian=False,
+        )  # fmt: skip
 
 
 _BoundTerm = TypeVar("_BoundTerm", bound=Term)
@@ -121,10 +118,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
         each control with a `control_rate`. `dynamics` are those without that state.
         """
-        raise InputError(
-            f"duration and control_rate: got a {type(self).__name__} beside one of them, which cannot have one more"
-            " state, want none"
-        )
+        got = f"a {type(self).__name__} beside one of them, which cannot have one more state"
+        raise InputError(f"duration and control_rate: got {got}, want none")
 
     @checked
     def ahead(self, steps: Index, *, horizon: Horizon = "shrinking") -> Self:
@@ -133,9 +128,9 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         The rest of a plan, with a "shrinking" horizon, is without the first rows; a plan of the same length, with a
         "moving" one, repeats the last row.
         """
-        filled = horizon == "moving"
         if not self.by_knot:
             return self
+        filled = horizon == "moving"
         return self._at_other_knots(lambda rows: left_after(min(steps, len(rows) - 1), rows, filled=filled))
 
     def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:

@@ -27,7 +27,7 @@ def functions_of(problem: Problem) -> list[UserFunction]:
 
 
 def check_functions(problem: Problem, x: Array, u: Array) -> None:
-    """Call each function that is no formula once. Raises InputError if a function returns an unsuitable result."""
+    """Call each function that is no formula once, which raises InputError for an unsuitable result."""
     for part in _parts(problem):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
@@ -61,27 +61,22 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
         slopes_of = dynamics.linearize(x, u, problem.dt)[:2] if dynamics.discrete else dynamics.rate_jacobian(x, u)
         for label, slopes, column in zip(("df/dx", "df/du"), slopes_of, columns, strict=True):
             for i, j in np.argwhere(~np.isfinite(slopes)):
-                raise InputError(
-                    f"{called}: got {slopes[i, j]:g} in {label}, row {names[i]}, column"
-                    f" {column[j]}, {where}, want finite derivatives"
-                )
+                got = f"{slopes[i, j]:g} in {label}, row {names[i]}, column {column[j]}"
+                raise InputError(f"{called}: got {got}, {where}, want finite derivatives")
         for cost, term in _terms(problem):
             value, gradient, hessian = evaluate(term, x, u)
             for label, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
-                if not np.isfinite(array).all():
-                    entry = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
-                    place = f" at {entry}" if entry else ""
-                    raise InputError(
-                        f"{cost}: got {array[tuple(entry)]:g} as its {label}{place} {where}, want finite numbers"
-                    )
+                for entry in np.argwhere(~np.isfinite(array)).tolist():
+                    got = f"{array[tuple(entry)]:g} as its {label}{f' at {entry}' if entry else ''}"
+                    raise InputError(f"{cost}: got {got} {where}, want finite numbers")
 
 
 def _terms(problem: Problem) -> Iterator[tuple[str, CostTerm]]:
     """The cost terms, with their names in messages."""
-    for name in ("initial", "stage_cost", "final_cost"):
-        cost = getattr(problem, name)
-        if not isinstance(cost, FixedState):
-            yield from ((f"{name}: {c.name}", t) for c, t in zip(terms_of(cost), problem.terms(name), strict=True))
+    for part in ("initial", "stage_cost", "final_cost"):
+        if not isinstance(cost := getattr(problem, part), FixedState):
+            for cost_term, term in zip(terms_of(cost), problem.terms(part), strict=True):
+                yield f"{part}: {cost_term.name}", term
 
 
 def evaluate(term: CostTerm, x: Array, u: Array) -> tuple[float, Array, Array]:
@@ -143,12 +138,11 @@ def check_derivatives(
 
     Args:
       subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
-      spread: their standard deviation, in the units of states and controls.
+      spread: standard deviation of the samples, in the units of states and controls.
       tolerance: tolerance of the error, relative to each entry.
 
     Returns:
-      One check per matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the
-      verdict.
+      One check per matrix of derivatives, with its worst entry; print it.
     """
     dynamics = subject.dynamics if isinstance(subject, Problem) else subject
     if not isinstance(dynamics, Dynamics):
@@ -159,18 +153,17 @@ def check_derivatives(
         x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
     rng = np.random.default_rng(seed)
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
-    checks_by_name: dict[str, list[DerivativeCheck]] = {}
+    worst_by_name: dict[str, DerivativeCheck] = {}
     checks = [_of_dynamics(dynamics, points, tolerance)]
     if isinstance(subject, Problem):
         names = *dynamics.state_coordinates.names, *dynamics.control_coordinates.names
         checks += [_of_costs(subject, names, points, tolerance), _of_constraints(subject, names, points, tolerance)]
     with np.errstate(all="ignore"):
         for check in itertools.chain(*checks):
-            checks_by_name.setdefault(check.what, []).append(check)
-    return [
-        max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error)
-        for checks in checks_by_name.values()
-    ]
+            worst = worst_by_name.setdefault(check.what, check)
+            if not np.isnan(worst.error) and not check.error <= worst.error:  # a NaN is the worst
+                worst_by_name[check.what] = check
+    return [*worst_by_name.values()]
 
 
 def _of_dynamics(dynamics: Dynamics, points: _Points, tolerance: float) -> Iterator[DerivativeCheck]:
@@ -181,10 +174,8 @@ def _of_dynamics(dynamics: Dynamics, points: _Points, tolerance: float) -> Itera
     for x, u in points:
         fx, fu = dynamics.rate_jacobian(x, u)
         joint, noise = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]))
-        for derivative, names, slopes, columns in (
-            ("df/dx", states, fx, np.s_[:n]),
-            ("df/du", controls, fu, np.s_[n:]),
-        ):
+        parts = (("df/dx", states, fx, np.s_[:n]), ("df/du", controls, fu, np.s_[n:]))
+        for derivative, names, slopes, columns in parts:
             what, differences = f"{derivative} of {dynamics.name}", (joint[:, columns], noise[:, columns])
             yield _worst_entry(what, states, names, slopes, differences, (x, u), tolerance)
 

@@ -54,7 +54,7 @@ class Dynamics:
             parameters={"inertia": 0.02, "gravity": 9.81, "length": 0.2}, angles=("angle",),
         )
 
-    The same function can be stated at four levels, which differ in speed and in what the function may contain:
+    A function can be stated at four levels, which differ in speed and in what it may contain:
 
       symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default.
       compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
@@ -70,8 +70,8 @@ class Dynamics:
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: quantities unknown when planning, such as a wind or the remaining fraction of a motor's force: name
-        -> the value that the plan assumes, usually 0 or 1. To f they are parameters. For planning they are constants,
-        so they cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows
+        -> the value that the plan assumes, usually 0 or 1. To f they are parameters; for planning they are constants,
+        which cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows
         the names wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in world axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
@@ -85,7 +85,7 @@ class Dynamics:
       jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes the nonzero entries of df/dx
         and df/du to fx (n, n) and fu (n, m), which are zero on entry. A numba function if f is one, else a Python
         function.
-      level: "symbolic", "compiled", "jax" or "plain"; by default compiled if f is a numba function, else symbolic.
+      level: one of the four; by default compiled if f is a numba function, else symbolic.
       period: for a map, f is the next state, after this many seconds, and every `dt` is this period. `rate` and
         `rate_jacobian` are then f's value and derivatives. A map has no inverse and no state in between: solvers in
         continuous time, form="primal" and free durations are refused. Not with JAX. None for rates.
@@ -128,9 +128,8 @@ class Dynamics:
             if not isinstance(units, Mapping) or not all(isinstance(name, str) for name in units):
                 raise InputError(f"{field}: got {excerpt(units)}, want a dictionary of name: unit")
         if not states or not controls:
-            raise InputError(
-                f"dynamics: got {len(states)} states and {len(controls)} controls, want at least one of each"
-            )
+            got = f"{len(states)} states and {len(controls)} controls"
+            raise InputError(f"dynamics: got {got}, want at least one of each")
         names = tuple(states)
         for field, listed in (("position", position), ("angles", angles), ("rotation_vectors", rotation_vectors)):
             if isinstance(listed, str):
@@ -139,19 +138,16 @@ class Dynamics:
             check_items(field, listed, str, f"a tuple of names of states, of {', '.join(names)}")
             for field, listed in (("position", position), ("angles", angles))
         )
-        triples = [
-            check_items("rotation_vectors", triple, str, "tuples of three names of states")
-            for triple in check_items("rotation_vectors", rotation_vectors, (tuple, list), "a tuple of threes of names")
-        ]
 
         def index(field: str, name: str) -> int:
             return names.index(check_name(field, name, names))
 
         starts = []
-        for triple in triples:
-            indices = [index("rotation_vectors", name) for name in triple]
+        for triple in check_items("rotation_vectors", rotation_vectors, (tuple, list), "a tuple of threes of names"):
+            listed = check_items("rotation_vectors", triple, str, "tuples of three names of states")
+            indices = [index("rotation_vectors", name) for name in listed]
             if len(indices) != 3 or indices != list(range(indices[0], indices[0] + 3)):
-                raise InputError(f"rotation_vectors: got {excerpt(tuple(triple))}, want three neighbouring states")
+                raise InputError(f"rotation_vectors: got {excerpt(listed)}, want three neighbouring states")
             starts.append(indices[0])
         self.f, self.jacobian = f, jacobian
         self.level = level_of(f, level)
@@ -200,13 +196,11 @@ class Dynamics:
 
     @property
     def discrete(self) -> bool:
-        """Whether the dynamics are given as the state after a step, not as a rate: there is no inverse."""
+        """Whether the dynamics are the state after a step, not a rate: there is no inverse."""
         return self.period is not None
 
     def with_parameters(self, **values: float) -> "Dynamics":
-        """The same dynamics with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing
-        compiles again.
-        """
+        """The same dynamics with other values of some parameters, `mass=0.6`. Nothing compiles again."""
         for name in values:
             check_name("parameters", name, self.parameters)
         other = copy.copy(self)  # without `_plain` and `disturbed`, which have the old values
@@ -221,10 +215,7 @@ class Dynamics:
         return self._traced_anew(parameters=self.parameters | self.disturbances)
 
     def with_substeps(self, count: int) -> "Dynamics":
-        """The same dynamics with several Runge-Kutta steps of equal length in each control period, for accuracy.
-
-        `Problem(accuracy=)` chooses their number. The control is still held over the period.
-        """
+        """The same dynamics with several equal Runge-Kutta steps in each control period; see `Problem.accuracy`."""
         count = check_count("substeps", count)
         if self.discrete or self.level == "jax":
             raise InputError(f"substeps: got {count} for {self.name}, want a rate that is no function of JAX")
@@ -273,8 +264,7 @@ class Dynamics:
         if self.level != "symbolic":
             kernel = source_of(user_functions)
             return kernel if len(self.functions) > 1 else source_of(differences).filled(rate=kernel)
-        names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
-        details = ("dynamics", *names, *self.constants.items())
+        details = ("dynamics", *self._names, *self.constants.items())
         traced = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
         return text_source(traced["source"], f"{self.name}(x, u, p)")
 
@@ -337,14 +327,21 @@ class Dynamics:
     @property
     def _rates(self) -> dict[str, Source]:
         """The functions of `source` that steps leave open."""
-        names = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
-        return dict.fromkeys(names, self.source)
+        return {name: self.source for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)}
+
+    @property
+    def _names(self) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+        """The names of states, controls and parameters, on which traced formulas depend."""
+        return self.state_coordinates.names, self.control_coordinates.names, tuple(self.parameters)
 
     @cached_property
     def compiled(self) -> CompiledModule:
         """The compiled module of `step_source`."""
+        return self._module_of(self.step_source)
+
+    def _module_of(self, source: Source) -> CompiledModule:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        return module_of(self.step_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m)
+        return module_of(source, f"{self.name} ({n} states, {m} controls)", N=n, M=m)
 
     @cached_property
     def curvature_source(self) -> Source | None:
@@ -369,8 +366,7 @@ class Dynamics:
             return source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_values"))
         if self.level != "symbolic":
             return by_jacobians
-        names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
-        details = ("second derivatives", MOST_STEPS, *names, *self.constants.items())
+        details = ("second derivatives", MOST_STEPS, *self._names, *self.constants.items())
         traced = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
         support = tuple(traced["support"])
         if not traced["source"]:  # the formula would be too long
@@ -379,21 +375,15 @@ class Dynamics:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)
         curved = text_source(traced["source"], f"second derivatives of {self.name}(x, u, p)")
-        open_source = (
-            source_of(discrete_map, SUPPORT=support, K=len(support))
-            if self.discrete
-            else source_of(runge_kutta, SUPPORT=support, K=len(support), STATES=states)
-        )
+        step, sizes = (discrete_map, {}) if self.discrete else (runge_kutta, {"STATES": states})
+        open_source = source_of(step, SUPPORT=support, K=len(support), **sizes)
         return open_source.filled(rate_curvature=curved, **self._rates)
 
     @cached_property
     def step_curvature(self) -> float:
         """The address of the second derivatives of a step, which are compiled; 0 if they are zero everywhere."""
-        if self.curvature_source is None:
-            return 0.0
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
-        module = module_of(self.curvature_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m)
-        return module.addresses("step_curvature")[0]
+        source = self.curvature_source
+        return 0.0 if source is None else self._module_of(source).addresses("step_curvature")[0]
 
     @property
     def constants(self) -> dict[str, float]:
@@ -401,8 +391,7 @@ class Dynamics:
         return {name: value for name, value in self.disturbances.items() if name not in self.parameters}
 
     def _traced(self) -> tuple[list[Any], list[Any], list[Any]]:
-        names = self.state_coordinates.names, self.control_coordinates.names
-        return symbolic.trace(self.f, *names, list(self.parameters), constants=self.constants)
+        return symbolic.trace(self.f, *self._names, constants=self.constants)
 
     def _trace(self) -> str:
         n = len(self.state_coordinates)
@@ -420,10 +409,7 @@ class Dynamics:
         return "\n\n".join([rate, jacobian, symbolic.write_chain(n, slopes)])
 
     def _trace_curvature(self) -> dict[str, Any]:
-        """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved.
-
-        There is no source if it would take more than MOST_STEPS.
-        """
+        """Source of `rate_curvature`, empty beyond MOST_STEPS, and in which entries of (x, u) f is curved."""
         hessian = self._weighted_hessian()
         if hessian is None:
             return {"source": "", "support": []}
@@ -503,7 +489,7 @@ class Dynamics:
         return fx, fu
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds from a state (n,), with a control (m,) held: one step.
+        """The state (n,) after one step of `dt` seconds from a state (n,), with a control (m,) held.
 
         Negative steps lead backwards in time; a map and MuJoCo have none. MuJoCo's are NaN if they overflow.
         """
@@ -534,10 +520,11 @@ class Dynamics:
     @cached_property
     def _plain(self) -> dict[str, Any]:
         """What is compiled, as plain Python."""
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        sizes = {"N": len(self.state_coordinates), "M": len(self.control_coordinates)}
         names = ("rate", "rate_jacobian", "advance", "step_jacobian")
-        calls = [function.plain_call(self.parameters) for function in self.functions]
-        return plain_functions(self.step_source, {"N": n, "M": m}, names, calls)
+        return plain_functions(
+            self.step_source, sizes, names, [function.plain_call(self.parameters) for function in self.functions]
+        )
 
     def _numbers(self) -> Array:
         """The `p` of the compiled functions, with places for the addresses of functions."""

@@ -61,7 +61,7 @@ class OfFunction:
 
 
 class OfFormula(OfFunction):
-    """A cost or a constraint that is stated as a formula, with parameters."""
+    """A cost or a constraint that is stated as a formula."""
 
     def _set_formula(
         self, function: Callable[..., Any], parameters: Mapping[str, float] | None, name: str | None, instead: str
@@ -108,12 +108,8 @@ class SymbolicCost(OfFormula, Cost):
         traced = symbolic.kept(
             self.function, details, lambda: self._trace(*names), source=str, nonconvex_in=list, uses_control=bool
         )
-        return CostTerm(
-            traced["source"],
-            self._data,
-            nonconvex_in=None if self.convex or not traced["nonconvex_in"] else tuple(traced["nonconvex_in"]),
-            uses_control=traced["uses_control"],
-        )
+        curved = None if self.convex or not traced["nonconvex_in"] else tuple(traced["nonconvex_in"])
+        return CostTerm(traced["source"], self._data, nonconvex_in=curved, uses_control=traced["uses_control"])
 
     def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
         traced, x, u = symbolic.trace(self.function, states, controls, list(self.parameters))
@@ -122,18 +118,15 @@ class SymbolicCost(OfFormula, Cost):
         cost, z = traced[0], [*x, *u]
         slopes = [cost.diff(symbol) for symbol in z]
         curves = {(i, j): slope.diff(symbol) for i, slope in enumerate(slopes) for j, symbol in enumerate(z)}
+        curves = {pair: curve for pair, curve in curves.items() if curve != 0}
         targets = {"cost": cost}
         targets |= {f"gradient[{i}]+": slope for i, slope in enumerate(slopes) if slope != 0}
-        targets |= {f"hessian[{i}, {j}]+": curve for (i, j), curve in curves.items() if curve != 0}
-        value = symbolic.write_function("value", "x, u, t, data", "data", {"cost": cost}, of=self.name, returns="cost")
-        derivatives = symbolic.write_function(
-            "derivatives", "x, u, t, data, hessian, gradient", "data", targets, of=self.name, returns="cost"
-        )
-        return {
-            "source": f"{value}\n\n{derivatives}",
-            "nonconvex_in": sorted({i for (i, _), curve in curves.items() if curve != 0}),
-            "uses_control": bool(cost.free_symbols & set(u)),
-        }
+        targets |= {f"hessian[{i}, {j}]+": curve for (i, j), curve in curves.items()}
+        write = functools.partial(symbolic.write_function, data="data", of=self.name, returns="cost")
+        value = write("value", "x, u, t, data", assignments={"cost": cost})
+        derivatives = write("derivatives", "x, u, t, data, hessian, gradient", assignments=targets)
+        curved, uses_control = sorted({i for i, _ in curves}), bool(cost.free_symbols & set(u))
+        return {"source": f"{value}\n\n{derivatives}", "nonconvex_in": curved, "uses_control": uses_control}
 
 
 class SymbolicConstraint(OfFormula, Constraint):
@@ -221,14 +214,11 @@ class SymbolicConstraint(OfFormula, Constraint):
         )  # fmt: skip
         with_control, rows = traced["with_control"], traced["rows"]
         if self.at == "final" and with_control:
-            raise InputError(
-                f"{self.name}: got an entry that depends on u, want none at the final step, which has no u"
-            )
+            got, want = "an entry that depends on u", "none at the final step, which has no u"
+            raise InputError(f"{self.name}: got {got}, want {want}")
         if 0 < len(with_control) < rows:
-            raise InputError(
-                f"{self.name}: got {rows} entries of which {len(with_control)} depend on u, want all of them or none:"
-                " state the others as another SymbolicConstraint"
-            )
+            got, want = f"{rows} entries of which {len(with_control)} depend on u", "all of them or none"
+            raise InputError(f"{self.name}: got {got}, want {want}: state the others as another SymbolicConstraint")
         kind = "=" if self.equality else ">="
         parts = [f"[{row}]" for row in range(rows)] if rows > 1 else [""]
         name = self._name or getattr(self.function, "__name__", type(self.function).__name__)
@@ -236,15 +226,9 @@ class SymbolicConstraint(OfFormula, Constraint):
         if name == "<lambda>":
             names = texts = traced["texts"]
         term = ConstraintTerm(
-            source=traced["source"],
-            data=self._data,
-            rows=rows,
-            describe=lambda row: f"{texts[row]} {kind} 0",
-            names=tuple(names),
-            uses_control=bool(with_control),
-            equality=self.equality,
-            final_only=self.at == "final",
-        )
+            traced["source"], self._data, rows, lambda row: f"{texts[row]} {kind} 0", names=tuple(names),
+            uses_control=bool(with_control), equality=self.equality, final_only=self.at == "final",
+        )  # fmt: skip
         if isinstance(self.at, str):
             return term
         kernel = source_of(__name__, COUNT=self._table.shape[1])
@@ -278,15 +262,12 @@ class SymbolicConstraint(OfFormula, Constraint):
         texts = [re.sub(r"\b[xup]\d+\b", lambda match: words[match[0]], str(entry)) for entry in traced]
         value = "\n".join(["def value(x, u, t, row, data):", *choices["value"], "    return 0.0"])
         slope = "\n".join(["def slope(x, u, t, row, data, gradient):", *choices["slope"]])
-        return {
-            "source": "\n\n".join([*parts, value, slope]) + "\n",
-            "rows": len(traced),
-            "texts": [
-                text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}...[{row}]"
-                for row, text in enumerate(texts)
-            ],
-            "with_control": [row for row, entry in enumerate(traced) if entry.free_symbols & set(u)],
-        }
+        for row, text in enumerate(texts):
+            if len(text) > MOST_LETTERS:
+                texts[row] = f"{text[:MOST_LETTERS]}...[{row}]"
+        with_control = [row for row, entry in enumerate(traced) if entry.free_symbols & set(u)]
+        source = "\n\n".join([*parts, value, slope]) + "\n"
+        return {"source": source, "rows": len(traced), "texts": texts, "with_control": with_control}
 
 
 class FunctionCost(OfFunction, Cost):
@@ -299,8 +280,7 @@ class FunctionCost(OfFunction, Cost):
         about six digits, at two evaluations for every pair of entries in `depends_on`; JAX derives them.
       depends_on: names of the states and controls that the cost depends on; all by default. The fewer, the faster.
       parameters: name -> value, as in `Dynamics`.
-      convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
-      name: the name in messages; by default that of the function.
+      convex, name: as in `SymbolicCost`.
       level: "compiled", "jax" or "plain"; by default compiled if the function is numba's, and plain otherwise.
     """
 
@@ -320,10 +300,10 @@ class FunctionCost(OfFunction, Cost):
         self.function, self.derivatives = function, derivatives
         self.convex = convex
         self.level = level_of(function, level)
+        if level == "symbolic":
+            wanted = "'compiled', 'jax' or 'plain'; or use SymbolicCost"
+            raise InputError(f"FunctionCost: level: got 'symbolic', want {wanted}")
         if self.level == "symbolic":
-            if level is not None:
-                wanted = "'compiled', 'jax' or 'plain'; or use SymbolicCost"
-                raise InputError(f"FunctionCost: level: got 'symbolic', want {wanted}")
             self.level = "plain"
         self.depends_on = check_depends_on("FunctionCost", depends_on, "states and controls, at least one")
         if self.depends_on == ():  # a constant: nothing to minimise
@@ -332,9 +312,8 @@ class FunctionCost(OfFunction, Cost):
         self.parameters = symbolic.check_parameters(parameters)
         check_signature(function, ("x", "u", "p"))
         if derivatives is not None:
-            check_derivative(
-                "FunctionCost: derivatives", derivatives, function, self.level, "x, u, p, gradient, hessian"
-            )
+            arguments = "x, u, p, gradient, hessian"
+            check_derivative("FunctionCost: derivatives", derivatives, function, self.level, arguments)
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
@@ -347,13 +326,8 @@ class FunctionCost(OfFunction, Cost):
         source = source_of(user_functions)
         if len(functions) == 1:
             source = source_of(differences, AXES=axes).filled(value=source)
-        return CostTerm(
-            source,
-            self._data,
-            nonconvex_in=None if self.convex else axes,
-            uses_control=any(axis >= n for axis in axes),
-            functions=functions,
-        )
+        curved, uses_control = None if self.convex else axes, any(axis >= n for axis in axes)
+        return CostTerm(source, self._data, nonconvex_in=curved, uses_control=uses_control, functions=functions)
 
 
 def _knots(at: npt.ArrayLike) -> tuple[int, ...]:

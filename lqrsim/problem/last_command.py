@@ -124,14 +124,13 @@ def with_last_command(problem: Problem) -> Problem:
         return part
 
     begun: Cost
-    initial = problem.initial
-    if isinstance(initial, FixedState):
-        initial = initial._extended(np.zeros(m))
+    if isinstance(problem.initial, FixedState):
+        initial = problem.initial._extended(np.zeros(m))
         begun = initial._cost
     else:
         # A weight, which costs nothing: a cost-to-come needs one of each state.
         weight = np.diag(np.pad(np.ones(m), (len(dynamics.state_coordinates), 0)))
-        begun = added(initial)
+        begun = added(problem.initial)
         if isinstance(begun, QuadraticCost):  # else the problem's start would be no longer known
             begun = QuadraticCost(begun.weight + weight, about=begun.about)
         else:

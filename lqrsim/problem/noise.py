@@ -5,6 +5,7 @@ The same object serves for planning, as `Problem(noise=...)`, and in trials, as 
 
 import copy
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +39,7 @@ MOST = 100  # largest number of independent normal numbers
 
 @dataclass(frozen=True, eq=False)
 class NoiseTerm(Term):
-    """A noise, for one system: the source to compile, and its data.
+    """A noise, for one system.
 
     The source defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
     `kernels/declarations.py`. The data are the parameters or the matrix, then the strength.
@@ -85,7 +86,7 @@ class Noise:
       size: k; not allowed with a matrix.
       parameters: name -> value, as in `Dynamics`.
       depends_on: names of the states and controls that M depends on, for other functions than formulas; all by
-        default. The fewer, the faster. For formulas they are found automatically.
+        default. The fewer, the faster.
       level: as in `Dynamics`.
     """
 
@@ -98,10 +99,8 @@ class Noise:
         depends_on: Sequence[str] | None = None,
         level: str | None = None,
     ) -> None:
-        self.parameters = symbolic.check_parameters(parameters)
-        self.strength = 1.0
-        self.depends_on = None
-        self.matrix, self.level = None, "symbolic"
+        self.parameters, self.strength = symbolic.check_parameters(parameters), 1.0
+        self.matrix, self.level, self.depends_on = None, "symbolic", None
         if callable(function):
             self.level = level_of(function, level)
             check_signature(function, ("x", "u", "p"))
@@ -184,25 +183,19 @@ class Noise:
         strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)  # after the parameters, and without a name
         table = [[strength * entry for entry in entries[i * self.size : (i + 1) * self.size]] for i in range(n)]
         rows = [i for i, row in enumerate(table) if any(entry != 0 for entry in row)] or [0]
-        z = [*x, *u]
-        used = set().union(*(entry.free_symbols for entry in entries))
+        z, used = [*x, *u], set().union(*(entry.free_symbols for entry in entries))
         active = [a for a, symbol in enumerate(z) if symbol in used]
         values = {f"out[{i}, {k}]": table[row][k] for i, row in enumerate(rows) for k in range(self.size)}
-        slopes = {
-            f"slopes[{k}, {i}, {a}]": table[row][k].diff(z[entry])
-            for k in range(self.size)
-            for i, row in enumerate(rows)
-            for a, entry in enumerate(active)
-        }
+        slopes = {}
+        for k, (i, row), (a, entry) in itertools.product(range(self.size), enumerate(rows), enumerate(active)):
+            slopes[f"slopes[{k}, {i}, {a}]"] = table[row][k].diff(z[entry])
         write = functools.partial(symbolic.write_function, data="data", of=self.name)
-        source = [
-            write("noise_values", "x, u, data, out", assignments=values),
-            write("noise_slopes", "x, u, data, out, slopes", assignments=values | slopes),
-        ]
+        source = [write("noise_values", "x, u, data, out", assignments=values)]
+        source.append(write("noise_slopes", "x, u, data, out, slopes", assignments=values | slopes))
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
     def _rows(self, returned: Any, n: int) -> list[list[Any]]:
-        """The result of the function, as n rows. Raises InputError for another shape."""
+        """The result of the function, as n rows."""
         wanted = f"{n} rows, one per state, of {self.size} entries"
         rows = rows_of(returned, n, wanted)
         for row in rows:

@@ -24,20 +24,18 @@ CUTOFF = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothi
 class ObstacleCost(KeepsClear, Cost):
     """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
 
-    Paper: Sec. VI-A, with the sharpness made explicit. The cost does not act at t = 0, where the state is given. For a
-    robot in the plane (two position coordinates), the world is seen from above or cut by the plane; see
-    `World.seen_by`.
+    Paper: Sec. VI-A, with the sharpness made explicit. For a robot in the plane (two position coordinates), the world
+    is seen from above or cut by the plane; see `World.seen_by`.
 
-    For a robot of several balls, the cost is summed over the balls, too. Its Hessian is then computed in the centres of
-    the balls and mapped to the states by the Jacobian of the centres. Second derivatives of the centres are left out.
+    For a robot of several balls, the cost is summed over the balls, too. Its Hessian is then that in the centres of the
+    balls, mapped to the states by the Jacobian of the centres, without their second derivatives.
 
     Args:
-      radius: radius of the robot at its position, in metres.
-      balls: the robot's balls, in place of `radius`, as `robot.balls`. The attribute `radius` is then the largest one.
+      radius: radius of the robot at its position, in metres. Give exactly one of `radius`, `balls` and `geoms`.
+      balls: the robot's balls, as `robot.balls`. The attribute `radius` is then the largest one.
       geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances. The sum is then
         over bodies and obstacles. Pairs farther apart than D = 16 / sharpness cost nothing; for the others, the
-        exponential's tangent at D, `exp(-16) * (1 + sharpness * (D - distance))`, is taken off. Give exactly one of
-        `radius`, `balls` and `geoms`.
+        exponential's tangent at D, `exp(-16) * (1 + sharpness * (D - distance))`, is taken off.
       sharpness: sharpness in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """

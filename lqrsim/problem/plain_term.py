@@ -18,8 +18,8 @@ class PlainTerm:
     def __init__(self, term: CostTerm | ConstraintTerm, states: int, controls: int) -> None:
         self.shared = term.shared if isinstance(term, ConstraintTerm) else 0
         self.states, self.size = states, states + controls
-        first = term.functions[:1]
-        parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
+        named = term.functions[0].parameters if term.functions else ()
+        parameters = dict(zip(named, term.data.tolist(), strict=False))
         wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
         sizes, calls = {"N": states, "M": controls}, [function.plain_call(parameters) for function in term.functions]
         self._functions = plain_functions(term.code, sizes, wanted, calls)

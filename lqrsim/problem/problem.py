@@ -2,7 +2,7 @@
 
 import copy
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -202,22 +202,18 @@ class Problem(OneVersion):
         constraint_terms = bind_all(self.constraints, self.dynamics, self.times)
         noise_term = None if self.noise is None else self.noise.bind(self.dynamics)
         keep(self, _terms=bound, constraint_terms=constraint_terms, noise_term=noise_term)
-        self._check_end_costs()
+        self._checked_parts()
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
-        self._check_duration()
         self._check_rate()
-        self._check_between_knots()
         limited = controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
             sides = zip(limited.names, limited.low, limited.high, controls.low, controls.high, strict=True)
             for name, low, high, lowest, highest in sides:
                 if not max(low, lowest) < min(high, highest):
-                    raise InputError(
-                        f"control_limits: got {low:g} to {high:g} for {name}, want a range that overlaps the"
-                        f" actuator's, {lowest:g} to {highest:g}"
-                    )
+                    want = f"a range that overlaps the actuator's, {lowest:g} to {highest:g}"
+                    raise InputError(f"control_limits: got {low:g} to {high:g} for {name}, want {want}")
             keep(self, control_limits=(limited.low, limited.high))
         keep(self, control_coordinates=limited, applied_coordinates=limited.within(controls))
         start = self.start if self.initial._must_be_clear else None
@@ -244,8 +240,8 @@ class Problem(OneVersion):
     def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
         """The rest of the problem after some steps, from a state (n,) that is given exactly.
 
-        Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it. The time of those
-        steps is taken from a free duration.
+        Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it. A free duration is
+        shorter by these steps.
 
         Args:
           previous: (m,) the last command, from which a `control_rate` counts; by default the problem's own, and after
@@ -334,10 +330,7 @@ class Problem(OneVersion):
         return replace(self, dt=seconds / self.steps, duration=None, time_weight=0.0)
 
     def _with_segments(self, knots: Sequence[int]) -> "Problem":
-        """The problem with its segments at other knots, and with rows by knot moved along.
-
-        A row of a knot at which a segment ends stays that of such a knot; those between are the nearest.
-        """
+        """The problem with its segments at other knots, where their rows move along; those between are the nearest."""
         old, new = (np.array([0, *interior, self.steps]) for interior in (self.segments, knots))
         rows = np.rint(np.interp(np.arange(self.steps + 1), new, old)).astype(int)
         segment = np.clip(np.searchsorted(new, np.arange(self.steps + 1), side="right") - 1, 0, len(knots))
@@ -363,17 +356,14 @@ class Problem(OneVersion):
         return self._with(_terms=self._terms | {"stage_cost": terms}, constraint_terms=constraints)
 
     def _checked_parts(self) -> "Problem":
-        """The same problem. Raises InputError if its costs or constraints do not go with the rest."""
+        """The same problem, whose costs or constraints must go with the rest."""
         self._check_end_costs()
         self._check_duration()
         self._check_between_knots()
         return self
 
     def _with(self, **changed: Any) -> "Problem":
-        """The problem with other parts, without checks.
-
-        Nothing is checked again: everything was checked before, and this runs at every solve of a re-planning robot.
-        """
+        """The problem with other parts. Nothing is checked: this runs at every solve of a re-planning robot."""
         other = copy.copy(self)
         keep(other, **changed)
         return other
@@ -447,7 +437,7 @@ class Problem(OneVersion):
 
     @property
     def obstacle_costs(self) -> tuple[Any, ...]:
-        """The terms that keep the robot clear of obstacles: each an `ObstacleCost`, or of a user's own kind."""
+        """The stage costs that keep the robot clear of obstacles: each an `ObstacleCost`, or of a user's own kind."""
         return tuple(cost for cost in terms_of(self.stage_cost) if cost.kept_clear is not None)
 
     @property
@@ -522,13 +512,11 @@ class Problem(OneVersion):
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_end_costs(self) -> None:
-        """Raises InputError if the initial or the final cost depends on the control."""
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in self._terms[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
 
     def _check_duration(self) -> None:
-        """Raises InputError if the duration is not as described, or must not be free for this kind of problem."""
         knots = self.segments
         if any(late - early < 2 for early, late in itertools.pairwise((0, *knots, self.steps)) if knots):
             want = f"knots in order, with 2 steps in each segment of the {self.steps} at least"
@@ -544,22 +532,17 @@ class Problem(OneVersion):
         stated = self.steps * self.dt
         spare = 1e-9 * stated  # rounding: 3 * 0.1 is more than 0.3
         if not 0 < low < high or not low - spare <= stated <= high + spare:
-            raise InputError(
-                f"duration: got {low:g} to {high:g} s, want two times above 0 with steps * dt, {stated:g} s, between"
-            )
+            want = f"two times above 0 with steps * dt, {stated:g} s, between"
+            raise InputError(f"duration: got {low:g} to {high:g} s, want {want}")
         keep(self, duration=(low, high))
-        why = ""
-        if self.dynamics.discrete or self.dynamics.level != "symbolic":
-            why = "dynamics that are not a formula of rates"
-        elif self.noise is not None:
-            why = "noise"
-        elif any(term.world.moving for term in self.kept_clear):
-            why = "obstacles that move"
-        if why:
+        others = {
+            "dynamics that are not a formula of rates": self.dynamics.discrete or self.dynamics.level != "symbolic",
+            "noise": self.noise is not None, "obstacles that move": any(term.world.moving for term in self.kept_clear),
+        }  # fmt: skip
+        if why := next((why for why, stated in others.items() if stated), ""):
             raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
 
     def _check_rate(self) -> None:
-        """Raises InputError if the rates do not fit the controls, or there must be none for this kind of problem."""
         if self.control_rate is None:
             return
         others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
@@ -569,7 +552,6 @@ class Problem(OneVersion):
         keep(self, control_rate=self.control_rate._in(self.dynamics))
 
     def _check_between_knots(self) -> None:
-        """Raises InputError if the accuracy is no number, or this kind of problem is right at its knots alone."""
         formula = not self.dynamics.discrete and self.dynamics.level == "symbolic"
         if self.accuracy is not None and (self.dynamics.discrete or self.dynamics.level == "jax"):
             raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
@@ -594,8 +576,7 @@ class Problem(OneVersion):
         states, errors = shaped("states", states, (None, len(self.dynamics.state_coordinates))), dict[str, Array]()
         for part in (*terms_of(self.final_cost), *self.constraints):
             for name, error in part.off_place(self.dynamics, states).items():
-                numbered = (f"{name} ({number})" for number in itertools.count(2))
-                errors[name if name not in errors else next(key for key in numbered if key not in errors)] = error
+                errors[_numbered(name, errors)] = error
         return errors
 
     @checked
@@ -636,15 +617,12 @@ class Problem(OneVersion):
                 before = of_term.get(name, worst)
                 of_term[name] = np.where(by[:, None] > before[:, :1], worst, before)
             for name, worst in of_term.items():
-                unused = (f"{name} ({number})" for number in itertools.count(2))
-                worsts[name if name not in worsts else next(key for key in unused if key not in worsts)] = worst
+                worsts[_numbered(name, worsts)] = worst
         return worsts
 
     @property
     def goal_inside(self) -> str:
-        """The position of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if the goal is
-        clear, or is no position.
-        """
+        """The position of a goal that is inside an obstacle of a cost or a Clearance, as text; else empty."""
         goal, end = self.weighed_goal, self.begin + self.steps * self.dt
         collision = None if goal is None else self._inside(self.kept_clear, goal, end)
         return "" if collision is None else collision[0]
@@ -653,3 +631,9 @@ class Problem(OneVersion):
         """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
         collisions = (term.in_world(self.dynamics, time).inside(state) for term in terms)
         return next((collision for collision in collisions if collision is not None), None)
+
+
+def _numbered(name: str, taken: Collection[str]) -> str:
+    """The name; if it is taken, with " (2)" after it, and so on."""
+    numbered = (f"{name} ({number})" for number in itertools.count(2))
+    return next(each for each in itertools.chain([name], numbered) if each not in taken)

@@ -63,21 +63,17 @@ class _SquareCost(Cost):
 
     @property
     def weight(self) -> Array:
-        """The weight matrix (n, n), or one for each knot, (K, n, n). Numbers by name are in no order before a Problem
-        has the cost.
-        """
+        """The weight matrix (n, n), or one for each knot, (K, n, n)."""
         return self._known[0]
 
     @property
     def about(self) -> Array:
-        """The point (n,) at which the cost is zero, or one for each knot, (K, n). Numbers by name are in no order
-        before a Problem has the cost.
-        """
+        """The point (n,) at which the cost is zero, or one for each knot, (K, n)."""
         return self._known[1]
 
     @property
     def _known(self) -> tuple[Array, Array]:
-        if self._numbers is None:
+        if self._numbers is None:  # by name, and so in no order before a Problem has the cost
             raise InputError(f"{self.name}: got numbers by name, want the cost from a Problem: problem.final_cost")
         return self._numbers
 
@@ -105,9 +101,8 @@ class _SquareCost(Cost):
                 weighed = space._by_name(f"{self.name}: weight", weight, _number_or_column)
                 missing = [name for i, name in enumerate(space.names) if i not in weighed]
                 if missing:
-                    raise InputError(
-                        f"{self.name}: weight: got none for {', '.join(missing)}, want one for each control"
-                    )
+                    got = f"none for {', '.join(missing)}"
+                    raise InputError(f"{self.name}: weight: got {got}, want one for each control")
             fields = {
                 field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
                 for field, given in self._arguments.items()

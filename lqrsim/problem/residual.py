@@ -13,7 +13,7 @@ from lqrsim.kernels.linear_algebra import clear
 
 @dataclass(frozen=True, eq=False)
 class Residual(Term):
-    """Numbers that depend on the states, made for one system: the source to compile, and its data.
+    """Numbers that depend on the states, for one system.
 
     The source defines `residual(x, data, out)`, which writes one number per row, and `residual_jacobian(x, data, out,
     slopes)`, which writes them, and their nonzero derivatives in the states (rows, N) to an array of zeros.

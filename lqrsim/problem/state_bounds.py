@@ -82,9 +82,8 @@ class StateBounds(Constraint):
 
     At the end, the bounds do not act on a state that a GoalState fixes. A goal may therefore lie on a bound.
 
-    Either bound may have one number for each of the T+1 knots; where it is infinite, it does not act. A waypoint, or a
-    gate that is open for a while, is such a bound. Numbers belong to knots, also with a free duration. When a
-    `Replanner` plans again, they move with time as a reference does, see `QuadraticCost`.
+    Either bound may have one number for each of the T+1 knots, such as that of a waypoint, or of a gate that is open
+    for a while. Numbers of knots move with time as the rows of a `QuadraticCost` do.
 
     Args:
       bounds: a dictionary of name or unit of a state: (low, high), in its unit, each a number or (T+1,) numbers. An
@@ -184,14 +183,13 @@ def _bound(field: str, bound: object) -> tuple[Side, Side]:
     if wrong or not (np.isfinite(lows).any() or np.isfinite(highs).any()):
         at = wrong[0] if wrong else 0
         knot = f" at knot {at}" if wrong and len(lows) > 1 else ""
-        raise InputError(
-            f"{field}: got {lows[at]:g} to {highs[at]:g}{knot}, want low below high, and one of them finite"
-        )
+        got = f"{lows[at]:g} to {highs[at]:g}{knot}"
+        raise InputError(f"{field}: got {got}, want low below high, and one of them finite")
     return low, high
 
 
 def _side(field: str, bound: object) -> Side:
-    """A bound, or one for each knot. Raises InputError for anything else."""
+    """A bound, or one for each knot."""
     numbers = numbers_of(field, bound, "a number, or one for each knot")
     numbers = check_array(field, numbers, (None,) if numbers.ndim else (), infinite=True)
     if not numbers.size:
