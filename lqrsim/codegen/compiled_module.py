@@ -20,19 +20,7 @@ import numpy as np
 
 from lqrsim import kernels
 from lqrsim.codegen import disk_cache as disk
-from lqrsim.codegen.language import (
-    BOOL,
-    FLOAT,
-    INT,
-    VECTOR,
-    Group,
-    Pointer,
-    Pointers,
-    Scalar,
-    Type,
-    scalars,
-    type_of,
-)
+from lqrsim.codegen.language import BOOL, FLOAT, INT, VECTOR, Group, Pointer, Pointers, Scalar, Type, scalars, type_of
 from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, Source
