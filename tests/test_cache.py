@@ -15,7 +15,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim import rotations
-from lqrsim.codegen import compiled_module, disk_cache
+from lqrsim.codegen import compiled_module, disk_cache, symbolic
 from lqrsim.codegen.compiled_module import CompiledModule
 from lqrsim.codegen.fingerprint import fingerprint, identity
 from lqrsim.codegen.sources import text_source
@@ -424,6 +424,11 @@ def test_sources_are_kept_by_what_each_name_is() -> None:
     assert two.rate([1.0], [3.0, 4.0]) == [6.0]
     one = ls.Dynamics(falling, states={"a": ""}, controls={"b": ""}, parameters={"c": 5.0})
     assert one.rate([1.0], [3.0]) == [2.0]
+
+
+def test_every_module_that_keeps_derivatives_is_in_their_key() -> None:
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in Path(ls.__file__).parent.rglob("*.py")}
+    assert [name for name, text in texts.items() if "symbolic.kept(" in text and text not in symbolic._writers()] == []
 
 
 def test_a_formula_that_failed_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

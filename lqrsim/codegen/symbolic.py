@@ -60,17 +60,15 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
     check_kind("parameters", parameters, Mapping, "a dictionary of name: value")
     if len(parameters) > MOST:
         raise InputError(f"parameters: got {len(parameters)}, want at most {MOST}")
-    for name in parameters:
-        if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
-            raise InputError(
-                f"parameters: got the name {excerpt(name)}, want a Python name without a leading underscore, for p.name"
-            )
     normal: dict[str, float] = {}
     for name, value in parameters.items():
+        if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
+            want = "a Python name without a leading underscore, for p.name"
+            raise InputError(f"parameters: got the name {excerpt(name)}, want {want}")
         if (same := unicodedata.normalize("NFKC", name)) in normal:  # Python normalises the name in p.µ
             raise InputError(f"parameters: got two names that are p.{same} in Python, want different ones")
-        normal[same] = value
-    return {name: check_number(f"parameters: {name}", value) for name, value in normal.items()}
+        normal[same] = check_number(f"parameters: {same}", value)
+    return normal
 
 
 def kept(
@@ -84,14 +82,9 @@ def kept(
     if print_of_it is None:
         return make()
     key = disk_cache.key("derivatives", _writers(), print_of_it, repr(details))
-    stored = disk_cache.load(key)
-    if stored is not None:
-        with contextlib.suppress(ValueError, RecursionError):
-            stored_values = json.loads(stored[0])
-            if isinstance(stored_values, dict) and all(
-                isinstance(stored_values.get(name), kind) for name, kind in kinds.items()
-            ):
-                return stored_values
+    values = disk_cache.made_of(disk_cache.load(key), lambda stored, _: json.loads(stored))
+    if isinstance(values, dict) and all(isinstance(values.get(name), kind) for name, kind in kinds.items()):
+        return values
     values = make()
     name = getattr(function, "__qualname__", repr(function))
     disk_cache.save(key, json.dumps(values).encode(), f"derivatives of {name}(x, u, p)")
@@ -102,12 +95,11 @@ def kept(
 def _writers() -> str:
     """The source of the modules that write the cached files, because these depend on it."""
     package = Path(__file__).parents[1]
-    files = [package / "codegen" / f"{name}.py" for name in ("edge_pushing", "symbolic")]
-    files += [
-        package / "problem" / f"{name}.py"
-        for name in ("belief", "dynamics", "costs", "constraints", "collision_spheres", "noise")
-    ]
-    return "".join(file.read_text(encoding="utf-8") for file in files)
+    names = (
+        "codegen/edge_pushing", "codegen/symbolic", "control/plan_model", "problem/belief",
+        "problem/collision_spheres", "problem/dynamics", "problem/formulas", "problem/noise",
+    )  # fmt: skip
+    return "".join((package / f"{name}.py").read_text(encoding="utf-8") for name in names)
 
 
 def weights(count: int) -> list[Any]:
@@ -125,14 +117,11 @@ def trace(
     *,
     constants: Mapping[str, float] | None = None,
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """Call `function(x, u, p)` with symbols.
+    """The expressions that `function(x, u, p)` returns for symbols, the symbols of x, and those of u.
 
     Args:
       states, controls, parameters: names; without controls, of a `function(x, p)`.
       constants: further attributes of p, with numbers in place of symbols.
-
-    Returns:
-      The expressions that it returned, the symbols of x, and the symbols of u.
     """
     import sympy
 
@@ -150,11 +139,12 @@ def trace(
     except InputError as error:
         raise InputError(f"{called}: {error}") from None
     except Exception as error:  # any exception of a user's function becomes one line
-        raise InputError(
-            f"{called}: got {type(error).__name__} ({error}) when called with symbols, {len(x)} in x{counted},"
-            " want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
-            " for NumPy's functions and for branches there is level='compiled' or 'plain', for JAX's level='jax'"
-        ) from None
+        got = f"{type(error).__name__} ({error}) when called with symbols, {len(x)} in x{counted}"
+        want = (
+            "plain arithmetic and functions of SymPy (from sympy import sin, Max, ...); for NumPy's functions and for"
+            " branches there is level='compiled' or 'plain', for JAX's level='jax'"
+        )
+        raise InputError(f"{called}: got {got}, want {want}") from None
     if returned is None:
         raise InputError(f"{called}: got None, want expressions: is a return missing?")
     if hasattr(returned, "tolist"):  # a NumPy array or a SymPy matrix
@@ -177,8 +167,7 @@ def trace(
         if expression.has(sympy.Sum, sympy.Product, sympy.Integral, sympy.Derivative):
             expression = expression.doit()
         for piecewise in expression.atoms(sympy.Piecewise):
-            last: Any = piecewise.args[-1]
-            if last[1] != sympy.true:
+            if piecewise.args[-1][1] != sympy.true:  # pyright: ignore[reportIndexIssue]
                 raise InputError(f"{called}: got {piecewise} in entry {i}, want its last case to be (expression, True)")
         expressions.append(without_kinks(expression))
     return expressions, x, u
@@ -191,10 +180,8 @@ def _unsorted_extremes() -> Iterator[None]:
 
     def keep(cls: Any, *given: Any, **options: Any) -> Any:
         if any(getattr(argument, "free_symbols", ()) for argument in given):
-            options, given = (
-                {"evaluate": False} | options,
-                tuple(argument for argument in given if argument != cls.identity),
-            )
+            options = {"evaluate": False} | options
+            given = tuple(argument for argument in given if argument != cls.identity)
         return original(cls, *given, **options)
 
     with _TRACING:
