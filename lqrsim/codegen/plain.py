@@ -31,7 +31,7 @@ def plain_functions(
 
     Args:
       functions: Python functions that kernels call by their index here, in place of an address.
-      caller: if given, calls each kernel: `caller(kernel, run, arguments)`.
+      caller: if given, it calls each kernel.
     """
     scope, plain = Scope(source, sizes), {}
     return {name: _run(scope.function(name), _words(functions), plain, caller) for name in names}
@@ -69,19 +69,15 @@ def _run(
 @functools.lru_cache(maxsize=2048)  # a kernel is the same function in many problems, and each solve evaluates its own
 def _compiled(node: ast.FunctionDef, what: str) -> tuple[CodeType, frozenset[str]]:
     """Python's code that defines a kernel, and the names in it."""
-    module = ast.Module([_Plain().visit(ast.parse(ast.unparse(node)).body[0])], [])
+    module = ast.parse(ast.unparse(node))
+    (function,) = module.body
+    assert isinstance(function, ast.FunctionDef)
+    # Names in decorators and annotations are not defined.
+    function.decorator_list, function.returns = [], None
+    for argument in function.args.args:
+        argument.annotation = None
     names = frozenset(name.id for name in ast.walk(module) if isinstance(name, ast.Name))
-    return compile(ast.fix_missing_locations(module), f"<{what}>", "exec"), names
-
-
-class _Plain(ast.NodeTransformer):
-    """Removes decorators and annotations, whose names are not defined."""
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
-        node.decorator_list, node.returns = [], None
-        for argument in node.args.args:
-            argument.annotation = None
-        return node
+    return compile(module, f"<{what}>", "exec"), names
 
 
 def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
@@ -101,11 +97,8 @@ def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
         return _c_call(ctypes.c_double, address, arguments)
 
     words = {name: getattr(np, name, getattr(math, name)) for name in vars(math) if not name.startswith("_")}
-    words |= {f"{side}{name}": getattr(np, f"arc{name}") for name in ("sin", "cos", "tan") for side in "a"}
-    words |= {f"a{name}h": getattr(np, f"arc{name}h") for name in ("sin", "cos", "tan")}
-    words |= {"atan2": np.arctan2, "pow": np.power}
-    words |= {"erf": math.erf, "erfc": math.erfc, "gamma": _gamma, "lgamma": _lgamma}
     return words | {
+        "gamma": _gamma, "lgamma": _lgamma,
         "stack": lambda *shape: np.empty(shape), "zeros": lambda *shape: np.zeros(shape),
         "call": call, "call_for_value": call_for_value,
         "at": lambda address: _memory(address, ctypes.c_double),
@@ -134,10 +127,10 @@ def _lgamma(number: float) -> float:
         return math.inf
 
 
-def _flattened(arguments: Sequence[Any]) -> list[Any]:
-    return [
-        part for argument in arguments for part in (_flattened(argument) if isinstance(argument, tuple) else [argument])
-    ]
+def _flattened(argument: Any) -> list[Any]:
+    if not isinstance(argument, tuple):
+        return [argument]
+    return [part for member in argument for part in _flattened(member)]
 
 
 def _c_call(returns: Any, address: float, arguments: Sequence[Any]) -> Any:

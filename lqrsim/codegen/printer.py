@@ -167,30 +167,24 @@ class Program:
             raise SubsetError(f"{where(function, function.node)}: got {describe(result)} returned, want numbers")
         lines, place = [], 0
         for i, member in enumerate(_passed(function, types)):
-            if isinstance(member, Group):
-                lines.append(f"  %a{i} = getelementptr inbounds i64, ptr %words, i64 {place}")
-            else:
-                loaded = "i64" if member is BOOL else llvm_type(member)
-                lines += [
-                    f"  %p{i} = getelementptr inbounds i64, ptr %words, i64 {place}",
-                    f"  %{'w' if member is BOOL else 'a'}{i} = load {loaded}, ptr %p{i}",
-                ]
-                if member is BOOL:
-                    lines.append(f"  %a{i} = trunc i64 %w{i} to i1")
+            name = "a" if isinstance(member, Group) else "p"
+            lines.append(f"  %{name}{i} = getelementptr inbounds i64, ptr %words, i64 {place}")
+            if member is BOOL:
+                lines += [f"  %w{i} = load i64, ptr %p{i}", f"  %a{i} = trunc i64 %w{i} to i1"]
+            elif not isinstance(member, Group):
+                lines.append(f"  %a{i} = load {llvm_type(member)}, ptr %p{i}")
             place += len(scalars(member))
         lines.append(f"  {call}" if result is None else f"  %r = {call}")
         for i, member in enumerate(returned):
-            part = "%r"
+            part, stored = "%r", llvm_type(member)
             if isinstance(result, Group):
                 lines.append(f"  %o{i} = extractvalue {kind} %r, {i}")
                 part = f"%o{i}"
             if member is BOOL:
                 lines.append(f"  %z{i} = zext i1 {part} to i64")
-                part = f"%z{i}"
-            lines += [
-                f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {place + i}",
-                f"  store {'i64' if member is BOOL else llvm_type(member)} {part}, ptr %q{i}",
-            ]
+                part, stored = f"%z{i}", "i64"
+            lines.append(f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {place + i}")
+            lines.append(f"  store {stored} {part}, ptr %q{i}")
         self._texts.append("\n".join([f"define void @{symbol}(ptr %words) #0 {{", *lines, "  ret void", "}"]))
         return returned
 
@@ -198,7 +192,7 @@ class Program:
         """LLVM's type of a function's result, a call with the arguments %a0, %a1, ..., and the type of the result."""
         name, result = self.instance(function, types)
         kind = "void" if result is None else llvm_type(result)
-        arguments = ", ".join(f"{_passed_type(kind)} %a{i}" for i, kind in enumerate(_passed(function, types)))
+        arguments = ", ".join(f"{_passed_type(each)} %a{i}" for i, each in enumerate(_passed(function, types)))
         return kind, f"call {kind} {name}({arguments})", result
 
 
@@ -242,9 +236,8 @@ class _Body:
         """Print the function."""
         arguments, decorators = self.function.node.args, self.function.node.decorator_list
         if len(self.function.decorators & {"inline", "outline", "compact", "exact"}) < len(decorators):
-            self._refuse(
-                self.function.node, f"`@{ast.unparse(decorators[0])}`", "@inline, @outline, @compact, @exact or none"
-            )
+            got, want = f"`@{ast.unparse(decorators[0])}`", "@inline, @outline, @compact, @exact or none"
+            self._refuse(self.function.node, got, want)
         if arguments.vararg or arguments.kwarg or arguments.kwonlyargs or arguments.defaults or arguments.posonlyargs:
             self._refuse(self.function.node, "arguments with defaults, * or **", "positional ones")
         if len(arguments.args) != len(self.types):
@@ -292,7 +285,7 @@ class _Body:
 
     def _emit(self, text: str) -> str:
         name = self._fresh()
-        self._now.lines.append(f"  {name} = {text}")
+        self._do(f"{name} = {text}")
         return name
 
     def _do(self, text: str) -> None:
@@ -347,9 +340,8 @@ class _Body:
 
     def _get(self, kind: Type, slots: Any) -> Value:
         if isinstance(kind, Group):
-            return Value(
-                kind, parts=tuple(self._get(*self._member_of(kind, slots, i)) for i in range(len(kind.members)))
-            )
+            members = (self._member_of(kind, slots, i) for i in range(len(kind.members)))
+            return Value(kind, parts=tuple(self._get(*member) for member in members))
         if isinstance(slots, Address):
             slots = self._pointer_of(slots)
         return Value(kind, self._emit(f"load {llvm_type(kind)}, ptr {slots}"))
@@ -359,8 +351,7 @@ class _Body:
         if not isinstance(slots, Address):
             return kind.members[place], slots[place]
         offset = sum(len(scalars(member)) for member in kind.members[:place])
-        pointer = self._emit(f"getelementptr inbounds i64, ptr {self._pointer_of(slots)}, i64 {offset}")
-        return kind.members[place], Address(pointer)
+        return kind.members[place], Address(self._at("i64", self._pointer_of(slots), offset))
 
     def _pointer_of(self, address: Address) -> str:
         return self._emit(f"load ptr, ptr {address.name}") if address.in_slot else address.name
@@ -388,7 +379,7 @@ class _Body:
         return self._cast(value, FLOAT, node).name
 
     def _int(self, value: Value, node: ast.AST) -> str:
-        if value.type not in (INT, BOOL):
+        if value.type not in (INT, BOOL):  # a constant float would be cast
             self._refuse(node, describe(value.type), "an int")
         return self._cast(value, INT, node).name
 
@@ -472,27 +463,29 @@ class _Body:
                     self._refuse(target, f"{describe(value.type)} for {len(parts)} names", "as many values")
                 for element, part in zip(parts, value.parts, strict=True):
                     self._assign(element, part)
-            case ast.Subscript() | ast.Attribute():
+            case _:
                 address = self._address(target)
                 self._do(f"store double {self._float(value, target)}, ptr {address}")
-            case _:
-                self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a struct")
 
     def _address(self, target: ast.expr) -> str:
         """The address of an entry of an array or a field of a struct."""
         if isinstance(target, ast.Subscript):
-            entry = self._entry(self._expression(target.value), target)
-            if isinstance(entry, str):
+            if isinstance(entry := self._entry(self._expression(target.value), target), str):
                 return entry
         elif isinstance(target, ast.Attribute):
             row = self._expression(target.value)
             if _is_struct(row.type) and target.attr in row.type.fields:
-                return self._field(row, row.type.fields.index(target.attr))
+                return self._at("double", row.name, row.type.fields.index(target.attr))
         self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a struct")
 
-    def _field(self, row: Value, place: int) -> str:
-        """The address of a field of a struct."""
-        return self._emit(f"getelementptr inbounds double, ptr {row.name}, i64 {place}")
+    def _at(self, kind: str, pointer: str, place: int | str) -> str:
+        """The address of an entry, of LLVM's type `kind`."""
+        return self._emit(f"getelementptr inbounds {kind}, ptr {pointer}, i64 {place}")
+
+    def _library(self, name: str, *numbers: str, fast: str = "") -> Value:
+        """A call of an intrinsic or a C library function of floats."""
+        function, arguments = self.program.library(name, len(numbers)), ", ".join(f"double {n}" for n in numbers)
+        return Value(FLOAT, self._emit(f"call{fast} double {function}({arguments})"))
 
     def _statement_Return(self, node: ast.Return) -> None:
         if node.value is None:
@@ -593,7 +586,7 @@ class _Body:
         self._begin(end)
 
     def _statement_Break(self, node: ast.Break) -> None:
-        _, end = self._loop(node)
+        end = self._loop(node)[1]
         self._left.add(end)
         self._end(f"br label %{end}")
 
@@ -651,7 +644,7 @@ class _Body:
             self._refuse(node, f".{node.attr} of {describe(value.type)}", f"one of: {', '.join(fields) or '(none)'}")
         place = fields.index(node.attr)
         if _is_struct(value.type):
-            return Value(FLOAT, self._emit(f"load double, ptr {self._field(value, place)}"))
+            return Value(FLOAT, self._emit(f"load double, ptr {self._at('double', value.name, place)}"))
         return value.parts[place]
 
     def _reference(self, node: ast.expr) -> Value:
@@ -691,12 +684,10 @@ class _Body:
                     number, stride = self._int(value, node), math.prod(block[i:])
                     number = self._emit(f"mul nsw i64 {number}, {stride}") if stride != 1 else number
                     total = number if total is None else self._emit(f"add nsw i64 {total}, {number}")
-                address = self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {total}")
-                return (
-                    address if len(values) == len(block) + 1 else Value(Pointer(block[len(values) :], fields), address)
-                )
+                address, left = self._at("double", base.name, str(total)), block[len(values) :]
+                return address if len(values) == len(block) + 1 else Value(Pointer(left, fields), address)
             case Pointers() if len(values) == 1:
-                address = self._emit(f"getelementptr inbounds ptr, ptr {base.name}, i64 {self._int(values[0], node)}")
+                address = self._at("ptr", base.name, self._int(values[0], node))
                 return Value(VECTOR, self._emit(f"load ptr, ptr {address}"))
             case Group() if len(values) == 1:
                 return self._member(base, values[0], node)
@@ -711,13 +702,12 @@ class _Body:
         kinds = {part.type for part in group.parts}
         if len(kinds) != 1 or isinstance((kind := kinds.pop()), Group):
             self._refuse(node, "an index that is not constant, of a tuple of several types", "a constant one")
-        table = self._slot(f"[{len(group.parts)} x {llvm_type(kind)}]")
+        of = llvm_type(kind)
+        table = self._slot(f"[{len(group.parts)} x {of}]")
         for i, part in enumerate(group.parts):
-            address = self._emit(f"getelementptr inbounds {llvm_type(kind)}, ptr {table}, i64 {i}")
-            self._do(f"store {llvm_type(kind)} {part.name}, ptr {address}")
-        number = self._int(index, node)
-        address = self._emit(f"getelementptr inbounds {llvm_type(kind)}, ptr {table}, i64 {number}")
-        return Value(kind, self._emit(f"load {llvm_type(kind)}, ptr {address}"))
+            self._do(f"store {of} {part.name}, ptr {self._at(of, table, i)}")
+        address = self._at(of, table, self._int(index, node))
+        return Value(kind, self._emit(f"load {of}, ptr {address}"))
 
     def _expression_UnaryOp(self, node: ast.UnaryOp) -> Value:
         if isinstance(node.op, ast.Not):
@@ -764,7 +754,7 @@ class _Body:
                 shift = self._emit(f"select i1 {down}, double {b}, double {_hex(0.0)}")
                 return Value(FLOAT, self._emit(f"fadd double {remainder}, {shift}"))
             quotient = self._emit(f"fdiv double {self._emit(f'fsub double {a}, {remainder}')}, {b}")
-            quotient = self._emit(f"call double {self.program.library('llvm.rint.f64', 1)}(double {quotient})")
+            quotient = self._library("llvm.rint.f64", quotient).name
             return Value(FLOAT, self._emit(f"fsub double {quotient}, {self._emit(f'uitofp i1 {down} to double')}"))
         return Value(FLOAT, self._emit(f"f{name} {self._fast} double {a}, {b}"))
 
@@ -795,9 +785,7 @@ class _Body:
             return self._arithmetic(ast.Div(), _constant(1.0), total, node) if number < 0 else total
         if exponent.type is not FLOAT and base.type is not FLOAT:
             self._refuse(node, "a whole exponent of an int that is not constant", "a float")
-        function = self.program.library("llvm.pow.f64", 2)
-        a, b = self._float(base, node), self._float(exponent, node)
-        return Value(FLOAT, self._emit(f"call double {function}(double {a}, double {b})"))
+        return self._library("llvm.pow.f64", self._float(base, node), self._float(exponent, node))
 
     def _expression_Compare(self, node: ast.Compare) -> Value:
         left, total = self._expression(node.left), None
@@ -807,7 +795,7 @@ class _Body:
             if total is None:
                 total = outcome
             elif total.constant is not None and outcome.constant is not None:
-                total = _constant(bool(total.constant) and bool(outcome.constant))
+                total = _constant(bool(total.constant and outcome.constant))
             else:
                 total = Value(BOOL, self._emit(f"and i1 {total.name}, {outcome.name}"))
             left = right
@@ -917,9 +905,8 @@ class _Body:
         returned = self._emit(f"call {llvm_type(result)} {symbol}({arguments})")
         if not isinstance(result, Group):
             return Value(result, returned)
-        kind = llvm_type(result)
-        parts = [self._emit(f"extractvalue {kind} {returned}, {i}") for i in range(len(result.members))]
-        return _assemble(result, iter(parts))
+        extract = f"extractvalue {llvm_type(result)} {returned}"
+        return _assemble(result, iter([self._emit(f"{extract}, {i}") for i in range(len(result.members))]))
 
     def _in_memory(self, value: Value) -> Value:
         """The address of a record, which is written to memory if it is not there."""
@@ -928,8 +915,7 @@ class _Body:
         parts = _leaves(value)
         table = self._slot(f"[{len(parts)} x i64]", 8)
         for i, part in enumerate(parts):
-            address = self._emit(f"getelementptr inbounds i64, ptr {table}, i64 {i}")
-            self._do(f"store {llvm_type(part.type)} {part.name}, ptr {address}")
+            self._do(f"store {llvm_type(part.type)} {part.name}, ptr {self._at('i64', table, i)}")
         return Value(value.type, table)
 
     def _call_word(self, name: str, given: list[Value], node: ast.Call) -> Value | None:
@@ -942,19 +928,16 @@ class _Body:
             return method(given, node)
         if name in UNARY or name in BINARY:
             library = UNARY.get(name) or BINARY[name]
-            function = self.program.library(library, count)
-            numbers = ", ".join(f"double {self._float(value, node)}" for value in given)
             fast = f" {self._fast}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
-            return Value(FLOAT, self._emit(f"call{fast} double {function}({numbers})"))
+            return self._library(library, *(self._float(value, node) for value in given), fast=fast)
         if name in SCALES:
             return self._arithmetic(ast.Mult(), given[0], _constant(float(SCALES[name])), node)
         if name in TESTS:
             number = self._float(given[0], node)
             if name == "isnan":
                 return Value(BOOL, self._emit(f"fcmp uno double {number}, {number}"))
-            size = self._emit(f"call double {self.program.library('llvm.fabs.f64', 1)}(double {number})")
-            test = "oeq" if name == "isinf" else "olt"
-            return Value(BOOL, self._emit(f"fcmp {test} double {size}, {_hex(float('inf'))}"))
+            size, test = self._library("llvm.fabs.f64", number), "oeq" if name == "isinf" else "olt"
+            return Value(BOOL, self._emit(f"fcmp {test} double {size.name}, {_hex(math.inf)}"))
         self._refuse(node, f"a call of {name}", "a word of `codegen/language.py`")
 
     def _extreme(self, given: list[Value], node: ast.AST, op: ast.cmpop, plainly: Callable[..., Any]) -> Value:
@@ -981,8 +964,7 @@ class _Body:
             negative = self._emit(f"icmp slt i64 {number}, 0")
             minus = self._emit(f"sub nsw i64 0, {number}")
             return Value(INT, self._emit(f"select i1 {negative}, i64 {minus}, i64 {number}"))
-        function = self.program.library("llvm.fabs.f64", 1)
-        return Value(FLOAT, self._emit(f"call double {function}(double {self._float(given[0], node)})"))
+        return self._library("llvm.fabs.f64", self._float(given[0], node))
 
     def _word_int(self, given: list[Value], node: ast.AST) -> Value:
         if given[0].type is FLOAT:
@@ -1052,8 +1034,7 @@ class _Body:
 
     def _shared(self, given: list[Value], node: ast.AST) -> str:
         """The address of an int64 that threads share."""
-        words, index = self._pointer(given[0], node), self._int(given[1], node)
-        return self._emit(f"getelementptr inbounds i64, ptr {words}, i64 {index}")
+        return self._at("i64", self._pointer(given[0], node), self._int(given[1], node))
 
     def _word_claim(self, given: list[Value], node: ast.AST) -> Value:
         outcome = self._emit(f"cmpxchg ptr {self._shared(given, node)}, i64 0, i64 1 acq_rel acquire")

@@ -37,12 +37,11 @@ Constant = bool | int | float | tuple[Any, ...]
 @checked
 @dataclass(frozen=True)
 class Source:
-    """Functions in the kernels' subset, of a module or a text; `source_of` and `text_source` make it.
+    """Functions of a module or a text; `source_of` and `text_source` make it.
 
     Attributes:
       constants: (name, number or tuple of numbers), which replace the module's.
-      fills: (name, source, name there) of functions that fill declarations of the module or its imports, or replace
-        their functions.
+      fills: (name, source, name there) of functions that take the place of functions of the module or its imports.
     """
 
     module: str = ""
@@ -50,11 +49,6 @@ class Source:
     constants: tuple[tuple[str, Constant], ...] = ()
     fills: tuple[tuple[str, "Source", str], ...] = ()
     what: str = field(default="source", compare=False)
-
-    def __post_init__(self) -> None:
-        for name, number in self.constants:
-            if not _is_constant(number):
-                raise InputError(f"source: {name}: got {excerpt(number)}, want a number or a tuple of numbers")
 
     def __hash__(self) -> int:
         return self._hash
@@ -76,11 +70,9 @@ class Source:
         A function can be filled in if the module defines it, or if the module, or one that it imports from, imports it
         from `declarations.py`, where it is empty: there stands which files have the real one.
         """
-        pairs = {name: fill if isinstance(fill, tuple) else (fill, name) for name, fill in fills.items()}
-        kept = tuple(fill for fill in self.fills if fill[0] not in pairs)
-        return Source(
-            self.module, self.text, self.constants, (*kept, *((name, *pair) for name, pair in pairs.items())), self.what
-        )
+        kept = (fill for fill in self.fills if fill[0] not in fills)
+        new = ((name, *fill) if isinstance(fill, tuple) else (name, fill, name) for name, fill in fills.items())
+        return Source(self.module, self.text, self.constants, (*kept, *new), self.what)
 
     def has(self, name: str) -> bool:
         """Whether there is a function of that name, the source's own or filled in."""
@@ -120,12 +112,11 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
     """
     if isinstance(source, Source):
         return source
-    wanted = " and ".join(f"{name}(...)" for name in functions)
-    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
-    wrong = _wrong(str(source), tuple(functions.items()))
-    if wrong:
-        raise InputError(f"{field}: source: {wrong}")
-    return text_source(str(source), f"{field}: source")
+    what = f"{field}: source"
+    text = check_kind(what, source, str, f"text that defines {' and '.join(f'{name}(...)' for name in functions)}")
+    if wrong := _wrong(text, tuple(functions.items())):
+        raise InputError(f"{what}: {wrong}")
+    return text_source(text, what)
 
 
 @functools.lru_cache(maxsize=256)  # a problem that is stated repeatedly has the same sources
@@ -200,19 +191,16 @@ class Scope:
         self._constants = dict(source.constants)
         self._fills = {name: (filled, inner_name) for name, filled, inner_name in source.fills}
         self._scopes: dict[Source, Scope] = {}
-        self._found: dict[str, Meaning] = {}
+        self._found: dict[str, Meaning | None] = {}
 
     def find(self, name: str) -> Meaning | None:
         """The meaning of a name; None if it is not defined."""
         if name not in self._found:
-            meaning = self._find(name)
-            if meaning is None:
-                return None
-            self._found[name] = meaning
+            self._found[name] = self._find(name)
         return self._found[name]
 
     def function(self, name: str) -> ScopedFunction:
-        """The function of that name. Raises SubsetError if there is none."""
+        """The function of that name."""
         meaning = self.find(name)
         if not isinstance(meaning, ScopedFunction):
             raise SubsetError(f"{self.source.what}: got no function {name}, want it defined")
@@ -222,8 +210,7 @@ class Scope:
         if name in self._constants:
             return self._constants[name]
         if name in self._fills:
-            source, inner_name = self._fills[name]
-            return self._scope_of(source).function(inner_name)
+            return self._filled(name)
         if name in self._functions:
             return ScopedFunction(self, self._functions[name])
         if name in self._imports:
@@ -253,10 +240,13 @@ class Scope:
         if name in WORDS:
             return Word(name)
         if name in self._fills:
-            source, inner_name = self._fills[name]
-            return self._scope_of(source).function(inner_name)
+            return self._filled(name)
         value = getattr(declarations, name, None)
         return value if _is_constant(value) else None
+
+    def _filled(self, name: str) -> ScopedFunction:
+        source, inner_name = self._fills[name]
+        return self._scope_of(source).function(inner_name)
 
     def _at_hand(self, name: str) -> Meaning | None:
         """The meaning of a name that a text can use without importing it."""
@@ -337,9 +327,8 @@ def _parse(text: str) -> _Parsed:
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             functions[node.name] = node
-            texts += lines[
-                min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)]) - 1 : node.end_lineno
-            ]
+            first = min(part.lineno for part in (node, *node.decorator_list))
+            texts += lines[first - 1 : node.end_lineno]
         elif isinstance(node, ast.ImportFrom):
             imports |= {alias.asname or alias.name: (str(node.module), alias.name) for alias in node.names}
     return _Parsed(functions, imports, "\n".join(texts))

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property, partial
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -57,14 +57,11 @@ def _numba_names() -> dict[str, Any]:
     from numba import carray  # pyright: ignore[reportPrivateImportUsage]
     from numba.extending import intrinsic
 
+    @intrinsic  # pyright: ignore[reportCallIssue, reportArgumentType]
     def readonly(typingctx: Any, array: Any) -> Any:
-        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return args[0]
+        return array.copy(readonly=True)(array), lambda context, builder, sig, args: args[0]
 
-        return array.copy(readonly=True)(array), generate
-
-    decorate: Any = intrinsic
-    return {"carray": carray, "readonly": decorate(readonly)}
+    return {"carray": carray, "readonly": readonly}
 
 
 def _reason(error: Exception) -> str:
@@ -73,11 +70,9 @@ def _reason(error: Exception) -> str:
         return "a function that returns on every path, and does not change x and u"
     if "readonly" in str(error) and "setitem" in str(error):
         return "a function that does not change x and u, which are readonly"
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    telling = [
-        line for line in lines if not re.match(r"Failed in|During:|File |\^|- Resolution|<source|raised from", line)
-    ]
-    return f"its subset of Python ({' '.join(telling[:3])})"
+    lines = (line.strip() for line in str(error).splitlines())
+    where = r"$|Failed in|During:|File |\^|- Resolution|<source|raised from"
+    return f"its subset of Python ({' '.join([line for line in lines if not re.match(where, line)][:3])})"
 
 
 LEVELS = ("symbolic", "compiled", "jax", "plain")
@@ -85,11 +80,8 @@ LEVELS = ("symbolic", "compiled", "jax", "plain")
 
 def level_of(function: Any, level: str | None) -> str:
     """The level of a function: the given level, or by default compiled for a numba function and symbolic for others."""
-    if not callable(function):
-        raise InputError(f"function: got {excerpt(function)}, want a function of (x, u, p)")
+    check_function("function", function, "a function of (x, u, p)")
     is_compiled = hasattr(function, "py_func")
-    if level is not None and not isinstance(level, str):
-        raise InputError(f"level: got {excerpt(level)}, want one of: {', '.join(LEVELS)}")
     if level is None:
         return "compiled" if is_compiled else "symbolic"
     if check_name("level", level, LEVELS) != "compiled" and is_compiled:
@@ -188,9 +180,8 @@ class UserFunction:
         except InputError:
             raise
         except Exception as error:  # any exception of a user's function becomes one line
-            raise InputError(
-                f"{self.name}: got {type(error).__name__} ({error}), want no exception at x = {first_numbers(x)}"
-            ) from error
+            got, want = f"{type(error).__name__} ({error})", f"no exception at x = {first_numbers(x)}"
+            raise InputError(f"{self.name}: got {got}, want {want}") from error
 
     def _values(self, function: Callable[..., Any], x: Array, u: Array, p: Any) -> list[Array]:
         """What it returns, as one vector, or writes; of copies, because it may keep them beyond the call."""
@@ -235,9 +226,9 @@ class UserFunction:
 
     @cached_property
     def called_back(self) -> tuple[Any, int]:
-        """A C function that calls this one through Python: the object to keep alive, and its address.
+        """`f(x, u, data, out)` or `f(x, u, data, a, b)` in C, of pointers to float64, that calls it through Python.
 
-        It is `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
+        With the object to keep alive before its address, as `compiled`.
         """
         sizes = [int(np.prod(shape)) for shape in self.writes] or [self.values]
         end = self.offset + len(self.parameters)
@@ -376,24 +367,14 @@ def with_derivatives(
     return (first,) if derivatives is None else (first, UserFunction(function=derivatives, writes=writes, **both))
 
 
-class Part(Protocol):
-    """What compiled code reads: functions, whose addresses come first, and numbers."""
-
-    @property
-    def functions(self) -> tuple[UserFunction, ...]: ...
-    @property
-    def data(self) -> Array: ...
-
-
 @dataclass(frozen=True, eq=False)
 class Term:
     """A part of a problem, for one system: the source to compile, and the numbers that it reads.
 
     Attributes:
       source: text that defines the functions of its kind of term, or a Source, from a module of the package.
-        `codegen/language.py` defines what it may contain. N, M, W and functions such as sqrt and exp are available by
-        their bare names: `cos`, not `math.cos` or `np.cos`, which are refused. So are the functions of
-        `kernels/signed_distance.py` and `kernels/rotation_ratios.py`.
+        `codegen/language.py` defines what it may contain. N, M, W, functions such as sqrt and exp, and those of
+        `kernels/signed_distance.py` and `kernels/rotation_ratios.py` are available by their bare names.
       data: (any,) float64; the source can index it, but cannot determine its length.
       functions: functions that the source calls with `call`; their addresses come first in its data.
     """
@@ -423,14 +404,14 @@ class Term:
         return len(self.functions) + len(self.data)
 
     def __post_init__(self) -> None:
-        keep(self, data=check_array(f"{type(self).__name__}: data", self.data, (None,), infinite=True))
-        _ = self.code
-        wanted = "a tuple of UserFunction, as FunctionCost makes them"
-        keep(self, functions=check_items(f"{type(self).__name__}: functions", self.functions, UserFunction, wanted))
+        kind, wanted = type(self).__name__, "a tuple of UserFunction, as FunctionCost makes them"
+        data = check_array(f"{kind}: data", self.data, (None,), infinite=True)
+        keep(self, data=data, functions=check_items(f"{kind}: functions", self.functions, UserFunction, wanted))
+        _ = self.code  # which is checked
 
 
 def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[list[Any]]:
-    """This number of rows that a user's function returned, in lists or arrays. Raises InputError for anything else."""
+    """This number of rows that a user's function returned, in lists or arrays."""
     if returned is None:
         raise InputError(f"got None, want {wanted}: is a return missing?")
     listed = returned.tolist() if hasattr(returned, "tolist") else returned
@@ -443,8 +424,8 @@ def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[
     return rows
 
 
-def numbers_of(part: Part) -> Array:
-    """The data of its source: the addresses of its functions, then its own numbers."""
+def numbers_of(part: Any) -> Array:
+    """What compiled code reads of a Term or Dynamics: the addresses of its functions, then its own numbers."""
     if not part.functions:
         return part.data
     return np.concatenate([[address_of(function) for function in part.functions], part.data])
@@ -508,8 +489,7 @@ def address_of(function: UserFunction) -> float:
 
 def view(address: int, size: int) -> Array:
     """The numbers at an address."""
-    memory: Any = (ctypes.c_double * size).from_address(address)
-    return np.frombuffer(memory, dtype=np.float64)
+    return np.frombuffer((ctypes.c_double * size).from_address(address), dtype=np.float64)
 
 
 def first_numbers(x: Array) -> str:
@@ -519,12 +499,12 @@ def first_numbers(x: Array) -> str:
 
 def check_signature(function: Any, wanted: Sequence[str]) -> None:
     """Raises InputError unless a function takes these arguments."""
-    plain = getattr(function, "py_func", function)
+    want = f"want a function of ({', '.join(wanted)})"
     try:
-        inspect.signature(plain).bind(*wanted)
+        inspect.signature(getattr(function, "py_func", function)).bind(*wanted)
     except TypeError as error:
-        raise InputError(f"{name_of(function)}: {error}, want a function of ({', '.join(wanted)})") from None
+        raise InputError(f"{name_of(function)}: {error}, {want}") from None
     except ValueError:  # a built-in function has no signature
         return
     except Exception:  # an object whose attributes raise
-        raise InputError(f"function: got {excerpt(function)}, want a function of ({', '.join(wanted)})") from None
+        raise InputError(f"function: got {excerpt(function)}, {want}") from None
