@@ -162,11 +162,8 @@ def _of_parameters(function: Any) -> dict[str, Declared]:
     """The declarations of parameters. A plain number, text or dictionary says too little: the function decides."""
     hints = get_type_hints(function, include_extras=True)
     specs = {name: declared(hint) for name, hint in hints.items() if name != "return"}
-    return {
-        name: spec
-        for name, spec in specs.items()
-        if not (spec.plain and (get_origin(spec.kinds[0]) or spec.kinds[0]) in _PLAIN)
-    }
+    plain = {name for name, spec in specs.items() if (get_origin(spec.kinds[0]) or spec.kinds[0]) in _PLAIN}
+    return {name: spec for name, spec in specs.items() if not (spec.plain and name in plain)}
 
 
 @cache
@@ -189,8 +186,7 @@ def _of_fields(kind: type) -> dict[str, Declared]:
 @cache
 def declared(annotation: Any) -> Declared:
     """The content of an annotation."""
-    metadata: list[Any] = []
-    optional = False
+    metadata, optional = list[Any](), False
     kinds: tuple[Any, ...] = (annotation,)
     while len(kinds) == 1 and get_origin(kinds[0]) in (Annotated, Union, UnionType):
         inside = get_args(kinds[0])
@@ -207,11 +203,10 @@ def declared(annotation: Any) -> Declared:
     dtype = None
     if get_origin(kinds[0]) in (np.ndarray, npt.NDArray):  # the latter from NumPy 2.5 on, with Python 3.12
         dtype = np.int64 if "int64" in str(kinds[0]) else np.float64
-    letters, want, names = first(str) or "", first(Want), first(OneOf)
-    if get_origin(kinds[0]) is Literal:
-        names = OneOf(get_args(kinds[0]))
-    wanted, allowed = want.text if want else "", names.names if names else ()
-    return Declared(kinds, dtype, letters, first(Bounds), first(int), wanted, allowed, optional)
+    want, listed = first(Want), first(OneOf)
+    names = get_args(kinds[0]) if get_origin(kinds[0]) is Literal else listed.names if listed else ()
+    wanted = want.text if want else ""
+    return Declared(kinds, dtype, first(str) or "", first(Bounds), first(int), wanted, names, optional)
 
 
 def _is_known(spec: Declared) -> bool:
@@ -260,9 +255,9 @@ def _checked(field: str, value: Any, spec: Declared, sizes: Sizes | None) -> Any
         return check_flag(field, value)
     if spec.names:
         return check_name(field, value, spec.names)
+    if kind is str and want:
+        return check_text(field, value, want, at_most=spec.longest or 200)
     if kind is str:
-        if want:
-            return check_text(field, value, want, at_most=spec.longest or 200)
         return check_string(field, value, spec.longest)
     origin, inside = get_origin(kind), get_args(kind)
     if origin is Callable:
@@ -316,10 +311,11 @@ def _items(field: str, value: Any, spec: Declared, sizes: Sizes | None) -> tuple
     kinds = inner[:1] * len(items) if len(inner) == 1 or inner[-1] is Ellipsis else inner
     if len(kinds) != len(items):
         raise InputError(f"{field}: got {len(items)} entries, want {len(kinds)}")
-    pairs = enumerate(zip(items, map(declared, kinds), strict=True))
-    return tuple(
-        _checked(f"{field}[{i}]", item, of_item, sizes) if _is_known(of_item) else item for i, (item, of_item) in pairs
-    )
+    checked_items = list(items)
+    for i, of_item in enumerate(map(declared, kinds)):
+        if _is_known(of_item):
+            checked_items[i] = _checked(f"{field}[{i}]", items[i], of_item, sizes)
+    return tuple(checked_items)
 
 
 def _unify_sizes(field: str, record: Any, sizes: Sizes) -> None:
@@ -385,9 +381,8 @@ def _array(field: str, value: Any, spec: Declared, sizes: Sizes) -> Any:
     if spec.bounds is not None:
         above, least, most, below = (np.nan if bound is None else bound for bound in spec.bounds)
         bad = ~np.isfinite(array) | (array <= above) | (array < least) | (array > most) | (array >= below)
-        if bad.any():
-            place = tuple(np.argwhere(bad)[0].tolist())
-            check_number(f"{field}{list(place)}", array[place].item(), **spec.bounds._asdict())
+        for place in np.argwhere(bad)[:1].tolist():
+            check_number(f"{field}{place}", array[tuple(place)].item(), **spec.bounds._asdict())
     return array
 
 
@@ -406,8 +401,7 @@ def check_string(field: str, value: Any, longest: int | None = None) -> str:
 
     Lines are printed as they are, and a terminal obeys control characters.
     """
-    if not isinstance(value, str):
-        raise InputError(f"{field}: got {excerpt(value)}, want text")
+    check_kind(field, value, str, "text")
     if longest is not None and not (len(value) <= longest and value.isprintable()):
         raise InputError(f"{field}: got {excerpt(value)}, want one printable line of at most {longest} characters")
     if not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):

@@ -132,10 +132,7 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
-    """A block that adds results so far to an exception, as its attribute `found`.
-
-    `make` returns them, given the `found` of an inner block, or None.
-    """
+    """A block that adds results so far, `make(found of an inner block, or None)`, to an exception, as `found`."""
     try:
         yield
     except BaseException as error:

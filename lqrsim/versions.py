@@ -26,10 +26,8 @@ def _versions() -> dict[str, str]:
 def changed(was: Mapping[str, str]) -> str:
     """The versions that have changed, as `name new (was old)`; empty if none has changed."""
     now = versions()
-    names = [*now, *(name for name in was if name not in now)]
-    return ", ".join(
-        f"{name} {now.get(name)} (was {was.get(name)})" for name in names if now.get(name) != was.get(name)
-    )
+    names = [name for name in now | dict(was) if now.get(name) != was.get(name)]
+    return ", ".join(f"{name} {now.get(name)} (was {was.get(name)})" for name in names)
 
 
 def other_lqrsim(was: Mapping[str, str]) -> str:
@@ -58,10 +56,9 @@ def outdated(extra: str = "") -> str:
         name: present for name, present in versions_of(*least).items()
         if present != "not installed" and _numbers(present) < _numbers(least[name])
     }  # fmt: skip
-    if not older:
-        return ""
+    got = ", ".join(f"{name} {present}" for name, present in older.items())
     wanted = " ".join(f"'{name}>={least[name]}'" for name in older)
-    return f"got {', '.join(f'{name} {present}' for name, present in older.items())}, want newer: pip install {wanted}"
+    return f"got {got}, want newer: pip install {wanted}" if older else ""
 
 
 def _numbers(version: str) -> tuple[int, ...]:
