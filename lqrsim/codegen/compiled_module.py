@@ -5,6 +5,7 @@ block of memory, a number or an address every 8 bytes. Functions that compiled c
 signatures below, called by their addresses.
 """
 
+import contextlib
 import ctypes
 import functools
 import importlib
@@ -59,12 +60,8 @@ class CompiledModule:
 
     def lay_out(self, name: str, *arguments: Any) -> "Call":
         """Lay out a call of a function, to be made any number of times, by one thread at a time."""
-        entry = self._last.get(name)
-        if entry is not None:
-            try:
-                return Call(entry, arguments)  # this checks the types
-            except TypeError:
-                pass
+        with contextlib.suppress(KeyError, TypeError):  # the first call, or other types, which a Call checks
+            return Call(self._last[name], arguments)
         types = tuple(map(type_of, arguments))
         entry = self._last[name] = self._once((name, types), lambda: self._make_entries({name: types})[name])
         return Call(entry, arguments)
@@ -269,9 +266,7 @@ def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[list[Sca
 
 @functools.cache
 def _toolchain() -> str:
-    """A hash of everything that machine code depends on, except the source: all kernels, and the compiler's own
-    modules.
-    """
+    """A hash of all that machine code depends on, except the source: all kernels, and the compiler's own modules."""
     modules = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
     paths = [Path(str(importlib.import_module(name).__file__)) for name in modules]
     paths += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))

@@ -143,9 +143,7 @@ def hessian_of(
 ) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
     """The second derivatives of `sum_i weights[i] results[i]`; steps are added to the operations.
 
-    Args:
-      results: names of formulas, as `operations.of` returns them.
-      weights: a symbol for each formula, which is in none of them.
+    `results` are names of formulas, as `operations.of` returns them, and `weights` are symbols that are in none.
 
     Returns:
       Steps (symbol, operation), in order, and in terms of these the second derivatives by variables i <= j that are not

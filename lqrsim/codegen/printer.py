@@ -92,10 +92,7 @@ class _Retyped(Exception):
 
 
 class Program:
-    """The LLVM IR of kernels and everything that they call.
-
-    `export` and `entry` add functions; `text` is the IR.
-    """
+    """The LLVM IR of kernels and everything that they call. `export` and `entry` add functions; `text` is the IR."""
 
     def __init__(self) -> None:
         self._instances: dict[tuple[Any, ...], tuple[str, Type | None]] = {}

@@ -78,9 +78,9 @@ def _reason(error: Exception) -> str:
 LEVELS = ("symbolic", "compiled", "jax", "plain")
 
 
-def level_of(function: Any, level: str | None) -> str:
-    """The level of a function: the given level, or by default compiled for a numba function and symbolic for others."""
-    check_function("function", function, "a function of (x, u, p)")
+def level_of(function: Any, level: str | None, arguments: Sequence[str] = ("x", "u", "p")) -> str:
+    """The level of a function of these arguments; by default compiled for a numba function and symbolic for others."""
+    check_signature(function, arguments)
     is_compiled = hasattr(function, "py_func")
     if level is None:
         return "compiled" if is_compiled else "symbolic"
@@ -475,8 +475,7 @@ def check_derivative(field: str, derivative: Any, function: Any, level: str, arg
         got = f"a derivative of {name_of(function)}, which is {level}"
         raise InputError(f"{field}: got {got}, want none (it is derived) or level='compiled' or 'plain'")
     check_function(field, derivative, f"a function of ({arguments})")
-    level_of(derivative, level)
-    check_signature(derivative, arguments.split(", "))
+    level_of(derivative, level, arguments.split(", "))
 
 
 def address_of(function: UserFunction) -> float:
@@ -498,13 +497,14 @@ def first_numbers(x: Array) -> str:
 
 
 def check_signature(function: Any, wanted: Sequence[str]) -> None:
-    """Raises InputError unless a function takes these arguments."""
-    want = f"want a function of ({', '.join(wanted)})"
+    """Raises InputError unless it is a function of these arguments."""
+    want = f"a function of ({', '.join(wanted)})"
+    check_function("function", function, want)
     try:
         inspect.signature(getattr(function, "py_func", function)).bind(*wanted)
     except TypeError as error:
-        raise InputError(f"{name_of(function)}: {error}, {want}") from None
+        raise InputError(f"{name_of(function)}: {error}, want {want}") from None
     except ValueError:  # a built-in function has no signature
         return
     except Exception:  # an object whose attributes raise
-        raise InputError(f"function: got {excerpt(function)}, {want}") from None
+        raise InputError(f"function: got {excerpt(function)}, want {want}") from None

@@ -25,13 +25,12 @@ from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.edge_pushing import Operations, hessian_of, jacobian_of
 from lqrsim.codegen.sources import text_source
-from lqrsim.codegen.user_functions import check_signature, level_of, name_of, rows_of
+from lqrsim.codegen.user_functions import level_of, name_of, rows_of
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
     check_items,
-    check_kind,
     check_name,
     check_symmetric,
     excerpt,
@@ -80,7 +79,6 @@ class NoisySensors:
     ) -> None:  # fmt: skip
         if level_of(function, None) == "compiled":
             raise InputError(f"NoisySensors: got the numba function {name_of(function)}, want one of SymPy symbols")
-        check_signature(function, ("x", "u", "p"))
         self.function, self.parameters, self.delay = function, symbolic.check_parameters(parameters), delay
 
 
@@ -121,8 +119,6 @@ class Belief(Dynamics):
         self, dynamics: Dynamics, *, dt: Positive, noise: Noise, sensors: NoisySensors, averaged: bool = False,
         uncertain: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
-        check_kind("Belief: noise", noise, Noise, "a Noise")
-        check_kind("Belief: sensors", sensors, NoisySensors, "NoisySensors(...)")
         for field, level in (("dynamics", dynamics.level), ("noise", noise.level)):
             if level != "symbolic" or dynamics.by_mujoco:
                 raise InputError(f"Belief: {field}: got a function of arrays, want a formula")
@@ -154,9 +150,7 @@ class Belief(Dynamics):
         )
 
     def state(self, mean: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
-        """The belief (N,) of a mean (n,) and a covariance (n, n), positive definite in the uncertain states; or (n,)
-        standard deviations.
-        """
+        """The belief (N,) of a mean (n,) and a covariance (n, n), or deviations (n,), above 0 for uncertain states."""
         n, rows = self.size, self.rows
         numbers = real("covariance", covariance)
         if numbers.ndim == 1:
@@ -215,8 +209,7 @@ class Belief(Dynamics):
           function: as in `SymbolicConstraint`, with x the robot's state.
           chance: largest chance that an entry of it is negative, below a half.
         """
-        values: Mapping[str, float] = {} if parameters is None else parameters
-        check_kind("chance_constraint: parameters", values, Mapping, "a dictionary by name")
+        values = symbolic.check_parameters(parameters)
         n, rows, names = self.size, self.rows, tuple(self.robot.state_coordinates.names)
         quantile, deviations = -NormalDist().inv_cdf(chance), free_name("deviations", values)
 
@@ -235,10 +228,7 @@ class Belief(Dynamics):
         return SymbolicConstraint(margin, parameters={**values, deviations: quantile}, name=name)
 
     def corrected(self, states: Array, controls: Array, readings: Array) -> Array:
-        """The beliefs (K, N) of the extended Kalman filter one period later.
-
-        Its readings (K, Y) are taken at the end of the period; NaN are lost.
-        """
+        """The beliefs (K, N) of the filter one period later, after readings (K, Y) at its end; NaN are lost ones."""
         size = len(self.state_coordinates)
         states = shaped("states", states, (None, size))
         controls = shaped("controls", controls, (len(states), len(self.control_coordinates)))
@@ -251,10 +241,10 @@ class Belief(Dynamics):
         entries = self._each("read", 2 * self.readings, shaped("states", states, (None, self.size)))
         return entries[:, ::2], entries[:, 1::2]
 
-    @functools.cached_property
+    @property
     def readings(self) -> int:
         """Y, the number of readings."""
-        return int(self._made["readings"])
+        return self._made["readings"]
 
     def _each(self, name: str, size: int, *given: Array) -> Array:
         out, n = np.empty((len(given[0]), size)), len(self.state_coordinates)
@@ -416,10 +406,9 @@ def _key(
     dynamics: Dynamics, dt: float, noise: Noise, sensors: NoisySensors, averaged: bool, rows: list[int]
 ) -> Callable[[Any, Any, Any], Any]:
     """A function that refers to all that a belief is made of, by which its formulas are kept; nothing calls it."""
-    parts = (
-        dynamics.f, dynamics.discrete, dynamics.substeps, float(dt), noise.strength,
-        noise.function if noise.matrix is None else noise.matrix, sensors.function, averaged, rows,
-    )  # fmt: skip
+    shaken = noise.function if noise.matrix is None else noise.matrix
+    steps = dynamics.f, dynamics.discrete, dynamics.substeps, float(dt)
+    parts = *steps, noise.strength, shaken, sensors.function, averaged, rows
 
     def belief(x: Any, u: Any, p: Any) -> Any:
         return parts

@@ -17,7 +17,6 @@ from lqrsim.codegen.user_functions import (
     axes_of,
     check_depends_on,
     check_derivative,
-    check_signature,
     level_of,
     name_of,
     numbers_of,
@@ -135,8 +134,7 @@ class CollisionSpheres:
         depends_on: Sequence[str] | None = None,
         level: str | None = None,
     ) -> None:
-        self.level = level_of(places, level)
-        check_signature(places, ("x", "p"))
+        self.level = level_of(places, level, ("x", "p"))
         if jacobian is not None:
             check_derivative("CollisionSpheres: jacobian", jacobian, places, self.level, "x, p, slopes")
         self.function, self.jacobian = places, jacobian

@@ -15,7 +15,7 @@ import numpy as np
 from lqrsim.annotations import Index, checked
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import Term
-from lqrsim.errors import Array, InputError, brief, check_count, excerpt
+from lqrsim.errors import Array, InputError, brief, check_count, check_kind
 from lqrsim.problem import residual as kernel
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.dynamics import Dynamics
@@ -233,13 +233,10 @@ class CostSum(Cost):
 
 
 def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
-    """The terms of a sum; a single cost is its own. Raises InputError for an object that is no cost."""
+    """The terms of a sum; a single cost is its own."""
     if isinstance(cost, CostSum):
         return cost.terms
-    if not isinstance(cost, Cost):
-        or_given = ", or a FixedState" if field == "initial" else ""
-        wanted = f"a cost such as QuadraticCost(...) or a sum of costs{or_given}"
-        raise InputError(f"{field}: got {excerpt(cost)}, want {wanted}")
+    check_kind(field, cost, Cost, Cost._want + (", or a FixedState" if field == "initial" else ""))
     return (cost,)
 
 

@@ -1,6 +1,4 @@
-"""Checks the values and derivatives of a user's functions: before the first iteration, and where derivatives are in
-doubt.
-"""
+"""Checks of the values and derivatives of a user's functions: before the first iteration, and when in doubt."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -11,7 +9,7 @@ import numpy as np
 
 from lqrsim.annotations import Bounds, Line, NonNegative, Positive, Seed, checked
 from lqrsim.codegen.user_functions import Term, UserFunction, first_numbers
-from lqrsim.errors import Array, InputError, excerpt
+from lqrsim.errors import Array, InputError
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.plain_term import PlainTerm
@@ -132,9 +130,8 @@ def check_derivatives(
 ) -> list[DerivativeCheck]:
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
-    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes. Derivatives
-    of compiled and plain functions may be wrong. Costs without derivatives are left out, because central differences
-    are used for them anyway.
+    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes. Costs without
+    derivatives are left out, because central differences are used for them anyway.
 
     Args:
       subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
@@ -145,8 +142,6 @@ def check_derivatives(
       One check per matrix of derivatives, with its worst entry; print it.
     """
     dynamics = subject.dynamics if isinstance(subject, Problem) else subject
-    if not isinstance(dynamics, Dynamics):
-        raise InputError(f"subject: got {excerpt(subject)}, want a Problem or Dynamics")
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     x0, u0 = np.zeros(n), np.zeros(m)
     if isinstance(subject, Problem):

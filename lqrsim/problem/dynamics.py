@@ -20,7 +20,6 @@ from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import (
     UserFunction,
     check_derivative,
-    check_signature,
     interrupt_of,
     level_of,
     name_of,
@@ -153,7 +152,6 @@ class Dynamics:
         self.level = level_of(f, level)
         if self.level == "jax" and period is not None:
             raise InputError(f'period: got {period:g} beside level="jax", want none: functions of JAX are rates')
-        check_signature(f, ("x", "u", "p"))
         if jacobian is not None:
             check_derivative("jacobian", jacobian, f, self.level, "x, u, p, fx, fu")
         self.parameters, self.disturbances = map(symbolic.check_parameters, (parameters, disturbances))

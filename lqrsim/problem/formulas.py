@@ -21,7 +21,6 @@ from lqrsim.codegen.user_functions import (
     axes_of,
     check_depends_on,
     check_derivative,
-    check_signature,
     level_of,
     name_of,
     with_derivatives,
@@ -70,7 +69,6 @@ class OfFormula(OfFunction):
         self._set_name(name)
         if level_of(function, None) == "compiled":
             raise InputError(f"{type(self).__name__}: got the numba function {name_of(function)}, want {instead}")
-        check_signature(function, ("x", "u", "p"))
         self.function, self.parameters = function, symbolic.check_parameters(parameters)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
@@ -310,7 +308,6 @@ class FunctionCost(OfFunction, Cost):
             wanted = "a tuple of names of states and controls, at least one"
             raise InputError(f"FunctionCost: depends_on: got none, want {wanted}, or None for all of them")
         self.parameters = symbolic.check_parameters(parameters)
-        check_signature(function, ("x", "u", "p"))
         if derivatives is not None:
             arguments = "x, u, p, gradient, hessian"
             check_derivative("FunctionCost: derivatives", derivatives, function, self.level, arguments)

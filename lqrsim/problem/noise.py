@@ -21,7 +21,6 @@ from lqrsim.codegen.user_functions import (
     Term,
     axes_of,
     check_depends_on,
-    check_signature,
     level_of,
     name_of,
     numbers_of,
@@ -103,7 +102,6 @@ class Noise:
         self.matrix, self.level, self.depends_on = None, "symbolic", None
         if callable(function):
             self.level = level_of(function, level)
-            check_signature(function, ("x", "u", "p"))
             if size is None:
                 raise InputError("Noise: size: got none, want k, the number of entries of w and of each row of M")
             self.size = check_count("Noise: size", size, at_most=MOST)

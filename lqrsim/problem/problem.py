@@ -140,16 +140,14 @@ class Problem(OneVersion):
         the state alone; `lq.rate_feedback` makes the best feedback, which also depends on the last command. Feedback
         adds to the rates of the plan: a `Replanner` clips its commands to the limits, other controllers do not, and
         `violations` says by how much they exceed them.
-      constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
-        `StateBounds` and `Clearance`.
+      constraints: conditions on the plan at the knots: `SymbolicConstraint`, `GoalState`, `StateBounds`, `Clearance`.
       begin: time in s of the first knot. The positions of moving obstacles are those at time 0.
       noise: process noise: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation, to second order
         about the plan. None for a problem without noise.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
         risk-averse, below 0 risk-seeking; 0 is the expectation.
-      duration: (shortest, longest) in s, for a free final time. A solve begins with `dt` and `steps`. The solution has
-        the same number of steps, and its own dt. The stage cost still counts once per step, whatever dt is. None for
-        the fixed duration steps * dt.
+      duration: (shortest, longest) in s, for a free final time. A solve begins with `dt` and `steps`; the solution has
+        as many steps, and its own dt. The stage cost still counts once per step. None for steps * dt.
       time_weight: cost per second of a free duration. The cost of a solution does not include it.
       segments: knots that divide a plan into segments, such as those of waypoints. With a free duration, that of each
         segment is free, too: whatever has numbers by knot moves with these knots. The steps of a solution are equally
@@ -224,7 +222,7 @@ class Problem(OneVersion):
 
     @property
     def times(self) -> Array:
-        """The times of the knots, (T+1,) in s; see `begin`."""
+        """The times of the knots, (T+1,) in s."""
         return self.begin + self.dt * np.arange(self.steps + 1)
 
     @property
@@ -415,9 +413,7 @@ class Problem(OneVersion):
 
     @property
     def nominal_control(self) -> Array:
-        """u*, (m,), at which the sum of the ControlCosts is least; zeros if there is none. The mean if it has one for
-        each step.
-        """
+        """u*, (m,), at which the sum of the ControlCosts is least, or its mean over steps; zeros if there is none."""
         controls = self.nominal_controls
         return controls if controls.ndim == 1 else controls.mean(axis=0)
 
@@ -564,14 +560,13 @@ class Problem(OneVersion):
     def site_errors(self, states: Annotated[Array, "K n"]) -> dict[str, Array]:
         """How far sites are from where SiteCosts of the final cost and SiteConstraints want them.
 
-        A goal has states alone, so neither the goal line of a Solution nor a run's outcome counts this.
+        Neither the goal line of a Solution nor a run's outcome counts this.
 
             problem.site_errors(rollout.states[:, -1])  # of the last state of each trial
 
         Returns:
           Name of the site -> (K,), its distance from the position in metres; with " turned", its angle from the
-          orientation in rad. NaN for states that are not finite. If a site has several places, " (2)" follows the name
-          of the second, and so on.
+          orientation in rad. NaN for states that are not finite. " (2)" follows the name for a second place, and so on.
         """
         states, errors = shaped("states", states, (None, len(self.dynamics.state_coordinates))), dict[str, Array]()
         for part in (*terms_of(self.final_cost), *self.constraints):
@@ -589,9 +584,8 @@ class Problem(OneVersion):
           Name -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in seconds; zeros
           for a trial that violates it by at most 1e-6. Names do not depend on the runs or on the constraints' numbers:
           "StateBounds: x low", "GoalState: x", "ControlRate: torque high" of the commands, "SymbolicConstraint: NAME",
-          its `name` or that of its function, with "[0]" for the first of several entries. Only a lambda without a name
-          is called by its expressions, which may have numbers. If an earlier constraint has the same name, " (2)"
-          follows, and so on.
+          its `name` or that of its function (of a lambda its expressions), with "[0]" for the first of several entries.
+          " (2)" follows a name that an earlier constraint has, and so on.
         """
         sizes = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates), self.steps
         rollout_sizes = rollout.states.shape[2], rollout.applied.shape[2], rollout.plan.steps
