@@ -149,14 +149,9 @@ def vectors_of(field: str, value: npt.ArrayLike, size: int) -> Array:
 
 
 def check_number(
-    field: str,
-    value: object,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    at_most: float | None = None,
-    below: float | None = None,
-) -> float:
+    field: str, value: object, *, above: float | None = None, at_least: float | None = None,
+    at_most: float | None = None, below: float | None = None,
+) -> float:  # fmt: skip
     """`value` as a finite float within the bounds. Raises InputError otherwise, including for text and bools."""
     number = math.nan
     with contextlib.suppress(Exception):  # an object may raise anything in its conversion
@@ -450,10 +445,8 @@ def format_error(error: BaseException) -> str:
     return (f"{type(error).__name__}: {text}" if text else type(error).__name__) + (f" ({where})" if where else "")
 
 
-_NOT_USERS = tuple(
-    os.path.join(os.path.realpath(folder), "")
-    for folder in (os.path.dirname(__file__), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
-)
+_INSTALLED = (sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+_NOT_USERS = tuple(os.path.realpath(folder) + os.sep for folder in (os.path.dirname(__file__), *_INSTALLED))
 
 
 def _line_of_user(trace: types.TracebackType | None) -> str:

@@ -13,9 +13,9 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim.codegen.distances import hull_distances, signed_distance
 from lqrsim.errors import Array
 from lqrsim.kernels.hull_distance import hull_distance
+from lqrsim.problem.collision_shape import hull_distances, signed_distance
 from lqrsim.problem.derivative_check import evaluate
 
 CAR, TRAILER = ls.types.Box(0.5, 0.25), ls.types.Box(0.3, 0.25)

@@ -9,10 +9,10 @@ from sampling import examples
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim.codegen import distances
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance_derivatives
+from lqrsim.problem import collision_shape
 from lqrsim.scenes.world import KINDS
 
 SIZES = {
@@ -108,7 +108,9 @@ def test_compiled_distances_are_the_plain_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     world = ls.World([obstacle(kind, seed) for kind in KINDS])
     points = rng.normal(size=(4, 5, 3))
-    np.testing.assert_allclose(distances.signed_distance(world, points), world.distance(points), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        collision_shape.signed_distance(world, points), world.distance(points), rtol=0, atol=1e-12
+    )
     rows = np.array([world.distances(point) for point in points.reshape(-1, 3)])
     assert (world.nearest(points).ravel() == rows.argmin(axis=1)).all()
 

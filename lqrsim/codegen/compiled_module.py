@@ -259,7 +259,6 @@ def in_c_order(array: Array) -> Array:
 
 
 def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[list[Scalar]]]:
-    """Load cached functions, with the types that they return."""
     kinds = {kind.name: kind for kind in (FLOAT, INT, BOOL)}
     return Loaded(code), [[kinds[name] for name in names] for names in known["returns"]]
 

@@ -44,7 +44,6 @@ class Jitted:
             return np.asarray(self._jitted(*given))
 
     def traced(self, *given: Any) -> Any:
-        """What JAX traces."""
         import jax.numpy as jnp
 
         return jnp.asarray(self.py_func(*given))

@@ -21,12 +21,9 @@ Caller = Callable[[ScopedFunction, Callable[..., Any], tuple[Any, ...]], Any]
 
 
 def plain_functions(
-    source: Source,
-    sizes: Mapping[str, int],
-    names: Sequence[str],
-    functions: Sequence[Callable[..., None]] = (),
+    source: Source, sizes: Mapping[str, int], names: Sequence[str], functions: Sequence[Callable[..., None]] = (),
     caller: Caller | None = None,
-) -> dict[str, Callable[..., Any]]:
+) -> dict[str, Callable[..., Any]]:  # fmt: skip
     """Functions of a source, by name, as plain Python functions.
 
     Args:

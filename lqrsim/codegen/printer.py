@@ -230,7 +230,6 @@ class _Body:
     # Lines and blocks.
 
     def run(self) -> None:
-        """Print the function."""
         arguments, decorators = self.function.node.args, self.function.node.decorator_list
         if len(self.function.decorators & {"inline", "outline", "compact", "exact"}) < len(decorators):
             got, want = f"`@{ast.unparse(decorators[0])}`", "@inline, @outline, @compact, @exact or none"
@@ -257,7 +256,6 @@ class _Body:
             self._refuse(self.function.node, "a path that returns nothing", "a value on all")
 
     def text(self, name: str) -> str:
-        """The IR."""
         passed = ", ".join(
             # Records do not change: LLVM need not read their parts again.
             f"ptr noalias readonly %a{i}" if isinstance(kind, Group) else f"{llvm_type(kind)} %a{i}"
@@ -691,7 +689,6 @@ class _Body:
         self._refuse(node, f"{len(values)} indices of {describe(base.type)}", "as many as it has")
 
     def _member(self, group: Value, index: Value, node: ast.AST) -> Value:
-        """The entry of a tuple."""
         if isinstance(index.constant, int):
             if index.constant >= len(group.parts):
                 self._refuse(node, f"entry {index.constant} of {len(group.parts)}", "a smaller one")
@@ -756,7 +753,6 @@ class _Body:
         return Value(FLOAT, self._emit(f"f{name} {self._fast} double {a}, {b}"))
 
     def _whole(self, name: str, a: str, b: str) -> Value:
-        """Arithmetic of ints."""
         if name in ("add", "sub", "mul"):
             return Value(INT, self._emit(f"{name} nsw i64 {a}, {b}"))
         none = self._emit(f"icmp eq i64 {b}, 0")  # because a division by zero would end the process

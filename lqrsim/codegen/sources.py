@@ -200,7 +200,6 @@ class Scope:
         return self._found[name]
 
     def function(self, name: str) -> ScopedFunction:
-        """The function of that name."""
         meaning = self.find(name)
         if not isinstance(meaning, ScopedFunction):
             raise SubsetError(f"{self.source.what}: got no function {name}, want it defined")

@@ -110,13 +110,9 @@ def weights(count: int) -> list[Any]:
 
 
 def trace(
-    function: Callable[..., Any],
-    states: Sequence[str],
-    controls: Sequence[str] | None,
-    parameters: Sequence[str],
-    *,
+    function: Callable[..., Any], states: Sequence[str], controls: Sequence[str] | None, parameters: Sequence[str], *,
     constants: Mapping[str, float] | None = None,
-) -> tuple[list[Any], list[Any], list[Any]]:
+) -> tuple[list[Any], list[Any], list[Any]]:  # fmt: skip
     """The expressions that `function(x, u, p)` returns for symbols, the symbols of x, and those of u.
 
     Args:
@@ -282,15 +278,9 @@ def without_kinks(expression: Any) -> Any:
 
 
 def write_function(
-    name: str,
-    arguments: str,
-    data: str,
-    assignments: Mapping[str, Any],
-    *,
-    of: str,
-    returns: str | None = None,
+    name: str, arguments: str, data: str, assignments: Mapping[str, Any], *, of: str, returns: str | None = None,
     steps: Sequence[tuple[Any, Any]] | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """Source of a function that evaluates SymPy expressions.
 
     Args:
@@ -329,9 +319,8 @@ def write_function(
         steps, values = sympy.cse(values, symbols=sympy.numbered_symbols("s"))
     used = set().union(*(e.free_symbols for e in [*values, *(value for _, value in steps)]))
     lines = [f"def {name}({arguments}):"]
-    for symbol in sorted((s for s in used if str(s)[0] in "xupw"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
-        letter, index = str(symbol)[0], str(symbol)[1:]
-        lines.append(f"    {symbol} = {data if letter == 'p' else letter}[{index}]")
+    for letter, index in sorted((str(s)[0], int(str(s)[1:])) for s in used if str(s)[0] in "xupw"):
+        lines.append(f"    {letter}{index} = {data if letter == 'p' else letter}[{index}]")
     try:
         lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in steps]
         for target, value in zip(assignments, values, strict=True):
@@ -346,10 +335,9 @@ def write_function(
 
 
 def write_chain(states: int, slopes: Iterable[str]) -> str:
-    """Source of `chain` of `kernels/runge_kutta.py` for a sparse Jacobian.
+    """Source of `chain` of `kernels/runge_kutta.py` for a Jacobian with these nonzero entries, `fx[0, 3]`, `fu[1, 0]`.
 
-    Known zeros make an iteration faster than zeros that are found at run time. `slopes` are the nonzero entries,
-    `fx[0, 3]`, `fu[1, 0]`, ....
+    Known zeros make an iteration faster than zeros that are found at run time.
     """
     entries = [(target[:2], *map(int, target[3:-1].split(", "))) for target in slopes]
     inner = [(i, k) for matrix, i, k in entries if matrix == "fx"]

@@ -41,7 +41,6 @@ _loaded: dict[str, tuple[Any, int]] = {}
 
 
 def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int]:
-    """Load a cached function."""
     from numba.core import registry
 
     # Creating numba's target registers the functions of its runtime.
@@ -390,7 +389,6 @@ class Term:
 
     @cached_property
     def code(self) -> Source:
-        """The source, checked. Raises InputError."""
         return check_source(type(self).__name__, self.source, self._defines)
 
     @property

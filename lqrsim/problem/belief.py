@@ -139,15 +139,11 @@ class Belief(Dynamics):
             states=dict(zip(names, units, strict=True)) | {f"root_{names[i]}_{names[j]}": units[i] for i, j in pairs},
             controls=dict(zip(controls.names, controls.units, strict=True)),
             parameters=_together(dynamics.parameters, noise.parameters, sensors.parameters),
-            disturbances=dynamics.constants,
-            position=[names[i] for i in space.position],
-            plane=space.plane if len(space.position) == 2 else "",
-            offset=space.offset,
-            angles=[names[i] for i in space.angles],
+            disturbances=dynamics.constants, control_limits=(controls.low, controls.high), period=dt,
+            position=[names[i] for i in space.position], plane=space.plane if len(space.position) == 2 else "",
+            offset=space.offset, angles=[names[i] for i in space.angles],
             rotation_vectors=[names[i : i + 3] for i in space.rotation_vectors],
-            control_limits=(controls.low, controls.high),
-            period=dt,
-        )
+        )  # fmt: skip
 
     def state(self, mean: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
         """The belief (N,) of a mean (n,) and a covariance (n, n), or deviations (n,), above 0 for uncertain states."""
@@ -262,11 +258,9 @@ class Belief(Dynamics):
         n, of = len(step.x), f"{self.name}(x, u, p)"
         values = {f"out[{i}]": entry for i, entry in enumerate(step.after)}
         value = _written("rate", "x, u, p, out", values, step, of)
-        slopes = {
-            (f"fx[{i}, {j}]" if j < n else f"fu[{i}, {j - n}]"): slope
-            for (i, j), slope in jacobian_of(step.operations, step.after, [*step.x, *step.u]).items()
-        }
-        return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values | slopes, step, of)}"
+        for (i, j), slope in jacobian_of(step.operations, step.after, [*step.x, *step.u]).items():
+            values[f"fx[{i}, {j}]" if j < n else f"fu[{i}, {j - n}]"] = slope
+        return f"{value}\n\n{_written('rate_jacobian', 'x, u, p, out, fx, fu', values, step, of)}"
 
     def _weighted_hessian(self) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
         step = self._step()
@@ -279,11 +273,10 @@ class Belief(Dynamics):
         values = {f"out[{i}]": entry for i, entry in enumerate(step.after)}
         pairs, _, _ = self._sensing()
         sense = {f"out[{i}]": entry for i, entry in enumerate(pairs)}
-        parts = [
-            _written("correct", "x, u, p, w, out", values, step, of),
-            symbolic.write_function("sense", "x, p, out", "p", sense, of=of),
-        ]
-        return {"filter": "\n\n".join([*(f"@outline\n{part}" for part in parts), _LOOPS]), "readings": len(pairs) // 2}
+        correct = _written("correct", "x, u, p, w, out", values, step, of)
+        sense = symbolic.write_function("sense", "x, p, out", "p", sense, of=of)
+        text = "\n\n".join([f"@outline\n{correct}", f"@outline\n{sense}", _LOOPS])
+        return {"filter": text, "readings": len(pairs) // 2}
 
     def _sensing(self) -> tuple[list[Any], list[Any], list[Any]]:
         """The formulas of readings and their deviations, in turn, of the robot's state."""
@@ -304,7 +297,6 @@ class Belief(Dynamics):
         return entries, x, u
 
     def _formulas(self, function: Callable[..., Any]) -> tuple[list[Any], list[Any], list[Any]]:
-        """The formulas of a function of the robot's state and control, and their symbols."""
         names = self.robot.state_coordinates.names, self.control_coordinates.names
         return symbolic.trace(function, *names, list(self.parameters), constants=self.constants)
 
@@ -342,9 +334,8 @@ class Belief(Dynamics):
             column = [name(sum(root[i][j] * seen[j] for j in range(i + 1))) for i in range(n)]
             columns.append([name(entry / sympy.sqrt(sums[0])) for entry in column])
             if read:
-                off = sum(
-                    (s * (now[i] - mean[i]) for s, i in zip(slope, rows, strict=True)), name(reading.xreplace(at))
-                )
+                off = name(reading.xreplace(at))
+                off += sum(s * (now[i] - mean[i]) for s, i in zip(slope, rows, strict=True))
                 factor = name((sympy.Symbol(f"w{row}", real=True) - off) / sums[0])
                 now = list(now)
                 for i, entry in zip(rows, column, strict=True):
@@ -443,7 +434,6 @@ def _needed(step: _Step, values: Iterable[Any]) -> list[tuple[Any, Any]]:
 
 
 def _lower(entries: Any, n: int) -> list[list[Any]]:
-    """The rows of a lower triangle."""
     return [list(entries[i * (i + 1) // 2 :][: i + 1]) for i in range(n)]
 
 

@@ -84,7 +84,7 @@ class CollisionSpheres:
         ls.CollisionSpheres(rotors, [0.12] * 4)
 
     `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all balls clear. The `balls` of a `Robot`
-    are its collision shape in simulation; a robot without balls is one ball at its position. `Capsule` makes chains.
+    are its collision shape in simulation; a robot without them is one ball at its position. `Capsule` makes chains.
 
     `hulls` makes convex hulls of them, with exact distances, such as the boxes of a car and its trailer in the plane:
 
@@ -108,15 +108,14 @@ class CollisionSpheres:
         in the plane of the position or, without one, in the horizontal plane; obstacles are then seen as for the
         position, see `World.seen_by`. The parameters of the dynamics are attributes of p.
       radii: (K,) radii of the balls, in metres; with hulls also one for all.
-      hulls: number of balls of each hull, in the order of the balls. Balls of one hull have one radius. By default each
-        ball is by itself. Obstacles of hulls in a plane stand upright on it.
-      names: names of the balls, or hulls, in messages; by default "ball 0", "ball 1", ..., or "hull 0", ....
-      sites: names of sites or geoms in the robot's MJCF, one per ball, or None. A `Plant` checks that each of them has
-        its centre where the formula puts the ball.
+      hulls: number of balls of each hull, in the order of the balls, which have one radius. By default each ball is by
+        itself. Obstacles of hulls in a plane stand upright on it.
+      names: of the balls, or hulls, in messages; by default "ball 0", "ball 1", ..., or "hull 0", ....
+      sites: sites or geoms in the robot's MJCF, one per ball, or None. A `Plant` checks that their centres are there.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the nonzero derivatives to slopes
-        (K, 3 or 2, n), which are zero on entry. Without a jacobian, central differences are used; JAX derives it.
-      depends_on: names of the states that the centres depend on, for the compiled and the plain level; all by default.
-        The fewer, the faster.
+        (K, 3 or 2, n), which are zero on entry. Without it, central differences are used; JAX derives it.
+      depends_on: names of the states that the centres depend on, for these levels; all by default. The fewer, the
+        faster.
       level: as in `Dynamics`.
 
     The result of `places` is checked when it is first needed.
@@ -290,7 +289,7 @@ class CollisionSpheres:
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
-    """Centres of this number of balls, (..., count, 3), by compiled code, at states (..., n)."""
+    """The centres (..., count, 3) of this number of balls, by compiled code, at states (..., n)."""
     points = np.asarray(states, dtype=np.float64)
     flat = in_c_order(points.reshape(-1, points.shape[-1]))
     out = np.empty((len(flat), 3 * count))

@@ -133,10 +133,9 @@ class Dynamics:
         for field, listed in (("position", position), ("angles", angles), ("rotation_vectors", rotation_vectors)):
             if isinstance(listed, str):
                 raise InputError(f"{field}: got {excerpt(listed)}, want a tuple of names: ({excerpt(listed)},)")
-        position, angles = (
-            check_items(field, listed, str, f"a tuple of names of states, of {', '.join(names)}")
-            for field, listed in (("position", position), ("angles", angles))
-        )
+        want = f"a tuple of names of states, of {', '.join(names)}"
+        position = check_items("position", position, str, want)
+        angles = check_items("angles", angles, str, want)
 
         def index(field: str, name: str) -> int:
             return names.index(check_name(field, name, names))
@@ -160,14 +159,10 @@ class Dynamics:
         if self.level != "symbolic":  # constants gain nothing
             self.parameters |= self.disturbances
         self.state_coordinates = Coordinates(
-            names=names,
-            units=tuple(states.values()),
+            names=names, units=tuple(states.values()), plane=plane, offset=offset, rotation_vectors=tuple(starts),
             position=tuple(index("position", name) for name in position),
-            plane=plane,
-            offset=offset,
             angles=tuple(index("angles", name) for name in angles),
-            rotation_vectors=tuple(starts),
-        )
+        )  # fmt: skip
         space = Coordinates(names=tuple(controls), units=tuple(controls.values()))
         self.control_coordinates = space if control_limits is None else space.limited(control_limits)
         # Computed now, not when first needed: several threads may need the functions, and addresses must not change.
@@ -184,7 +179,6 @@ class Dynamics:
 
     @property
     def name(self) -> str:
-        """The name of `f`."""
         return name_of(self.f)
 
     @property
@@ -334,7 +328,6 @@ class Dynamics:
 
     @cached_property
     def compiled(self) -> CompiledModule:
-        """The compiled module of `step_source`."""
         return self._module_of(self.step_source)
 
     def _module_of(self, source: Source) -> CompiledModule:
@@ -355,9 +348,8 @@ class Dynamics:
     def _curvature_of_part(self) -> Source | None:
         """The same of one Runge-Kutta step."""
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
-        by_values = source_of(differences, AXES=axes).filled(
-            **self._rates, **dict.fromkeys(("advance", "step_jacobian"), self._part_source)
-        )
+        part, by_values = self._part_source, source_of(differences, AXES=axes)
+        by_values = by_values.filled(**self._rates, advance=part, step_jacobian=part)
         by_jacobians = source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_jacobians"))
         if self.level != "symbolic" and self.jacobian is None:
             by_values = by_values.filled(value=(by_values, "weighted_step"))
@@ -508,7 +500,6 @@ class Dynamics:
         return a, b, out - a @ x - b @ u
 
     def _evaluate(self, name: str, x: Array, u: Array, dt: float, *out: Array) -> None:
-        """Call a function of `step_source`, which writes."""
         self._plain[name](x, u, self._numbers(), dt, *out)
 
     def _check(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
@@ -520,9 +511,8 @@ class Dynamics:
         """What is compiled, as plain Python."""
         sizes = {"N": len(self.state_coordinates), "M": len(self.control_coordinates)}
         names = ("rate", "rate_jacobian", "advance", "step_jacobian")
-        return plain_functions(
-            self.step_source, sizes, names, [function.plain_call(self.parameters) for function in self.functions]
-        )
+        calls = [function.plain_call(self.parameters) for function in self.functions]
+        return plain_functions(self.step_source, sizes, names, calls)
 
     def _numbers(self) -> Array:
         """The `p` of the compiled functions, with places for the addresses of functions."""

@@ -65,7 +65,6 @@ class OfFormula(OfFunction):
     def _set_formula(
         self, function: Callable[..., Any], parameters: Mapping[str, float] | None, name: str | None, instead: str
     ) -> None:
-        """Check and keep a function of symbols."""
         self._set_name(name)
         if level_of(function, None) == "compiled":
             raise InputError(f"{type(self).__name__}: got the numba function {name_of(function)}, want {instead}")
@@ -103,9 +102,8 @@ class SymbolicCost(OfFormula, Cost):
     def bind(self, dynamics: Dynamics) -> CostTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
         details = ("cost", *names, tuple(self.parameters))
-        traced = symbolic.kept(
-            self.function, details, lambda: self._trace(*names), source=str, nonconvex_in=list, uses_control=bool
-        )
+        kinds = {"source": str, "nonconvex_in": list, "uses_control": bool}
+        traced = symbolic.kept(self.function, details, lambda: self._trace(*names), **kinds)
         curved = None if self.convex or not traced["nonconvex_in"] else tuple(traced["nonconvex_in"])
         return CostTerm(traced["source"], self._data, nonconvex_in=curved, uses_control=traced["uses_control"])
 
@@ -206,10 +204,8 @@ class SymbolicConstraint(OfFormula, Constraint):
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
         details = ("constraint", *names, tuple(self.parameters))
-        traced = symbolic.kept(
-            self.function, details, lambda: self._trace(*names),
-            source=str, rows=int, with_control=list, texts=list,
-        )  # fmt: skip
+        kinds = {"source": str, "rows": int, "with_control": list, "texts": list}
+        traced = symbolic.kept(self.function, details, lambda: self._trace(*names), **kinds)
         with_control, rows = traced["with_control"], traced["rows"]
         if self.at == "final" and with_control:
             got, want = "an entry that depends on u", "none at the final step, which has no u"

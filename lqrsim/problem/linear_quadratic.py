@@ -65,12 +65,10 @@ class Stage:
 
     @property
     def states(self) -> int:
-        """n, the number of states."""
         return np.shape(self.B)[-2]
 
     @property
     def controls(self) -> int:
-        """m, the number of controls."""
         return np.shape(self.B)[-1]
 
 

@@ -143,7 +143,6 @@ class Noise:
 
     @checked
     def bind(self, dynamics: Dynamics) -> NoiseTerm:
-        """The noise for a system."""
         n = len(dynamics.state_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
         if self.matrix is not None:
@@ -193,7 +192,6 @@ class Noise:
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
     def _rows(self, returned: Any, n: int) -> list[list[Any]]:
-        """The result of the function, as n rows."""
         wanted = f"{n} rows, one per state, of {self.size} entries"
         rows = rows_of(returned, n, wanted)
         for row in rows:

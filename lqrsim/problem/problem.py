@@ -97,7 +97,6 @@ class FixedState:
         return QuadraticCost(np.zeros(len(self.numbers)), about=self.numbers)
 
     def _extended(self, numbers: npt.ArrayLike) -> "FixedState":
-        """The state with further numbers at its end."""
         other = FixedState(np.append(self.numbers, numbers))
         keep(other, _must_be_clear=self._must_be_clear)
         return other
@@ -324,7 +323,6 @@ class Problem(OneVersion):
     settled = renamed("settled", "with_duration_of")
 
     def _of_duration(self, seconds: float) -> "Problem":
-        """The problem with a fixed duration."""
         return replace(self, dt=seconds / self.steps, duration=None, time_weight=0.0)
 
     def _with_segments(self, knots: Sequence[int]) -> "Problem":
@@ -461,11 +459,8 @@ class Problem(OneVersion):
         space, controls = self.dynamics.state_coordinates, self.control_coordinates
         low, high = (self.steps * self.dt,) * 2 if self.duration is None else self.duration
         seconds = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
-        limited = [
-            f"{name} {low:g} to {high:g}"
-            for name, low, high in zip(controls.names, controls.low, controls.high, strict=True)
-            if np.isfinite([low, high]).any()
-        ]
+        sides = zip(controls.names, controls.low, controls.high, strict=True)
+        limited = [f"{name} {low:g} to {high:g}" for name, low, high in sides if np.isfinite([low, high]).any()]
         return {
             "dynamics": f"{self.dynamics.name}; {self.steps} steps of {self.dt:.6g} s, {seconds} in all",
             "states": ", ".join(space.labels), "controls": ", ".join(controls.labels), "limits": ", ".join(limited),
@@ -593,11 +588,10 @@ class Problem(OneVersion):
             got, want = ("{} states, {} controls, {} steps".format(*counts) for counts in (rollout_sizes, sizes))
             raise InputError(f"rollout: got {got}, want the problem's: {want}")
         worsts: dict[str, Array] = {}
-        stated = [
-            (rollout.states, rollout.applied, term, names_of(constraint, term))
-            for constraint, term in zip(self.constraints, self.constraint_terms, strict=True)
-            if constraint.kept_clear is None
-        ]
+        stated, pairs = [], zip(self.constraints, self.constraint_terms, strict=True)
+        for constraint, term in pairs:
+            if constraint.kept_clear is None:
+                stated.append((rollout.states, rollout.applied, term, names_of(constraint, term)))
         if self.control_rate is not None and self.control_rate.limits is not None:
             last = np.pad(rollout.commanded, [(0, 0), (1, 0), (0, 0)])  # of the first step the term knows it itself
             term = RateLimits(self.control_rate, self.dt).bind(self.dynamics)

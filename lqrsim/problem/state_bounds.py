@@ -60,11 +60,9 @@ class GoalState(Constraint):
         turning = self._turning_states(dynamics)
         rows = list(self.final_states(dynamics).items())
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
-        data = _bound_data(
-            [(i, 1.0, np.inf, 2 * np.pi if i in turning else 0.0, np.array([number])) for i, number in rows]
-        )
+        table = [(i, 1.0, np.inf, 2 * np.pi if i in turning else 0.0, np.array([number])) for i, number in rows]
         return ConstraintTerm(
-            source_of(__name__), data, len(rows), described.__getitem__, equality=True, final_only=True,
+            source_of(__name__), _bound_data(table), len(rows), described.__getitem__, equality=True, final_only=True,
             names=tuple(names[i] for i, _ in rows),
         )  # fmt: skip
 
@@ -119,7 +117,6 @@ class StateBounds(Constraint):
         return self._bind_at(dynamics, np.zeros(1), {})
 
     def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
-        """Raises InputError if a goal is outside the bounds."""
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         rows, described, named = [], [], []
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
@@ -135,9 +132,8 @@ class StateBounds(Constraint):
                 rows.append((i, sign, len(times) - 2 if i in goals else np.inf, 0.0, numbers))
                 described.append(wanted)
                 named.append(f"{name} {('low', 'high')[side]}")
-        return ConstraintTerm(
-            source_of(__name__), _bound_data(rows), len(rows), described.__getitem__, convex=True, names=tuple(named)
-        )
+        kernel, data, describe = source_of(__name__), _bound_data(rows), described.__getitem__
+        return ConstraintTerm(kernel, data, len(rows), describe, convex=True, names=tuple(named))
 
 
 class LimitCost(Cost):
@@ -148,11 +144,8 @@ class LimitCost(Cost):
         self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None, *, weight: NonNegative
     ) -> None:
         self.weight = weight
-        self.bounds = [
-            (name, sign, check_number(f"LimitCost: bound of {name}", bound))
-            for sign, bounds in ((1.0, low), (-1.0, high))
-            for name, bound in (bounds or {}).items()
-        ]
+        bounds = [(1.0, *item) for item in (low or {}).items()] + [(-1.0, *item) for item in (high or {}).items()]
+        self.bounds = [(name, sign, check_number(f"LimitCost: bound of {name}", bound)) for sign, name, bound in bounds]
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return self

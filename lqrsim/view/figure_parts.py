@@ -14,9 +14,9 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.patches import Circle
 from scipy.spatial import ConvexHull
 
-from lqrsim.codegen import distances
 from lqrsim.errors import Array
 from lqrsim.problem.belief import Belief
+from lqrsim.problem.collision_shape import signed_distance
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.mjcf_kinematics import driven_trees, posed
@@ -169,7 +169,7 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
             lines.append(obstacle.position[axis] + half * RINGS)
         grid.append(np.unique(np.concatenate(lines)))
     x, y = grid
-    distance = distances.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
+    distance = signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
     levels = [-np.inf, 0, radius] if radius > 0 else [-np.inf, 0]
     axes.contourf(x, y, distance, levels=levels, colors=[SOLID, MARGIN][: len(levels) - 1])
     axes.contour(x, y, distance, levels=[0], colors=[EDGE], linewidths=0.8)
