@@ -346,12 +346,11 @@ def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) 
         expected = name if isinstance(name, int) else size if name == "_" else sizes.setdefault(name, size)
         fits = fits and size == expected and size >= 0
     if not fits:
-        named = letters.split()
         # The length that a letter stands for, such as 151 for T+1; the letter itself if its size is unknown.
-        known = [
-            str(before[name] + more) if isinstance(name, str) and name in before else letter
-            for letter, (name, more) in zip(named, _lengths(letters), strict=True)
-        ]
+        named, known = letters.split(), letters.split()
+        for i, (name, more) in enumerate(_lengths(letters)):
+            if name in before:
+                known[i] = str(before[name] + more)
         meaning = "" if known == named else f" = ({', '.join(known)})"
         raise InputError(f"{field}: got shape {shape}, want ({', '.join(named)}){meaning}")
 

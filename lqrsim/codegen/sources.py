@@ -106,10 +106,7 @@ def text_source(text: str, what: str = "source") -> Source:
 
 
 def check_source(field: str, source: object, functions: Mapping[str, int]) -> Source:
-    """The Source of a text, which must define these functions of that many arguments; a Source is returned as it is.
-
-    Functions of math are named without a module in it: cos, not math.cos or np.cos.
-    """
+    """The Source of a text, which must define these functions of that many arguments; a Source is returned as it is."""
     if isinstance(source, Source):
         return source
     what = f"{field}: source"

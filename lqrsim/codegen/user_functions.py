@@ -121,15 +121,14 @@ class UserFunction:
     or two arrays of those shapes, which are zero on entry.
 
     Attributes:
-      states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
-      unused: (index, name) of the entries of (x, u) on which the value does not depend, according to the user.
-      held: the object to keep alive and the address, once there is one.
-      stopped: setting it ends the solves that call the function, in any thread.
       entries: names of the returned values in messages; empty for a single number.
+      unused: (index, name) of the entries of (x, u) on which the value does not depend, according to the user.
       columns: size of the rows in which the values are returned; 0 for a flat list.
       with_control: False for a `function(x, p)`.
-      is_memory: whether the address is the address of numbers instead of a function.
+      is_memory: whether the address is that of numbers instead of a function.
+      held: the object to keep alive and the address, once there is one.
+      stopped: setting it ends the solves that call the function, in any thread.
     """
 
     function: Callable[..., Any]

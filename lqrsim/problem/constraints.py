@@ -39,13 +39,13 @@ class ConstraintTerm(Term):
       describe: the name of a row for messages.
       names: a name of each row for `Problem.violations`, without numbers that may change; rows of one name count as
         one. By default rows have their indices.
-      uses_control: whether the entries depend on u; if so, they do not act at the last step, which has no control.
-      shared: number of values that all rows share, such as the centres of balls; they are computed once per step. If it
-        is not 0, the source must define `places` and `places_jacobian`, as in `SphereCenters`. Then `value` and `slope`
-        get these values (shared,) and their derivatives (shared, n) in place of x and u.
+      uses_control: whether the entries depend on u; if so, they do not act at the last knot.
+      shared: number of values that all rows share, such as the centres of balls, computed once per step. Above 0, the
+        source must define `places` and `places_jacobian`, as in `SphereCenters`, and `value` and `slope` get these
+        values (shared,) and their derivatives (shared, n) in place of x and u.
       convex: whether the states that satisfy an inequality form a convex set: there is then no way round.
-      ranges: (rows,) the distance between the two bounds of a value that has both, infinite for others; it is the most
-        that counts as a typical change of the value.
+      ranges: (rows,) the distance between the two bounds of a value that has both, infinite for others: the most that
+        counts as a typical change.
       linear: whether the values are linear in state and control, so that no solver looks for their curvature.
       yields: whether the robot keeps an inequality by itself, as one that clips forces. A re-plan may then violate it,
         at a price: after a push, no plan may satisfy it.
@@ -119,10 +119,7 @@ class Constraint(ProblemPart[ConstraintTerm]):
         return {}
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "Constraint | None":
-        """The constraint as it is to be along a plan, if the plan misses it within its periods.
-
-        `smooth` solves again with what this returns, a few times, until it is None.
-        """
+        """What `smooth` solves again with, a few times, if a plan misses it within its periods; else None."""
         return None
 
 

@@ -108,10 +108,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         return None
 
     def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
-        """How far parts of the robot are from where it wants them, at states (K, n): name -> (K,), in m or rad.
-
-        Only of what no goal of states can say, as of a gripper's site.
-        """
+        """How far parts, such as a gripper's site, are off their places, at states (K, n): name -> (K,) in m or rad."""
         return {}
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
@@ -174,10 +171,7 @@ class Cost(ProblemPart[CostTerm]):
 
     @property
     def state_reference(self) -> "QuadraticCost | None":
-        """What it is near the states that it draws to; None for a cost that draws to none.
-
-        A problem's start and goal are those of its initial and its final cost.
-        """
+        """What it is near the states that it draws to, as a problem's start and goal; None if it draws to none."""
         return None
 
     @property
@@ -187,10 +181,7 @@ class Cost(ProblemPart[CostTerm]):
 
     @property
     def contact_curvature(self) -> float:
-        """Its second derivative in the distance to an obstacle, in 1/m^2, at contact; 0 if it does not act.
-
-        The search for ways round obstacles weighs paths by it.
-        """
+        """Its second derivative in the distance to an obstacle at contact, in 1/m^2, by which paths are weighed; or 0."""
         return 0.0
 
     def times(self, factor: float) -> "Cost":

@@ -63,8 +63,8 @@ class Dynamics:
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
     Args:
-      f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed. The parameters are attributes
-        of p. If x and u are symbols, states and controls are also attributes: `x.speed` is `x[1]`.
+      f: `f(x, u, p)`; returns one entry per state, without changing x (n,) and u (m,). The parameters are attributes of
+        p. If x and u are symbols, states and controls are also attributes: `x.speed` is `x[1]`.
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
@@ -72,18 +72,15 @@ class Dynamics:
         -> the value that the plan assumes, usually 0 or 1. To f they are parameters; for planning they are constants,
         which cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows
         the names wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in world axes.
-      position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
-        x, y and z, in this order.
-      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default the plane that the names of
-        the states give, if they are two of x, y and z.
+      position: names of the 2 or 3 states that are the robot's position in the world, in metres; of 3 as x, y, z.
+      plane: plane of a position of 2 states, such as "xz"; by default that of two states named x, y or z.
       offset: coordinate of the plane along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
         (lowest, highest), as `{"force": (-2, 2)}`. It is the range of the actuators in execution.
-      jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes the nonzero entries of df/dx
-        and df/du to fx (n, n) and fu (n, m), which are zero on entry. A numba function if f is one, else a Python
-        function.
+      jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level, a numba function if f is one: writes
+        the nonzero entries of df/dx and df/du to fx (n, n) and fu (n, m), which are zero on entry.
       level: one of the four; by default compiled if f is a numba function, else symbolic.
       period: for a map, f is the next state, after this many seconds, and every `dt` is this period. `rate` and
         `rate_jacobian` are then f's value and derivatives. A map has no inverse and no state in between: solvers in

@@ -133,9 +133,8 @@ class SymbolicConstraint(OfFormula, Constraint):
 
         ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
 
-    A constraint that depends on the control acts at all steps that have a control, so not at the last knot. A
-    constraint on the state alone acts at the last knot, too. It does not act at a start that is given exactly, because
-    that cannot change.
+    A constraint that depends on the control does not act at the last knot, which has none. A constraint on the state
+    alone does not act at a start that is given exactly, because that cannot change.
 
     An inequality may act at some knots alone, with parameters of their own: a waypoint, or a gate.
 
@@ -152,8 +151,7 @@ class SymbolicConstraint(OfFormula, Constraint):
       equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
       at: "all" steps; or only the "final" step, at which the expressions must not depend on u; or the indices (K,) of
         knots, in order. Those move with time when a `Replanner` plans again, as rows of a `StateBounds`.
-      name: the name in messages and in `Problem.violations`; by default that of the function, or its expression if it
-        is a lambda.
+      name: the name in messages and in `Problem.violations`; by default that of the function, or a lambda's expression.
     """
 
     @checked
