@@ -181,7 +181,7 @@ class Cost(ProblemPart[CostTerm]):
 
     @property
     def contact_curvature(self) -> float:
-        """Its second derivative in the distance to an obstacle at contact, in 1/m^2, by which paths are weighed; or 0."""
+        """Its second derivative in the distance to an obstacle at contact, in 1/m^2, which weighs paths; or 0."""
         return 0.0
 
     def times(self, factor: float) -> "Cost":

@@ -79,11 +79,11 @@ class Noise:
     the square root of dt: with half the dt, divide M by sqrt(2).
 
     Args:
-      function: `function(x, u, p)` as in `Dynamics`; returns n rows of k entries. Derivatives of formulas follow; at the
+      function: `function(x, u, p)` as in `Dynamics`; returns n rows of k entries. Derivatives of formulas follow; at
         other levels they are central differences. A constant M may be given as a matrix (n, k).
       size: k; not allowed with a matrix.
       parameters: name -> value, as in `Dynamics`.
-      depends_on: names of the states and controls that M depends on, at the other levels; all by default. The fewer, the
+      depends_on: names of the states and controls that M depends on, at other levels; all by default. The fewer, the
         faster.
       level: as in `Dynamics`.
     """
