@@ -485,7 +485,8 @@ def address_of(function: UserFunction) -> float:
 
 def view(address: int, size: int) -> Array:
     """The numbers at an address."""
-    return np.frombuffer((ctypes.c_double * size).from_address(address), dtype=np.float64)
+    memory: Any = (ctypes.c_double * size).from_address(address)
+    return np.frombuffer(memory, dtype=np.float64)
 
 
 def first_numbers(x: Array) -> str:
