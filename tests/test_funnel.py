@@ -212,10 +212,10 @@ def test_a_level_is_tested_by_trials_of_its_own(trials: int, data: st.DataObject
         ({"rate": 0.99999, "confidence": 0.999, "failures": 100}, "needs more than"),
         ({"seed": -1}, "seed"),
         ({"disturbances": [3]}, "disturbances"),
-        ({"disturbances": [InitialStateError(5.0)]}, "got InitialStateError, which changes the start of a run"),
+        ({"disturbances": [InitialStateError(5.0)]}, "got InitialStateError, which changes the start"),
         (
             {"disturbances": [ForceNoise(0.1), InitialStateError(1e-9)], "knots": (5,)},
-            "got InitialStateError, which changes the start of a run",
+            "got InitialStateError, which changes the start",
         ),
         ({"controller": 3}, "controller"),
         ({"progress": 3}, "progress"),
@@ -234,7 +234,7 @@ def test_refused(ice: ls.Plant, wrong: dict[str, Any], said: str) -> None:
 def test_a_funnel_is_not_checked_under_disturbances_that_change_the_start(ice: ls.Plant, strength: float) -> None:
     found = funnel_by_hand(PLAN, np.eye(4), knots=(0,), levels=(0.1,))
     given = [ForceNoise(0.1), InitialStateError(strength)]
-    with pytest.raises(InputError, match="got InitialStateError, which changes the start of a run"):
+    with pytest.raises(InputError, match="got InitialStateError, which changes the start"):
         ls.stress.check_funnel(found, ice, PLAN, disturbances=given)
 
 
