@@ -120,6 +120,25 @@ def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: py
     np.testing.assert_array_equal(solution.policy.gain, again.policy.gain)  # the same program: the same bits
 
 
+@pytest.mark.parametrize("option", [["--solver", "ilqr"], ["--finish", "none"]])
+def test_a_failed_solve_has_no_figure(option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its cost falls without end, so that it has no cost-to-go; it is saved, and is no bad input."""
+    file, figure = tmp_path / "own.py", tmp_path / "policy.png"
+    file.write_text("""from dataclasses import replace
+import lqrsim as ls
+
+def bent():
+    scenario = ls.scenarios.differential_drive()
+    cost = ls.SymbolicCost(lambda x, u, p: -(u.left**2) - u.right**2)
+    return replace(scenario, problem=replace(scenario.problem, stage_cost=cost, control_limits=None))
+""")
+    out = tmp_path / "out"
+    assert main(["solve", f"{file}:bent", "--out", str(out), "--figure", str(figure), *option]) == 1
+    assert "no figure: the solve has no cost-to-go" in capsys.readouterr().out
+    assert not ls.load(out / "solution.npz", ls.Solution).success
+    assert not figure.exists()
+
+
 @pytest.mark.parametrize("rows", [1, 3])
 def test_a_solve_that_is_stopped_keeps_its_best_plan(
     rows: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -133,7 +133,9 @@ class Solve:
         solution = replace(solved, scenario=reference)
         console.save(solution, folder / "solution.npz")
         console.result(solution=as_json.of_solution(solution))
-        if self.figure is not None:
+        if self.figure is not None and solution.cost_to_go is None:
+            console.say("no figure: the solve has no cost-to-go, which it shows")
+        elif self.figure is not None:
             from lqrsim.problem.belief import Belief
             from lqrsim.simulation.uncertainty_of import tube_under
 
