@@ -24,6 +24,8 @@ from lqrsim.solvers.budget import ATTENTION, Laps
 from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import Sizes, Stages
 
+# Iterations in which the cost has changed by less than rounding, relative to itself, so that no slope is left.
+RESTS, ROUNDING = 50, 1e-10
 NAME = "interior point"  # name of its iterations in the log
 STEPS = 12  # largest number of steps of an active set: a solve that needs more does not converge
 
@@ -150,7 +152,15 @@ class InteriorPoint:
                 bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
         if outcome == RUNNING:
             self._call(CLOSE, self._iterations)
-        return self._result(bool(self._memory["solved"][0]))
+        return self._result(bool(self._memory["solved"][0]) or self._rests())
+
+    def _rests(self) -> bool:
+        """Whether only rounding of the slope is left, which unstable dynamics enlarge."""
+        tolerance, violation = self._tolerances
+        last, now = self._log[max(self._iterations - RESTS, 0) : self._iterations], Measures.of(self._memory)
+        if len(last) < RESTS or self._stages.about.learns or now.violation > violation:
+            return False
+        return np.ptp(last["cost"]) <= ROUNDING * abs(now.cost) and max(now.gap, now.complementarity) < tolerance
 
     def _call(self, task: int, last: int) -> tuple[int, int]:
         return self._stages.call(
