@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
@@ -59,7 +59,7 @@ def separated(own: Array, other: Array) -> float:
     """The signed distance of two hulls: that of the origin to Qhull's hull M of all differences of their corners.
 
     Outside it is the least |sum w m| for weights w of the corners m. With least squares of (sum w m, sum w - 1) the
-    weights are the same up to their sum, which SciPy's nonnegative least squares find.
+    weights are the same up to their sum. SciPy's `nnls` is wrong for some boxes on a grid: scipy/scipy#25389.
     """
     apart = (own[:, None] - other[None]).reshape(-1, own.shape[1])
     try:
@@ -69,7 +69,8 @@ def separated(own: Array, other: Array) -> float:
     if depth < 0:
         return depth
     size = np.abs(apart).max()
-    weights, _ = nnls(np.vstack([apart.T / size, np.ones(len(apart))]), np.eye(own.shape[1] + 1)[-1], maxiter=10_000)
+    rows, right = np.vstack([apart.T / size, np.ones(len(apart))]), np.eye(own.shape[1] + 1)[-1]
+    weights = lsq_linear(rows, right, (0, np.inf), method="bvls", tol=1e-15, max_iter=10_000).x
     return float(np.linalg.norm(weights @ apart) / weights.sum())
 
 
@@ -122,7 +123,7 @@ def drawn(seed: int) -> tuple[Array, Array]:
 @settings(max_examples=examples(100))
 @given(st.integers(0, 2**32 - 1))
 def test_distances_in_space_are_those_of_the_difference_of_both(seed: int) -> None:
-    """To rounding; slopes as in the plane."""
+    """To rounding; slopes as in the plane, of hulls that do not touch: an edge that does has a range of them."""
     own, other = drawn(seed)
     world = ls.World([ls.Obstacle.of_corners("rock", other)])
     found, pulls = hull_distances(world, own[None], [len(own)])
@@ -131,8 +132,29 @@ def test_distances_in_space_are_those_of_the_difference_of_both(seed: int) -> No
     step = np.random.default_rng(seed).normal(size=own.shape)
     ahead, behind = distance(own + 1e-6 * step, world), distance(own - 1e-6 * step, world)
     once, again = (ahead - found[0, 0, 0]) / 1e-6, (found[0, 0, 0] - behind) / 1e-6
-    if abs(once - again) < 1e-4:  # no kink between the two
+    if abs(once - again) < 1e-4 and abs(found[0, 0, 0]) > 1e-5:  # no kink between the two
         assert (once + again) / 2 == pytest.approx((pulls[0, 0, 0] * step).sum(), abs=1e-3)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("axes", [2, 3])
+def test_the_way_out_is_that_of_a_face(axes: int, turned: bool) -> None:
+    """Of boxes on a grid that overlap or touch, where several faces are equally deep.
+
+    Along it, the first of the robot's corners is as far from the last of the obstacle's as the signed distance says.
+    """
+    rng = np.random.default_rng(axes)
+    for _ in range(600):
+        sides = rng.integers(1, 5, (2, axes)) / 4
+        turn = np.linalg.qr(rng.normal(size=(axes, axes)))[0] if turned else np.eye(axes)
+        own, other = (np.array(ls.types.Box(*one).corners([0] * axes, [0] * 3 if axes == 3 else 0.0)) for one in sides)
+        limit = (4 * sides.sum(axis=0)).astype(int)
+        own, other = (own + rng.integers(-limit, limit + 1) / 8) @ turn, other @ turn
+        world = ls.World([ls.Obstacle.of_corners("rock", other)])
+        found, pulls = hull_distances(world.upright() if axes == 2 else world, own[None], [len(own)])
+        out = pulls[0, 0, 0].sum(axis=0)[:axes]
+        assert np.linalg.norm(out) == pytest.approx(1.0, abs=1e-9)
+        assert (own @ out).min() - (other @ out).max() == pytest.approx(found[0, 0, 0], abs=1e-9)
 
 
 @settings(max_examples=examples(30))

@@ -273,8 +273,8 @@ def choose(points, face, within, prism, faces, normals, depths, total, simplex, 
     """Of the faces in the nearest one's plane write that below which the origin is; return the depth."""
     trial, number, best = stack(4), 2 if prism else 3, -inf
     for k in range(total):
-        alike = depths[k] <= depths[face] + within and weigh(points, number, faces[k], trial)
-        if alike and least_of(trial, number) > best:
+        alike = dot(normals[k], normals[face]) > 1 - TOUCHING and depths[k] <= depths[face] + within
+        if alike and weigh(points, number, faces[k], trial) and least_of(trial, number) > best:
             best = least_of(trial, number)
             for i in range(3):
                 weights[i] = trial[i] if i < number else 0.0
