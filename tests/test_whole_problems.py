@@ -106,7 +106,7 @@ def test_states_of_micrometres_have_sizes_of_their_own(number: int) -> None:
     assert dense.contradictions(case, solution) == []
 
 
-@pytest.mark.parametrize("number", [6, 16, 17, 22, 25, 26, 60, 117])
+@pytest.mark.parametrize("number", [6, 17, 18, 26, 33, 37, 38, 42, 46])
 def test_saddles_are_seen_in_all_units(number: int) -> None:
     """A length at rest had a size of 1 beside others of 1e5: the curvature along it counted as zero."""
     case = families.draw("units", number)

@@ -45,7 +45,7 @@ PROBE_DISTANCE = (
 # The size of a state that hardly moves is 1, or that of another in its unit if all move little or that moves far.
 SMALLEST = 1e-3  # a state that moves less hardly moves; where none moves more, relative to what moves most
 REST = 1e-12  # where none moves more, all motions are rounding errors
-FAR = 1e3  # a state that moves more moves far
+FAR = 100.0  # a state that moves more moves far
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
 # The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of

@@ -42,7 +42,10 @@ def contradictions(case: Case, solution: ls.Solution) -> list[str]:
         found += _worse_than_given(case, solution)
     if solution.status is Status.CONVERGED and case.model is None:
         found += _of_an_optimum(case, solution)
-    elif not solution.success and not case.problem.constraints and _can_be_lowered(case, solution):
+    elif (
+        not solution.success and solution.status is not Status.MAX_ITERATIONS
+        and not case.problem.constraints and _can_be_lowered(case, solution)
+    ):  # fmt: skip
         found.append(f"{solution.status.name}, but a step lowers the cost")
     return found
 

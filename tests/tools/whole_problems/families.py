@@ -8,7 +8,7 @@ overflow    With the nominal control the state overflows or leaves its domain wi
 scales      Costs and states from 1e-8 to 1e8 of the usual size.
 time        Least time, without an effort.
 contact     A slide of an MJCF that is to push another, with controls that do so, or without.
-units       As symmetric, with lengths in units from 1e-7 to 1e7 of the usual.
+units       As symmetric, with lengths in units from 1e-6 to 1e6 of the usual.
 
 Each kind has few structures, so that little is compiled; all else is numbers.
 """
@@ -315,7 +315,7 @@ def symmetric(rng: Generator, *, unit: float = 1.0) -> Case:
 
 
 def units(rng: Generator) -> Case:
-    return symmetric(rng, unit=float(10 ** rng.uniform(-7, 7)))
+    return symmetric(rng, unit=float(10 ** rng.uniform(-6, 6)))
 
 
 def flat(rng: Generator) -> Case:
