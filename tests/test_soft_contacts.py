@@ -104,11 +104,12 @@ def test_a_softer_step_is_continuous_where_a_contact_or_a_limit_is_just_reached(
 @settings(max_examples=examples(8))
 @given(mass=MASSES, speed=SPEEDS)
 @example(mass=1.0, speed=3.0)
+@example(mass=2.75, speed=2.8803348969127454)  # comes to half of the softness
 def test_derivatives_of_a_softer_step_are_its_differences(kind: str, mass: float, speed: float) -> None:
     robot, control = robot_of(kind, mass), np.array([0.2])
     state = np.array(TOUCHING[kind](0.01, speed))
     dynamics = softer(robot, state)["0.1"]
-    xml, n, far = text_of(kind, mass, "0 0.95 0.1"), len(state), 1e-5
+    xml, n, far = text_of(kind, mass, "0 0.95 0.1"), len(state), 2e-6
     for steps in (1, 4):
         a, b, _ = dynamics.linearize(state, control, 0.005 * steps)
         ends = [
@@ -117,7 +118,8 @@ def test_derivatives_of_a_softer_step_are_its_differences(kind: str, mass: float
         ]
         want = (np.array(ends[0]) - ends[1]).T / (2 * far)
         # Derivatives of a step are good to 1e-5 of the largest entry, which is up to 60; errors of neighbouring steps
-        # nearly cancel. The differences here are good to 2e-7 of it.
+        # nearly cancel. The differences here are good to 5e-6 of it where a depth is half of the softness, at which the
+        # second derivative of MuJoCo's impedance jumps, and elsewhere to 1e-8.
         np.testing.assert_allclose(np.hstack([a, b]), want, rtol=0, atol=1e-5 * np.abs(want).max())
 
 
