@@ -859,7 +859,7 @@ def test_a_closed_loop_closes_is_held_and_is_moved_by_a_plan(seed: int, tie: str
     ]
     np.testing.assert_allclose(robot.hold(state), work, rtol=0, atol=1e-6)
     assert "falls short" not in str(robot)
-    plan = ls.ilqr(robot.problem(state, goal, steps=30))
+    plan = ls.smooth(robot.problem(state, goal, steps=30))
     assert plan.success
     np.testing.assert_allclose(plan.trajectory.states[-1, :4], goal[:4], rtol=0, atol=0.02)
     data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state[:4], 0.0, 0.0
