@@ -321,6 +321,26 @@ def test_the_linear_model_is_the_run(structure: int, seed: int, unstable: bool) 
     np.testing.assert_allclose([*seen, z[:n]], expected, rtol=0, atol=1e-9 * (1 + np.abs(expected).max()))
 
 
+@hypothesis.given(st.integers(0, 10**6), st.booleans(), st.tuples(st.floats(-5, 5), st.floats(-5, 5)))
+@hypothesis.settings(max_examples=examples(25))
+def test_they_are_the_same_in_any_units_of_the_controls(seed: int, unstable: bool, exponents: Sequence[float]) -> None:
+    """A thrust in N beside a rudder in rad cancelled no wind: all entries of `undo` were compared with its largest."""
+    usual, uncertainty = drawn(3, seed, unstable=unstable)
+    units, controls = 10.0 ** np.array(exponents), usual.plan.controls
+    other = linear(
+        usual.rates, usual.inputs * units, usual.pushes, start=usual.plan.states[0], controls=controls / units
+    )  # fmt: skip
+    weights, laws = weights_of(np.random.default_rng(seed + 1), 3, 2, usual.plan.steps), []
+    for system, unit in ((usual, np.ones(2)), (other, units)):
+        model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+        gain, offset = tracking_laws(model, dataclasses.replace(weights, control=weights.control * unit**2))
+        entries = np.ones(model.size)
+        entries[3:5] = unit  # what the actuators have reached
+        laws.append((gain * unit[:, None] / entries, offset * unit))
+    for one, another in zip(*laws, strict=True):
+        np.testing.assert_allclose(one, another, rtol=0, atol=1e-5 * np.abs(one).max())
+
+
 def test_without_unknowns_they_are_those_of_a_plain_riccati_recursion() -> None:
     system, _ = drawn(2, 5, unstable=True)
     A, B, plan = system.A, system.B, system.plan

@@ -133,8 +133,9 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     B = model.jacobian[:, :, n:]
     weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
     curve = weighed @ B
-    least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
-    cancelling = np.linalg.inv(curve + least[..., None, None] * np.eye(m)) @ (weighed @ model.E)
+    efforts = np.sqrt(weights.control.min() / weights.control)  # the units in which all controls are alike
+    least = 1e-9 * np.vecdot(np.diagonal(curve, axis1=-2, axis2=-1), efforts**2) + 1e-300
+    cancelling = np.linalg.inv(curve + least[..., None, None] * np.diag(efforts**-2)) @ (weighed @ model.E)
     compensation[..., movable:-1] = weights.control[:, None] * cancelling.swapaxes(0, 1)
     cost, products = np.zeros((len(state), movable, width)), np.empty((len(state), movable + m, width + m))
     cost[:, range(n), range(n)] = end
