@@ -341,6 +341,28 @@ def test_they_are_the_same_in_any_units_of_the_controls(seed: int, unstable: boo
         np.testing.assert_allclose(one, another, rtol=0, atol=1e-5 * np.abs(one).max())
 
 
+@hypothesis.given(st.floats(-8, 3), st.floats(-1, 1))
+@hypothesis.settings(max_examples=examples(25))
+def test_effects_of_a_parameter_are_its_derivatives_whatever_its_size(exponent: float, control: float) -> None:
+    """As those of a moment of inertia of 1e-5 kg m^2, which differences of 1e-5 had made negative."""
+    inertia = 10.0**exponent
+
+    def turn(x: Any, u: Any, p: Any) -> list[Any]:
+        return [x[1], u[0] / p.inertia]
+
+    dynamics = ls.Dynamics(
+        turn, states={"angle": "rad", "rate": "rad/s"}, controls={"torque": "N m"}, parameters={"inertia": inertia}
+    )
+    states = [np.array([0.3, -0.2])]
+    controls = inertia * (1.5 + control) * np.ones((4, 1))
+    for torque in controls:
+        states.append(dynamics.step(states[-1], torque, DT))
+    plan = ls.Trajectory(np.array(states), controls, DT)
+    model = PlanModel.of(dynamics, plan, Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
+    wanted = -(1.5 + control) / inertia * np.array([DT**2 / 2, DT])
+    np.testing.assert_allclose(model.effects[:, :, 0], np.tile(wanted, (4, 1)), rtol=1e-4)
+
+
 def test_without_unknowns_they_are_those_of_a_plain_riccati_recursion() -> None:
     system, _ = drawn(2, 5, unstable=True)
     A, B, plan = system.A, system.B, system.plan

@@ -106,7 +106,9 @@ INEXACT = 0.02
 # The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
 # is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
 HELD = 0.3
-STEP = 1e-5  # step of a parameter for differences, relative to its value if that is larger than 1
+# Step of a parameter for differences, relative to its value if that is larger than 1; and the largest relative to a
+# small value, such as a moment of inertia of 1e-5 kg m^2, unless the step is then one of rounding.
+STEP, OF_SMALL, LEAST_STEP = 1e-5, 1e-3, 1e-10
 
 
 @dataclass(frozen=True)
@@ -296,8 +298,9 @@ class PlanModel:
         B = self.jacobian[:, :, self.n :]
         slopes = np.empty((plan.steps, self.n, count))
         if count:
-            values = np.array([self.dynamics.parameters[name] for name in self.parameters])
-            changes = STEP * np.maximum(np.abs(values), 1.0)
+            sizes = np.abs([self.dynamics.parameters[name] for name in self.parameters])
+            most = np.where(sizes > 0, np.maximum(OF_SMALL * sizes, LEAST_STEP), np.inf)
+            changes = np.minimum(STEP * np.maximum(sizes, 1.0), most)
             states, controls = in_c_order(plan.states), in_c_order(plan.controls)
             with self.dynamics.quiet():
                 self.compiled.parameter_slopes(
