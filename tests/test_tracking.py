@@ -10,7 +10,7 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from linear_plans import DT, Linear, linear
+from linear_plans import DT, Linear, by_hand, linear
 from sampling import examples
 from scipy.linalg import expm
 from sympy import cos, exp, sin
@@ -361,6 +361,45 @@ def test_effects_of_a_parameter_are_its_derivatives_whatever_its_size(exponent: 
     model = PlanModel.of(dynamics, plan, Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
     wanted = -(1.5 + control) / inertia * np.array([DT**2 / 2, DT])
     np.testing.assert_allclose(model.effects[:, :, 0], np.tile(wanted, (4, 1)), rtol=1e-4)
+
+
+def turning(x: Any, u: Any, p: Any) -> list[Any]:
+    """A unicycle whose heading is in units of p.unit rad."""
+    return [u.v * cos(p.unit * x.heading), u.v * sin(p.unit * x.heading), u.turn / p.unit]
+
+
+@hypothesis.given(st.integers(0, 10**6), st.floats(-4, 4))
+@hypothesis.settings(max_examples=examples(12))
+def test_what_is_chosen_depends_on_no_unit_of_what_is_no_position(seed: int, exponent: float) -> None:
+    """A heading in degrees had made the laws looser: a thousandth of the largest number counted as narrow enough."""
+    rng, unit = np.random.default_rng(seed), 10.0**exponent
+    start = rng.uniform(-1, 1, 3)
+    controls = np.stack([rng.uniform(0.3, 1.0, 30), rng.normal(size=30)], axis=1)
+    policies = []
+    for size in (1.0, unit):
+        dynamics = ls.Dynamics(
+            turning, states={"x": "m", "y": "m", "heading": "deg"}, controls={"v": "m/s", "turn": "rad/s"},
+            parameters={"unit": size}, control_limits=((-9, -9), (9, 9)), position=("x", "y"), plane="xy",
+        )  # fmt: skip
+        states: list[Array] = [start / (1.0, 1.0, size)]
+        for control in controls:
+            states.append(dynamics.step(states[-1], control, DT))
+        plan, n = ls.Trajectory(np.array(states), controls, DT), len(start)
+        policy = ls.AffinePolicy(
+            gain=np.zeros((30, 2, n)), offset=controls, nominal=plan.states[:-1], dt=DT,
+            state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
+        )  # fmt: skip
+        problem = ls.Problem(
+            dynamics=dynamics, dt=DT, steps=30, initial=ls.FixedState(states[0]),
+            stage_cost=ls.ControlCost(np.ones(2), about=np.zeros(2)),
+            final_cost=ls.QuadraticCost(np.ones(n), about=np.zeros(n)),
+        )  # fmt: skip
+        uncertainty = Uncertainty(
+            start=(0.1, 0.1, 0.05 / size), control=(0.1, 0.1), measurement=(0.02, 0.02, 0.01 / size)
+        )  # fmt: skip
+        solution = dataclasses.replace(by_hand(plan, policy), goal_radius=0.3)
+        policies.append(ls.track(problem, solution, uncertainty=uncertainty).gain / (1.0, 1.0, size))
+    np.testing.assert_allclose(*policies, rtol=0, atol=1e-6 * np.abs(policies[0]).max())
 
 
 def test_without_unknowns_they_are_those_of_a_plain_riccati_recursion() -> None:

@@ -277,7 +277,7 @@ def robust_to_lag(
         return Predictions(*(np.where(lost, worst, value) for worst, value in zip(UNSTABLE, finite, strict=True)))
 
     outcomes = predicted(design)
-    scores = outcomes.scores(narrowest(stated, outcomes.width[0]))
+    scores = outcomes.scores(narrowest(norm, stated.plan, outcomes.width[0]))
     if scores[1, 0] <= scores[0, 0] + MUCH_WORSE:
         return design
     if at_end is None:
@@ -291,7 +291,7 @@ def robust_to_lag(
         designs.append(Design.of(model, kalman_filter(model), weights))
     outcomes = [predicted(candidate) for candidate in designs]
     widths = np.array([outcome.width[0] for outcome in outcomes])
-    least = narrowest(stated, widths)
+    least = narrowest(norm, stated.plan, widths)
     scores = np.array([outcome.scores(least) for outcome in outcomes])
     scores = np.where(widths > WIDEST * least, np.inf, scores[:, 0] + WITHOUT_LAG * scores[:, 1])
     i, j = np.unravel_index(int(np.argmin(scores)), scores.shape)

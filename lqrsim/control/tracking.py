@@ -38,6 +38,7 @@ from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.compiled import law_about, rollout
 
 _log = logging.getLogger("lqrsim")
@@ -105,7 +106,7 @@ def choose_tolerances(
     laws = tracking_laws(model, tried)
     loop_moments = moments(laws)
     predicted = Predictions.of(solution, surroundings, norm, loop_moments)
-    least = narrowest(model, predicted.width)
+    least = narrowest(norm, model.plan, predicted.width)
     scores = predicted.scores(least)
 
     def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
@@ -191,9 +192,9 @@ def _squares(norm: DeviationNorm, covariance: Array) -> Array:
     return (np.diagonal(covariance, axis1=-2, axis2=-1)[..., norm.states] / norm.scale**2).sum(axis=-1)
 
 
-def narrowest(model: PlanModel, widths: Array) -> float:
-    """The width of the narrowest tube; a thousandth of the plan's extent is narrow enough."""
-    extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
+def narrowest(norm: DeviationNorm, plan: Trajectory, widths: Array) -> float:
+    """The width of the narrowest tube; a thousandth of the plan's extent by the norm is narrow enough."""
+    extent = float((np.ptp(plan.states[:, norm.states], axis=0) / norm.scale).max()) or 1.0
     return max(float(widths.min()), 1e-3 * extent)
 
 
