@@ -204,6 +204,26 @@ def test_the_discrete_solution_of_a_linear_system_comes_closer_at_first_order() 
         np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 1, atol=0.15)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_each_state_may_have_a_unit_of_its_own(seed: int) -> None:
+    """The total cost was called flat by the ratio of its curvatures in metres and in microns."""
+    s, start, end = random_stage(seed), random_end(seed + 10), random_end(seed + 20)
+    unit = 10.0 ** np.random.default_rng(seed).uniform(-6, 6, 3)
+    other = s | {
+        "A": s["A"] * unit / unit[:, None], "B": s["B"] / unit[:, None], "c": s["c"] / unit,
+        "Q": s["Q"] * np.outer(unit, unit), "P": s["P"] * unit, "q": s["q"] * unit,
+    }  # fmt: skip
+
+    def scaled(cost: Quadratic) -> Quadratic:
+        return Quadratic(cost.hessian * np.outer(unit, unit), cost.gradient * unit, cost.constant)
+
+    one = smooth_lq_continuous(Stage(**s), horizon=1.0, initial=start, final=end)
+    another = smooth_lq_continuous(Stage(**other), horizon=1.0, initial=scaled(start), final=scaled(end))
+    assert another.status is Status.CONVERGED
+    times = np.linspace(0, 1, 5)
+    np.testing.assert_allclose(another.x_hat(times) * unit, one.x_hat(times), rtol=0, atol=1e-5)
+
+
 def test_problems_without_a_minimum() -> None:
     """With x' = u and Q = -1 a cost-to-go ends where tan does: from S = 1, pi/4 + pi/2 before the horizon."""
     none = Quadratic(np.zeros((1, 1)), np.zeros(1), np.array(0.0))

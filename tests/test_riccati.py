@@ -91,6 +91,23 @@ def test_both_forms_solve_the_kkt_system_and_agree(n: int, m: int, seed: int, st
     np.testing.assert_allclose(again, once, rtol=0, atol=1e-10 * scale)
 
 
+@pytest.mark.parametrize("form", ["primal", "dual"])
+@settings(max_examples=examples(25))
+@given(seed=st.integers(0, 2**32 - 1), exponents=st.tuples(*[st.floats(-6, 6)] * 3))
+def test_each_state_may_have_a_unit_of_its_own(form: str, seed: int, exponents: tuple[float, ...]) -> None:
+    """Metres beside microns: the start's Hessian and the steps were called singular by the ratio of their entries."""
+    usual, unit = random_problem(seed, 3, 2, 8), 10.0 ** np.array(exponents)
+    both = np.concatenate([unit, np.ones(2)])
+    other = LinearQuadratic(
+        usual.A * unit / unit[:, None], usual.B / unit[:, None], usual.c / unit, usual.H * np.outer(both, both),
+        usual.h * both, usual.k, usual.Q0 * np.outer(unit, unit), usual.q0 * unit, usual.k0,
+        usual.QT * np.outer(unit, unit), usual.qT * unit, usual.kT,
+    )  # fmt: skip
+    one, another = smoothed(usual, form), smoothed(other, form)
+    assert_close(another.trajectory.states * unit, one.trajectory.states)
+    assert_close(another.trajectory.controls, one.trajectory.controls)
+
+
 @pytest.mark.parametrize(("n", "m"), SIZES)
 @settings(max_examples=examples(20))
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 12), rank=st.integers(0, 4))

@@ -35,7 +35,7 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import InitialPrior
-from lqrsim.solvers.linear_quadratic import WEIGH_MORE
+from lqrsim.solvers.linear_quadratic import WEIGH_MORE, definite
 
 NO_MINIMUM, FLAT = "S + Sbar is not positive definite", "R is not positive definite"
 # Largest number of evaluations of one right-hand side, a few seconds. A trajectory that needs more diverges or is far
@@ -482,8 +482,7 @@ def _check_minimum(backward: Pass, forward: Pass) -> None:
     """Check that the total cost has one minimum at every step of the passes. Raises IntegrationFailure."""
     times = np.union1d(backward.times, forward.times)
     total = backward.at(times)[0] + forward.at(times)[0]
-    spectrum = np.linalg.eigvalsh(total[:, :-1, :-1])
-    flat = spectrum[:, 0] <= spectrum.shape[1] * np.finfo(float).eps * spectrum[:, -1]
+    flat = ~definite(total[:, :-1, :-1], (total.shape[1] - 1) * np.finfo(float).eps)
     if flat.any():
         raise IntegrationFailure(Status.NOT_POSITIVE_DEFINITE, NO_MINIMUM, float(times[flat][0]))
 

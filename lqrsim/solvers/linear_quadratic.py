@@ -5,6 +5,7 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import matrix_balance
 
 from lqrsim.annotations import OneOf, Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_memory
@@ -139,7 +140,7 @@ def _start(passes: RiccatiArrays, failure: str, initial: Quadratic | FixedState)
         return passes.x_hats[0], failure
     # If every step of the cost-to-go is definite, this alone ensures a unique minimum.
     curve = initial.hessian + passes.to_go.hessian[0]
-    if not np.linalg.eigvalsh(curve)[0] > 0:
+    if not definite(curve, 0.0):
         return passes.x_hats[0], "minimum of the total cost, step 0"
     return -np.linalg.solve(curve, initial.gradient + passes.to_go.gradient[0]), ""
 
@@ -192,10 +193,10 @@ def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) ->
     hessian, gradient, constant = check_end("initial", initial, n)
     if form == "primal":
         return hessian, gradient, constant
-    values = np.linalg.eigvalsh(hessian)
-    if not values[0] > 1e-12 * max(values[-1], 0.0):
+    if not definite(hessian, 1e-12):
+        least = np.linalg.eigvalsh(hessian)[0]
         raise InputError(
-            f'initial: hessian: got smallest eigenvalue {values[0]:g}, want a positive-definite one; or form="primal"'
+            f'initial: hessian: got smallest eigenvalue {least:g}, want a positive-definite one; or form="primal"'
         )
     covariance = np.linalg.inv(hessian)
     covariance = 0.5 * (covariance + covariance.T)
@@ -204,8 +205,16 @@ def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) ->
 
 
 def _invertible(A: Array) -> npt.NDArray[np.bool_]:
-    """Whether each step has inverse dynamics, (T,), without which there is no primal form."""
-    return np.linalg.cond(A) < 1e12
+    """Whether each step has inverse dynamics, (T,), without which there is no primal form; in any units of states."""
+    return np.array([np.linalg.cond(matrix_balance(step, permute=False)[0]) < 1e12 for step in A])
+
+
+def definite(hessians: Array, least: float) -> npt.NDArray[np.bool_]:
+    """Whether Hessians (..., n, n), in any units, have a least eigenvalue beyond `least` times the largest."""
+    sizes = np.sqrt(np.maximum(np.diagonal(hessians, axis1=-2, axis2=-1), 0.0))
+    sizes = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
+    spectrum = np.linalg.eigvalsh(hessians / sizes[..., :, None] / sizes[..., None, :])
+    return spectrum[..., 0] > (least * np.maximum(spectrum[..., -1], 0.0) if least else 0.0)
 
 
 def _inverse(A: Array, B: Array, c: Array) -> tuple[Array, Array]:
