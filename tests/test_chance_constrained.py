@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,31 @@ def test_a_plan_is_not_much_safer_than_asked(
     second = plan.rounds[1]
     assert second[3] < 0.2e-3  # or this would be no such case
     assert plan.solution.cost < second[2]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_of_millimetres_is_not_kept_farther_away_than_one_of_metres(seed: int) -> None:
+    """All clearances were within a millimetre of their margin there, so the first margin was taken for too small."""
+    rng = np.random.default_rng(seed)
+    place, noise, plans = np.append(rng.uniform(-0.4, 0.4, 2), 0.0), rng.uniform(0.02, 0.08, 3), []
+    for unit in (1.0, 1e-3):
+        pillar = ls.Obstacle("pillar", "cylinder", unit * place, np.eye(3), unit * np.array([0.4, 2.0, 0.0]))
+        dynamics = ls.Dynamics(
+            pillars.moves, states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, position=("x", "y"),
+            controls={"ax": "m/s2", "ay": "m/s2"}, control_limits=(-5 * unit, 5 * unit),
+        )  # fmt: skip
+        near = ls.ObstacleCost(ls.World([pillar]), radius=RADIUS * unit, sharpness=10 / unit, weight=0.1)
+        problem = replace(
+            pillars.problem(), dynamics=dynamics, initial=ls.FixedState(unit * np.array(pillars.START)),
+            stage_cost=ls.ControlCost(np.full(2, unit**-2)) + near,
+            final_cost=ls.QuadraticCost(np.full(4, 500 * unit**-2), about=(1.5 * unit, 0.0, 0.0, 0.0)),
+        )  # fmt: skip
+        told = Uncertainty(start=noise[0] * unit, control=3 * noise[1] * unit, measurement=0.5 * noise[2] * unit)
+        law = partial(ls.track, tolerate={name: unit * number for name, number in TOLERATE.items()})
+        plans.append(ls.smooth_chance_constrained(problem, told, chance=1e-3, controller=law))
+    usual, small = (plan.tube.collision_chance for plan in plans)
+    assert all(plan.success for plan in plans)
+    assert usual / 2 < small < 2 * usual
 
 
 def test_what_is_safe_enough_stays_as_it_is(problem: ls.Problem) -> None:

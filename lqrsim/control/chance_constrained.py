@@ -31,7 +31,8 @@ from lqrsim.solvers.smoother import smooth
 
 # A plan whose chance is below the requested one by no more than this factor is not made cheaper.
 ENOUGH = 0.5
-HELD = 1e-3  # m; a clearance that exceeds its margin by at most this is determined by the margin
+# m; a clearance that exceeds its margin by at most this, and by one standard deviation, is determined by the margin.
+HELD = 1e-3
 AIM = 0.8  # target for the next plan, relative to the requested chance
 WIDEN = 2.0  # largest factor on the margin, in standard deviations, from one plan to the next
 PATIENCE = 2  # stop widening margins, or raising weights, after this many plans in a row without a safer one
@@ -297,7 +298,7 @@ class _Search:
         number says nothing, and only the limit holds.
         """
         clearance, std, correlation, _ = self._spread(plan)
-        clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
+        clearance = np.where(clearance <= self.margin + np.minimum(HELD, std), -np.inf, clearance)
         # The moments are assumed to misjudge the next plan's chance by the same factor as this plan's.
         wanted, tube = AIM * self.asked, plan.tube
         if tube.collision_chance > 0:
