@@ -34,7 +34,8 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
     for disturbance in as_disturbances(disturbances):
         disturbance.check(plant)
         field = f"{type(disturbance).__name__}: uncertainty"
-        parts.append(check_kind(field, disturbance.uncertainty(plant), Uncertainty, "an Uncertainty returned"))
+        wanted = "a method that returns an Uncertainty"
+        parts.append(check_kind(field, disturbance.uncertainty(plant), Uncertainty, wanted))
     total = gathered(parts)
     total.check(plant.robot.dynamics)
     return total
