@@ -18,6 +18,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.derivative_check import evaluate
+from lqrsim.scenes.mjcf_kinematics import reach_of
 from lqrsim.scenes.mjcf_obstacles import levers
 from lqrsim.scenes.scene import scene_from_xml
 
@@ -132,6 +133,22 @@ def test_no_joint_moves_a_point_by_more_than_its_lever(seed: int) -> None:
             mujoco.mj_jacGeom(model, data, moves, turns, geom)
             reach = np.linalg.norm(moves, axis=0) + model.geom_rbound[geom] * np.linalg.norm(turns, axis=0)
             assert (reach <= bounds + 1e-9).all(), f"{reach} by {bounds}"
+
+
+@settings(max_examples=examples(20))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_its_radius_contains_all_at_any_angles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(chain(rng))
+    data, radius = mujoco.MjData(model), reach_of(model, 1)
+    slides = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE))
+    for _ in range(100):
+        data.qpos[:] = rng.uniform(-4, 4, model.nq)
+        data.qpos[model.jnt_qposadr[slides]] = model.qpos0[model.jnt_qposadr[slides]]
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_kinematics(model, data)
+        ends = np.linalg.norm(data.geom_xpos - data.xpos[1], axis=1) + model.geom_rbound
+        assert ends.max() <= radius + 1e-9
 
 
 @settings(max_examples=examples(10))

@@ -193,11 +193,18 @@ def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
 def reach_of(model: mujoco.MjModel, body: int) -> float:
     """How far the colliding geoms, else all geoms, of a body and of what it carries reach from its origin, in m."""
     collides = colliding(model) & (model.body_rootid[model.geom_bodyid] == model.body_rootid[body])
+    turning = model.jnt_type != mujoco.mjtJoint.mjJNT_SLIDE.value
     reach = 0.0
     for geom in np.flatnonzero(collides).tolist() if collides.any() else range(model.ngeom):
         if (path := path_to(model, geom, body)) is not None:
-            offsets = [model.geom_pos[geom], *(model.body_pos[link] for link in path)]
-            reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(offset) for offset in offsets)))
+            place, lengths = model.geom_pos[geom], list[float]()
+            for link in path:  # a turn keeps the distance from its anchor
+                anchors = model.jnt_pos[turning & (model.jnt_bodyid == link)]
+                for anchor in anchors[::-1] if len(anchors) else np.zeros((1, 3)):
+                    lengths.append(float(np.linalg.norm(place - anchor)))
+                    place = anchor
+                place = model.body_pos[link] + axes_of(model.body_quat[link]) @ place
+            reach = max(reach, float(model.geom_rbound[geom]) + sum([*lengths, float(np.linalg.norm(place))]))
     return reach
 
 
