@@ -19,6 +19,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mechanisms import arm, motors, sled
 from sampling import examples, rarely
+from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
@@ -1393,6 +1394,7 @@ def test_a_plan_with_dry_friction_is_replayed_by_mujocos_own_steps(loss: float) 
         ('<joint name="wheel" axis="0 1 0"/><geom type="cylinder" zaxis="0 1 0" size="0.1 0.03"/>', True),
         ('<joint name="wheel" axis="0 1 0"/><geom type="sphere" size="0.1"/>', True),
         ('<joint name="wheel" axis="0 1 0"/><geom type="cylinder" size="0.1 0.03"/>', False),
+        ('<joint name="wheel" axis="0 1 0"/><geom size="0.1"/><body pos="0.1 0 0"><geom size="0.01"/></body>', False),
         ('<joint name="wheel" axis="0 1 0"/><geom type="sphere" size="0.1" pos="0.05 0 0"/>', False),
         ('<joint name="wheel" axis="0 1 0" range="-90 90"/><geom type="sphere" size="0.1"/>', False),
     ],
@@ -1419,6 +1421,26 @@ def test_the_turn_of_a_wheel_is_no_goal_unless_it_is_named(wheel: str, rolls: bo
     assert has(goal, [1, 1, 2 * held, 0, 0, 0], weights={"m": 1.0, "rad": 2.0})
     assert has(goal, [1, 1, 2, 0, 0, 0], weights={"m": 1.0, "wheel": 2.0})
     assert has(robot.at(x=1.0, wheel=0.5), [100] * 6)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.01])
+@settings(max_examples=examples(10))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_wheel_may_be_of_parts_that_are_fixed_to_it(off: float, seed: int) -> None:
+    """As of a URDF, whose tyre and cap are links: a tyre about the hinge's axis, or off it by some metres."""
+    rng = np.random.default_rng(seed)
+    rim, tyre = Rotation.random(2, rng=rng)
+    axis, place, anchor = tyre.as_matrix()[:, 2], rng.normal(size=3), rng.normal(size=3)
+    side = tyre.as_matrix()[:, 0]
+    within, turned = rim.inv().apply(anchor + rng.normal() * axis + off * side - place), rim.inv() * tyre
+    pos, centre, pivot, along = (" ".join(map(repr, v.tolist())) for v in (place, within, anchor, axis))
+    quats = [" ".join(map(repr, turn.as_quat(scalar_first=True).tolist())) for turn in (rim, turned)]
+    xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/><body>
+      <joint name="wheel" pos="{pivot}" axis="{along}"/><body pos="{pos}" quat="{quats[0]}">
+      <geom type="cylinder" size="0.1 0.03" pos="{centre}" quat="{quats[1]}"/><body name="cap"/></body></body></body>
+      </worldbody><actuator><motor joint="wheel"/></actuator></mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "wheel"))
+    assert [joint.name for joint in robot.mjcf.wheels] == ["wheel"] * (off == 0)
 
 
 def test_a_clearance_that_start_and_goal_lack_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from lqrsim import rotations
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_name, check_number
-from lqrsim.scenes.mjcf_kinematics import axes_of, colliding, quaternion_of
+from lqrsim.scenes.mjcf_kinematics import colliding, placed, quaternion_of
 from lqrsim.scenes.mjcf_text import SPEED_LIMIT, UNNAMED, model_from_xml, read_mjcf, spec_of, unnamed_names
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.urdf import is_urdf, read_urdf
@@ -166,18 +166,19 @@ class MjcfModel:
     @cached_property
     def wheels(self) -> tuple[Joint, ...]:
         """Hinges about which all turns look the same: without limits, the axis is that of all that collides there."""
-        return tuple(joint for number, joint in enumerate(self.joints) if self._is_wheel(number))
+        data = placed(self.model)
+        return tuple(joint for number, joint in enumerate(self.joints) if self._is_wheel(number, data))
 
-    def _is_wheel(self, number: int) -> bool:
-        model, body = self.model, int(self.model.jnt_bodyid[number])
+    def _is_wheel(self, number: int, data: mujoco.MjData) -> bool:
+        model, welds, body = self.model, self.model.body_weldid, int(self.model.jnt_bodyid[number])
         if self.joints[number].kind != "hinge" or self.joints[number].limits or model.jnt_stiffness[number]:
             return False
-        if model.body_jntnum[body] > 1 or body in model.body_parentid:
+        if model.body_jntnum[body] > 1 or ((welds[model.body_parentid] == body) & (welds != body)).any():
             return False
-        start, axis = model.jnt_pos[number], model.jnt_axis[number]
+        start, axis = data.xanchor[number], data.xaxis[number]
 
         def is_round(geom: int) -> bool:
-            size, center = model.geom_size[geom], model.geom_pos[geom] - start
+            size, center = model.geom_size[geom], data.geom_xpos[geom] - start
             if np.linalg.norm(np.cross(center, axis)) > _ROUND * size[0]:
                 return False
             kind = mujoco.mjtGeom(model.geom_type[geom])
@@ -185,10 +186,10 @@ class MjcfModel:
                 return True
             if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID and size[0] != size[1]:
                 return False
-            turned = axes_of(model.geom_quat[geom])[:, 2]
+            turned = data.geom_xmat[geom, 2::3]
             return kind in _OF_REVOLUTION and abs(float(turned @ axis)) > 1 - _ROUND
 
-        geoms = np.flatnonzero((model.geom_bodyid == body) & colliding(model))
+        geoms = np.flatnonzero((welds[model.geom_bodyid] == body) & colliding(model))
         return len(geoms) > 0 and all(is_round(geom) for geom in geoms.tolist())
 
     @cached_property
