@@ -130,6 +130,23 @@ def test_a_bar_is_infinite_where_both_its_ends_are_in_walls(scene_of, bar, half_
     assert by_name(scene_of(bar))["bar"].size[1] == half_length
 
 
+@pytest.mark.parametrize("kind", ["cylinder", "capsule"])
+@pytest.mark.parametrize("seed", range(10))
+def test_a_bar_behind_a_wall_is_nothing_before_it(scene_of, kind, seed):
+    rng = np.random.default_rng(seed)
+    turns, place, (radius, half) = Rotation.random(2, rng=rng), rng.normal(size=3), rng.uniform(0.1, 1, 2)
+    normal = turns.as_matrix()[0, :, 2]
+    centre = place - rng.uniform(2.5, 4) * normal
+    walls, quats = [], [" ".join(map(repr, quat)) for quat in turns.as_quat(scalar_first=True).tolist()]
+    for shape, at, quat in (("plane", place, quats[0]), (kind, centre, quats[1])):
+        size = "1 1 1" if shape == "plane" else f"{radius} {half}"
+        walls.append(f'<geom type="{shape}" size="{size}" pos="{" ".join(map(repr, at.tolist()))}" quat="{quat}"/>')
+    points = place + rng.normal(size=(100, 3)) * 5
+    points -= np.minimum(2 * (points - place) @ normal, 0)[:, None] * normal  # all before the wall
+    alone, both = (scene_of("".join(some)).world.distance(points) for some in (walls[:1], walls))
+    np.testing.assert_allclose(both, alone, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("asset", "geom", "kind"),
     [

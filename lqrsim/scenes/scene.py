@@ -9,7 +9,8 @@ collide if contype or conaffinity is not zero, and contacts are not switched off
   plane in which a robot moves, such as the floor that it drives on, does not bound the robot (`World.seen_by`);
 - plane, sphere, capsule, cylinder, box and mesh have a distance; a mesh is its convex hull, as in contacts. Other types
   are refused by name, not left out. A robot from an MJCF uses MuJoCo's distances, to all types;
-- a cylinder or capsule counts as infinite if both ends lie on or behind planes, because nothing can reach them.
+- a cylinder or capsule counts as infinite if both ends lie on or behind planes, because nothing can reach them, and
+  prolonged ones would stay behind these planes.
 
 `obstacles=` of `load_scene` chooses other obstacles, by names or by a function. `MjcfRobot` leaves out geoms that are
 not in the way of that robot.
@@ -206,7 +207,10 @@ def _hull_of(model: mujoco.MjModel, mesh: int) -> Array:
 
 
 def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
-    """Whether the end of a cylinder or capsule, as a disc across its axis, lies wholly on or behind a plane."""
+    """Whether the end of a cylinder or capsule, as a disc across its axis, lies wholly on or behind a plane.
+
+    It does not count if the bar, prolonged beyond this end, would come out of the plane again.
+    """
     radius, half_length, _ = bar.size
     axis = end * bar.rotation[:, 2]
     centre = bar.position + half_length * axis
@@ -215,4 +219,4 @@ def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
         normal = plane.rotation[:, 2]
         return normal @ (centre - plane.position) + radius * math.sqrt(max(0.0, 1 - float(normal @ axis) ** 2))
 
-    return any(height(plane) <= 1e-6 for plane in planes)
+    return any(height(plane) <= 1e-6 and plane.rotation[:, 2] @ axis <= 1e-9 for plane in planes)
