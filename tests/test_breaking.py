@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sampling import examples
 from scipy import stats
 
 import lqrsim as ls
@@ -9,6 +10,8 @@ from lqrsim.disturbances import ControlNoise, ForceNoise, Push
 from lqrsim.stress.failure_search import largest_effects
 from lqrsim.stress.reliability import smallest_failure
 from lqrsim.stress.trial_score import TrialScore
+
+UNITS = 1.0, 2.0**20, 2.0**-20  # powers of two, which round nothing
 
 
 @pytest.mark.parametrize("size", [2, 50])
@@ -35,6 +38,24 @@ def test_scores_without_a_slope_may_be_infinite(passing: float, failing: float, 
     found = smallest_failure(lambda z: np.where(z @ normal > 2.5, failing, passing), 10, failures=failures, seed=seed)
     assert found.converged
     assert 2.5 < found.distance < 2.53
+
+
+@pytest.mark.parametrize("seed", range(examples(20)))
+def test_the_unit_of_scores_does_not_matter(seed: int) -> None:
+    """Also where some are infinite, as of trials that diverge."""
+    rng = np.random.default_rng(seed)
+    size, limit, infinite = int(rng.integers(2, 12)), rng.uniform(1.5, 3), rng.uniform(0.1, 1)
+    normal, curved = rng.standard_normal(size), 0.02 * rng.standard_normal((size, size))
+    normal /= np.linalg.norm(normal)
+
+    def score(z: np.ndarray) -> np.ndarray:
+        depth = z @ normal - limit + np.einsum("ki,ij,kj->k", z, curved, z)
+        return np.where((depth > infinite) | (z[:, 0] > 2.2), np.inf, depth)
+
+    found, *others = (smallest_failure(lambda z, unit=unit: unit * score(z), size, seed=seed) for unit in UNITS)
+    for other in others:
+        np.testing.assert_array_equal(other.numbers, found.numbers)
+        assert (other.converged, other.simulations) == (found.converged, found.simulations)
 
 
 def test_many_numbers_take_longer_but_get_there() -> None:

@@ -444,10 +444,12 @@ def _gradients(score: Score, best: Array, pairs: int, rng: np.random.Generator) 
     """Estimate the gradient of the score at the best failure from each half of the pairs, (2, d)."""
     steps = SPREAD * rng.standard_normal((pairs, len(best))) / np.sqrt(len(best))
     scores = score(np.concatenate([best + steps, best - steps]))
-    # Trials that diverge have an infinite score; it counts as slightly worse than the worst finite score, and one of
-    # minus infinity, as without obstacles, as slightly better than the best.
+    # Trials that diverge have an infinite score; it counts as worse than the worst finite score by twice their range,
+    # in whatever unit, and one of minus infinity, as without obstacles, as better than the best by as much.
     finite = scores[np.isfinite(scores)]
-    scores = scores.clip(finite.min(initial=0.0) - 1.0, finite.max(initial=0.0) + 1.0)
+    low, high = finite.min(initial=0.0), finite.max(initial=0.0)
+    beyond = 2 * (high - low) or 1.0
+    scores = scores.clip(low - beyond, high + beyond)
     difference, half = scores[:pairs] - scores[pairs:], pairs // 2
     parts = [difference[:half] @ steps[:half], difference[half:] @ steps[half:]]
     return np.array(parts) / (pairs * SPREAD**2) * len(best)
