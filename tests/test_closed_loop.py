@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from mechanisms import Jointed
+from sampling import examples
 from tracking import hover, track, weave
 
 from lqrsim.errors import InputError
@@ -29,6 +30,7 @@ from lqrsim.scenes.scene import load_scene, scene_from_xml
 from lqrsim.simulation.closed_loop import ClosedLoop, simulate
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.plant_check import check_plant
 
 NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
 RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
@@ -571,3 +573,39 @@ def test_warnings_of_mujoco_are_counted_and_neither_printed_nor_left_in_a_file(
     np.testing.assert_array_equal(save_load.load(path, Rollout).warnings, run.warnings)
     older = replace(run, warnings=None, undisturbed=None)
     assert older.warned() == older.departure() == ""
+
+
+LINK = 'type="capsule" fromto="0 0 0 .4 0 0" size=".04" mass="1"'
+
+
+@pytest.mark.parametrize("seed", range(examples(20)))
+def test_contacts_are_those_of_the_whole_robot_whichever_body_disturbances_act_on(seed: int, tmp_path: Path) -> None:
+    """Also of trees without that body, whatever their order; a margin makes a contact a collision."""
+    rng = np.random.default_rng(seed)
+    at, margin = rng.uniform(0.1, 0.7, (2, 2)), rng.choice([0.0, 0.03])
+    arms = [
+        f'<body name="{name}1" pos="0 {y} .5"><joint name="{name}a" axis="0 1 0"/><geom {LINK}/>'
+        f'<body name="{name}2" pos=".4 0 0"><joint name="{name}b" axis="0 1 0"/><geom {LINK}/>'
+        f'<body name="{name}3" pos=".4 0 0"><joint name="{name}c" axis="0 1 0"/><geom {LINK}/></body></body></body>'
+        for name, y in (("p", 0), ("q", 2))
+    ]
+    balls = [
+        f'<geom name="{name}" size=".1" pos="{x} {y} {0.35 - depth / 3}" margin="{margin}"/>'
+        for name, y, (x, depth) in zip("ij", (0, 2), at, strict=True)
+    ]
+    found = []
+    for order, body in [(1, None), (1, "p2"), (1, "q1"), (1, "q2"), (-1, None)]:
+        path = tmp_path / "arms.xml"
+        path.write_text(
+            f"<mujoco><worldbody>{''.join(arms[::order] + balls)}</worldbody>"
+            '<actuator><motor joint="pa" ctrlrange="-1 1"/></actuator></mujoco>'
+        )
+        robot = MjcfRobot(path, body=body, position=())
+        plan = track(robot, robot.at(), np.zeros((30, 1)), 0.02, feedback=False)
+        run = simulate(Plant(robot, robot.scene), plan)
+        folded = robot.at(pb=2.2, pc=2.2, qb=2.2, qc=2.2)
+        check = check_plant(robot, robot.scene, samples=3, around=folded, spread=0.01)
+        touched = sorted({tuple(sorted(pair[:2])) for pair in check.contacts})
+        found.append((run.outcome, run.obstacles, run.contacts.tolist(), run.collided_at.round(9).tolist(), touched))
+    assert found[0][2] != [0]
+    assert all(one == found[0] for one in found)

@@ -169,7 +169,7 @@ class MujocoPhysics(Physics):
         """Whether each robot touches each obstacle, (K, obstacles). The simulations must not advance afterwards."""
         assert self._sensors is not None
         self.simulations.forward()
-        return self._sensors[:, self.plant.contact] > 0
+        return (self._sensors[:, self.plant.contact] > 0).any(axis=1)
 
     def sense(self, held: Array | None) -> Array:
         """MuJoCo's current `sensordata` (K, any), under the last forces and the last controls, or `held` (K, m).
@@ -249,7 +249,7 @@ class MujocoPhysics(Physics):
             self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
             self.simulations.warning[:] = 0
         if self._sensors is not None and (self.senses_contacts or self.solid.any()):
-            return self._sensors[:, self.plant.contact] > 0
+            return (self._sensors[:, self.plant.contact] > 0).any(axis=1)
         return np.zeros((0, 0), dtype=bool)
 
 

@@ -4,6 +4,7 @@ With a `Simulator`, the simulator moves the robot. The MuJoCo model then provide
 """
 
 import copy
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,7 +50,8 @@ class Plant(OneVersion):
       body: id of the robot's body. bodies: ids of it, of those that the robot's joints move, and of what is attached.
       qpos, qvel, ctrl: indices of the robot's joints and controls in MuJoCo's arrays.
       actuators: ids of the robot's actuators, of which each has any number of controls.
-      contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
+      contact: indices of the contact sensors in MuJoCo's `sensordata`, one row for each of the robot's kinematic trees;
+        positive while it touches the obstacle.
     """
 
     _prefix = ""
@@ -93,6 +95,7 @@ class Plant(OneVersion):
             if scene.model.body_parentid[body] in attached:
                 attached.add(body)
         self.bodies = np.array(sorted(attached), dtype=np.intp)
+        self._roots = self.bodies[~np.isin(scene.model.body_parentid[self.bodies], self.bodies) | (self.bodies == 0)]
         mounts = mounting_pairs(scene.model, [geom for geom, name in self._scenery if name in self.obstacles])
         # What a choice of obstacles leaves out does not collide, but ground and what the robot stands on; for a robot
         # whose own steps are MuJoCo's all of it does.
@@ -103,7 +106,8 @@ class Plant(OneVersion):
         self.model = self._compile()
         self.qpos, self.qvel, self.ctrl = indices_in(robot, self.model)
         self.actuators = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
-        self.contact = np.arange(self.model.nsensordata - len(self.obstacles), self.model.nsensordata)
+        first = self.model.nsensordata - len(self._roots) * len(self.obstacles)
+        self.contact = np.arange(first, self.model.nsensordata).reshape(len(self._roots), len(self.obstacles))
         try:
             batch.Batch(self.model, 1, 1)
         except ValueError as error:
@@ -134,8 +138,7 @@ class Plant(OneVersion):
         """Weight of the robot in N."""
         if self.simulator is not None:
             return self.simulator.weight
-        roots = self.bodies[~np.isin(self.model.body_parentid[self.bodies], self.bodies)]
-        return float(self.model.body_subtreemass[roots].sum() * np.linalg.norm(self.model.opt.gravity))
+        return float(self.model.body_subtreemass[self._roots].sum() * np.linalg.norm(self.model.opt.gravity))
 
     def sensors(self, sensors: Sequence[Sensor]) -> RobotSensors:
         """Sensors of the scene's MJCF, for `OffsetFree(sensors=...)` and `SensorErrors`."""
@@ -262,19 +265,21 @@ class Plant(OneVersion):
         for geom, name in self._scenery:
             geoms[geom].name = name  # sensors need names
         _separate(spec, geoms, self._apart, self.scene.model)
-        sensors = {sensor.name for sensor in spec.sensors}
-        for name in self.obstacles:
-            if not contacts:
-                geom = next(geom for geom in geoms if geom.name == name)
-                geom.contype = geom.conaffinity = 0
-                continue
+        sensors, bodies = {sensor.name for sensor in spec.sensors}, list(spec.bodies)
+        for root in self._roots.tolist():
+            bodies[root].name = bodies[root].name or free_name("robot", [body.name for body in bodies])
+        if not contacts:
+            for geom in geoms:
+                if geom.name in self.obstacles:
+                    geom.contype = geom.conaffinity = 0
+        for root, name in itertools.product(self._roots.tolist() if contacts else [], self.obstacles):
             sensor = free_name(f"contact with {name}", sensors)
             sensors.add(sensor)
             spec.add_sensor(
                 name=sensor,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot's body and everything attached to it
-                objname=self.robot.body,
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the body and everything attached to it
+                objname=bodies[root].name,
                 reftype=mujoco.mjtObj.mjOBJ_GEOM,
                 refname=name,
                 # The items to report, their order, and their number.

@@ -280,7 +280,7 @@ def _sample(
         mujoco.mj_step(plant.model, data)
     before = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=state)
     touched, model = set[tuple[str, str]](), plant.model
-    of_robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]  # geoms of its kinematic tree
+    of_robot = np.isin(model.body_rootid[model.geom_bodyid], model.body_rootid[plant.bodies])  # in its kinematic trees
     for _ in range(plant.substeps(period)):
         mujoco.mj_step(plant.model, data)
         pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
