@@ -344,6 +344,27 @@ def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
     assert simulate(Plant(robot, load_scene(tmp_path / "ice.xml")), strong).outcome == ("diverged",)
 
 
+@pytest.mark.parametrize("seed", range(examples(20)))
+def test_a_bumper_touches_whichever_body_has_it(seed: int, tmp_path: Path) -> None:
+    """On the sled, or on a carriage that carries it; it reaches further than the sled's radius."""
+    rng, runs = np.random.default_rng(seed), []
+    bumper = f'<geom type="box" pos="{rng.uniform(0.2, 0.5)} 0 0" size="0.05 0.1 0.1" mass="0.5"/>'
+    push = rng.uniform(1.5, 3.0, (40, 1)) * [0, 1]
+    across, ball = re.findall(r'<joint name="across"[^>]*>|<geom type="sphere"[^>]*>', SLED)
+    for body in (f"{across}{ball}{bumper}", f'{bumper}<body name="sled">{across}{ball}</body>'):
+        text = SLED.replace(ball, "").replace(across, body)
+        if text.count('"sled"') > 1:
+            text = text.replace('"sled"', '"carriage"', 1)
+        (tmp_path / "ice.xml").write_text(text)
+        plant = Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+        runs.append(simulate(plant, track(plant.robot, np.zeros(4), push, 0.1, feedback=False)))
+    assert runs[0].outcome == runs[1].outcome == ("collided",)
+    np.testing.assert_allclose(runs[1].collided_at, runs[0].collided_at, atol=1e-9)
+    before = [run.states[run.counts] for run in runs]  # the softness of MuJoCo's contacts is that of a body
+    np.testing.assert_allclose(before[1], before[0], atol=1e-9)
+    assert min(run.contacts[0] for run in runs) > 0
+
+
 # Bad input
 
 

@@ -315,6 +315,7 @@ def extent(plant: Plant) -> float:
     for geom in np.flatnonzero(collides).tolist():
         path = mjcf_kinematics.path_to(model, geom, plant.body)
         if path is None:
+            reach = np.inf if model.geom_bodyid[geom] in plant.bodies else reach
             continue
         size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
         if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
