@@ -107,7 +107,7 @@ class Rollout:
       measured: (K, T+1, n) states as measured, which the controller gets.
       commanded: (K, T, m) the controller's commands.
       applied: (K, T, m) the controls that the actuators applied, within the robot's limits.
-      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
+      forces: (K, T, 3) disturbing force at the centre of mass of the robot's body in N, world axes.
       torques: (K, T, 3) disturbing torque in N m, world axes.
       displaced: (K, obstacles, 3) displacement of each obstacle from its place in the plan, in metres.
       clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in m; infinite without obstacles.

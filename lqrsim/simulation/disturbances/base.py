@@ -44,7 +44,7 @@ class Effect:
       read: (step, readings (K, any) by the sensor's name) -> the same with errors; NaN for a reading that gets lost.
         It is called for a controller that reads sensors of the MJCF.
       actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
-      force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
+      force: (step, true states (K, n)) -> force at the centre of mass of the robot's body in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
       wind: (step, true states (K, n)) -> wind in m/s, world axes, (K, 3): the velocity of the medium if the plant
         `has_medium`, and a force of `robot.drag` times the wind unless a simulator has a wind.

@@ -117,7 +117,7 @@ class WrenchNoise(GaussianDisturbance):
 
 
 class ForceNoise(WrenchNoise):
-    """A random force at the robot's centre of mass; `std` in N, one number, or three along the world's axes."""
+    """A random force at the centre of mass of the robot's body; `std` in N, one, or three along the world's axes."""
 
     kind, unit = "force", "N"
 
@@ -202,7 +202,7 @@ def as_disturbances(disturbances: object) -> tuple[Disturbance, ...]:
 @checked
 @dataclass(frozen=True)
 class Push(Disturbance):
-    """A single push at the robot's centre of mass, spread over the control period in which it comes.
+    """A single push at the centre of mass of the robot's body, spread over the control period in which it comes.
 
     Args:
       impulse: the impulse in N s along the world's axes, (3,).
