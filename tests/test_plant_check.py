@@ -106,6 +106,59 @@ def test_samples_keep_to_the_bounds_of_a_problem(low: float, high: float, most: 
     assert not ls.check_plant(Arm(), scene, spread=3.0, seed=seed, samples=20).good
 
 
+@dataclass(frozen=True)
+class Spinner(Jointed):
+    """A cart, and a fast wheel that nothing couples to it."""
+
+    radius: float = 0.1
+    thrust: float = 1.0  # of the cart's force
+    turns: bool = True
+
+    name = "cart"
+    body = "cart"
+
+    @property
+    def joints(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return ("along", "spin") if self.turns else ("along",)
+
+    @property
+    def actuators(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return ("push", "drive") if self.turns else ("push",)
+
+    @cached_property
+    def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        def rate(x, u, p):
+            return [x[2], x[3], p.thrust * u[0], 1e5 * u[1]] if self.turns else [x[1], p.thrust * u[0]]
+
+        wheel, drive = ({"turn": "rad"}, {"torque": "N m"}) if self.turns else ({}, {})
+        return ls.Dynamics(
+            rate,
+            states={"place": "m", **wheel, "speed": "m/s", **{f"{name}_rate": "rad/s" for name in wheel}},
+            controls={"force": "N", **drive},
+            parameters={"thrust": self.thrust},
+            control_limits=(-1, 1),
+        )
+
+
+@settings(max_examples=examples(20))
+@given(thrust=st.floats(0.5, 0.9) | st.floats(1.1, 2.0) | st.just(1.0), seed=st.integers(0, 99))
+def test_a_fast_wheel_hides_no_fault_of_the_cart(thrust: float, seed: int) -> None:
+    """Its changes, in another unit, are thousands of times as large."""
+    wheel = """<body name="wheel" pos="0 9 0"><joint name="spin" axis="0 0 1"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="1e-5 1e-5 1e-5"/></body>"""
+    found = []
+    for turns in (False, True):
+        scene = scene_from_xml(
+            f"""<mujoco><option timestep="0.005" integrator="RK4" gravity="0 0 0"/><worldbody><body name="cart">
+              <joint name="along" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>{wheel if turns else ""}
+              </worldbody><actuator><motor name="push" joint="along"/>
+              {'<motor name="drive" joint="spin"/>' if turns else ""}</actuator></mujoco>""",
+            "rails",
+        )
+        found.append(ls.check_plant(Spinner(thrust=thrust, turns=turns), scene, seed=seed))
+    assert found[0].good == found[1].good == (thrust == 1.0)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

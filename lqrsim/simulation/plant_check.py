@@ -64,8 +64,12 @@ class PlantCheck:
 
     @property
     def relative(self) -> Array:
-        """(n,) errors relative to the changes; a change counts as at least a thousandth of the largest one."""
-        return self.errors / np.maximum(self.changes, 1e-3 * np.nanmax(self.changes, initial=1e-12))
+        """(n,) errors relative to the changes; one counts as at least a thousandth of the largest one in its unit."""
+        units, changes = np.array(self.units), np.nan_to_num(self.changes)
+        alike = (units[:, None] == units) & (units != "") | np.eye(len(units), dtype=bool)
+        rounding = 1e-9 * np.nan_to_num(np.abs([self.state, self.simulated, self.predicted])).max(axis=0)
+        least = np.maximum(1e-3 * (alike * changes).max(axis=1), rounding + 1e-15)
+        return self.errors / np.maximum(self.changes, least)
 
     @property
     def worst(self) -> str:
