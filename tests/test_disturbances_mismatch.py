@@ -1,5 +1,6 @@
 """Robots and surroundings that are not as planned, against MuJoCo: what moves, by how much."""
 
+import xml.etree.ElementTree as ElementTree
 from itertools import permutations
 
 import mujoco
@@ -10,7 +11,7 @@ from tracking import hover, track, weave
 from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes.scene import load_scene
+from lqrsim.scenes.scene import load_scene, scene_from_xml
 from lqrsim.simulation.closed_loop import ClosedLoop, simulate
 from lqrsim.simulation.disturbances import (
     AxleMismatch,
@@ -138,6 +139,27 @@ def test_mismatches_of_one_kind_are_one_of_their_product(arena, seed):
             models.append([loop.physics.simulations.expand(field) for field in fields])
         for one, both in zip(*models, strict=True):
             np.testing.assert_allclose(one, both, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", [AxleMismatch, WheelRadiusMismatch])
+@pytest.mark.parametrize("seed", range(3))
+def test_wheels_on_struts_are_as_far_apart_as_without(arena, kind, seed):
+    """Struts are fixed to the base, and turned; they are a part of the way from the middle to a wheel, or all of it."""
+    rng = np.random.default_rng(seed)
+    factor, share, angle = rng.uniform(0.8, 1.2), rng.choice([1.0, rng.uniform(0.2, 0.9)]), rng.uniform(-180, 180)
+    root, whole = ElementTree.fromstring(load_scene("arena").xml), driven(arena, (0.1, 0.2), [kind(factor=factor)])
+    bodies = {body.get("name"): body for body in root.iter("body")}
+    base = next(body for body in root.iter("body") if bodies["create_wheel_left"] in list(body))
+    for name, at in (("create_wheel_left", 0.129), ("create_wheel_right", -0.129)):
+        wheel, turned = bodies[name], ElementTree.Element("frame", euler=f"0 {-angle} 0")
+        strut = ElementTree.SubElement(base, "body", pos=f"0 {share * at} 0", euler=f"0 {angle} 0")
+        base.remove(wheel)
+        wheel.set("pos", f"0 {(1 - share) * at} 0")
+        turned.append(wheel)
+        strut.append(turned)
+    scene = scene_from_xml(ElementTree.tostring(root, encoding="unicode"), "arena")
+    on_struts = driven(Plant(DifferentialDrive(), scene), (0.1, 0.2), [kind(factor=factor)])
+    np.testing.assert_allclose(on_struts, whole, atol=1e-4)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])

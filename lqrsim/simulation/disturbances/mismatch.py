@@ -243,10 +243,11 @@ class AxleMismatch(WheelMismatch):
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         _, hubs = wheel_geoms(plant)
-        from_middle = plant.model.body_pos[hubs] - plant.model.body_pos[hubs].mean(axis=0)
-        places = simulations.expand("body_pos")
-        off = places[:, hubs] - places[:, hubs].mean(axis=1, keepdims=True)
-        longer = np.vecdot(off, from_middle) / np.vecdot(from_middle, from_middle)  # by other mismatches
+        model, data, places = plant.model, placed(plant.model), simulations.expand("body_pos")
+        parents = data.xmat[model.body_parentid[hubs]].reshape(-1, 3, 3)
+        from_middle = np.einsum("hi,hij->hj", data.xpos[hubs] - data.xpos[hubs].mean(axis=0), parents)  # in their axes
+        moved = places[:, hubs] - model.body_pos[hubs]  # by other mismatches
+        longer = 1 + np.vecdot(moved, from_middle) / np.vecdot(from_middle, from_middle)
         places[:, hubs] += ((factors - 1) * longer)[:, :, None] * from_middle
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
