@@ -78,7 +78,7 @@ def test_what_is_known_beforehand_is_found(kind: str) -> None:
         assert solution.success == drawn.possible, f"{kind} {number}"
 
 
-SLOW = "contact", "overflow", "scales", "saturating", "units"  # seconds each
+SLOW = "contact", "overflow", "scales", "saturating", "units", "wide"  # seconds each
 
 
 @pytest.mark.parametrize("kind", [*(one for one in families.KINDS if one not in SLOW), *rarely(*SLOW)])
@@ -111,6 +111,15 @@ def test_saddles_are_seen_in_all_units(number: int) -> None:
     """A length at rest had a size of 1 beside others of 1e5: the curvature along it counted as zero."""
     case = families.draw("units", number)
     solution = ls.smooth(case.problem, start=case.given, threads=1)
+    assert dense.contradictions(case, solution) == []
+
+
+@pytest.mark.parametrize("number", [1, 6, 7, 9, 17, 18, 20, 27, 34, 36])
+def test_limits_far_beyond_what_is_needed_measure_nothing(number: int) -> None:
+    """Limits as for none, such as 1e9, made all curvatures count as zero, and plans began far away."""
+    case = families.draw("wide", number)
+    solution = ls.smooth(case.problem, start=case.given, threads=1)
+    assert solution.success
     assert dense.contradictions(case, solution) == []
 
 

@@ -96,6 +96,7 @@ ROUNDED = 1e3  # slope relative to the tolerance, from which on it counts as rou
 ROUNDING, RESTING = 1e-12, 1e-11  # relative differences of merits that may be rounding, in these two tests
 PER_ROW = 0.05  # that may be taken for the first plan's, relative to sizes: even rows far from active count in a sum
 EDGE = 0.05  # distance of the first controls from their limits, relative to the range
+FAR = 1e3  # range relative to the first controls, or to 1, from which on limits may be very wide
 BARELY = 1e-3  # least first excess, relative to the least first slack
 WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
 CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
@@ -142,9 +143,18 @@ def find_sizes(begun, stages, work, mem):
     """Take a plan, with its controls a little inside their limits; compute typical sizes and the models there."""
     now, steps, limits = work.now, stages.steps, stages.model.limits
     copy_plan(steps, begun.plan, now.plan)
+    widest, largest = 0.0, 1.0
+    for i in range(M):
+        widest = max(widest, limits.high[i] - limits.low[i] if limits.high[i] - limits.low[i] < inf else 0.0)
+        for t in range(steps):
+            largest = max(largest, abs(now.plan.controls[t, i]))
+    wide = widest > FAR * largest
+    if wide:  # whether they are is known from the models alone
+        determine_scales(stages, now.plan)
     for i in range(M):
         low, high = limits.low[i], limits.high[i]
         edge = EDGE * (high - low) if high - low < inf else 0.0
+        edge = min(edge, EDGE * stages.control_size[i]) if wide else edge
         for t in range(steps):
             now.plan.controls[t, i] = min(max(now.plan.controls[t, i], low + edge), high - edge)
     stages.reuses_derivatives[0] = 0.0

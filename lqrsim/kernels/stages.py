@@ -46,6 +46,7 @@ PROBE_DISTANCE = (
 SMALLEST = 1e-3  # a state that moves less hardly moves; where none moves more, relative to what moves most
 REST = 1e-12  # where none moves more, all motions are rounding errors
 FAR = 100.0  # a state that moves more moves far
+WIDE = 1e5  # limits that are this much farther apart than a control is large are no measure of it
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
 # The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of
@@ -278,7 +279,7 @@ def determine_scales(stages, plan):
 def typical_sizes(stages, plan, hessian):
     """Write typical sizes of states, controls and rows; return the cost of such changes, by Hessians (T+1, W, W) of it.
 
-    The size of a control without limits is the change that moves a state by its typical size.
+    The size of a control without limits, or with very wide ones, is the change that moves a state by its typical size.
     """
     steps, rows, models = stages.steps, stages.rows, stages.models
     moves, farthest = stack(N), 0.0
@@ -297,9 +298,6 @@ def typical_sizes(stages, plan, hessian):
         rest = most if most > FAR or (small and most > least) else 1.0
         stages.state_size[i] = moves[i] if moves[i] > least else rest
     for j in range(M):
-        stages.control_size[j] = stages.model.limits.high[j] - stages.model.limits.low[j]
-        if stages.control_size[j] < inf:
-            continue
         effect, largest = SLOWEST, 0.0
         for i in range(N):
             row_change = 0.0
@@ -308,7 +306,8 @@ def typical_sizes(stages, plan, hessian):
             effect = max(effect, row_change / stages.state_size[i])
         for t in range(steps):
             largest = max(largest, abs(plan.controls[t, j]))
-        stages.control_size[j] = max(1 / effect, largest)
+        span, useful = stages.model.limits.high[j] - stages.model.limits.low[j], max(1 / effect, largest)
+        stages.control_size[j] = span if span <= WIDE * useful else useful
     for row in range(rows.size):
         total, count = 0.0, 0.0
         for t in range(steps + 1):

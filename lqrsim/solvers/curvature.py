@@ -27,6 +27,7 @@ FLAT = 1e-6  # curvature of a direction that counts as zero, relative to its ter
 FLATTER = 1e-10  # the same relative to the typical cost of a change
 CLEAR = 1e-7  # curvature of a control that is positive beyond doubt, relative to what the weights are
 PRESSING = 1e-9  # cost of a change by a row's size, relative to the typical cost, from which on the row presses
+USED, UNUSED = 100.0, 1e-3  # typical size of a control, at most, by its largest; what is less than that by another's
 SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below which its direction is looked at
 
 Flags = npt.NDArray[np.bool_]
@@ -47,7 +48,14 @@ def curvature_at(stages: Stages, plan: Motion, gain: Array, multipliers: Array) 
       multipliers: (T+1, R) of the constraints' rows; those of limits are worked out here.
     """
     with np.errstate(all="ignore"):
-        return _Reduced(stages, plan, gain, multipliers, stages.sizes(plan)).check()
+        return _Reduced(stages, plan, gain, multipliers, _used(stages.sizes(plan), plan)).check()
+
+
+def _used(sizes: Sizes, plan: Motion) -> Sizes:
+    """Sizes of which those of controls are no more than `USED` times what is used of them, between wide limits."""
+    used = np.abs(plan.controls).max(axis=0)
+    used = np.where(used > UNUSED * used.max(), used, used.max() or np.inf)
+    return sizes._replace(controls=np.minimum(sizes.controls, USED * used))
 
 
 class _Reduced:
@@ -60,6 +68,10 @@ class _Reduced:
         inside = (stages.low < plan.controls) & (plan.controls < stages.high)
         costates, slopes = stages.adjoint(np.where(inside[:, :, None], gain, 0.0))
         stages.linearize(plan, costates, multipliers, 0.0)
+        if (sizes.controls < stages.about.control_size).any():
+            changes = np.concatenate([sizes.states, sizes.controls])
+            curves = np.einsum("tii,i->", np.abs(stages.models.hessian), changes**2)
+            sizes = self._sizes = sizes._replace(cost=min(sizes.cost, float(curves) / 2))
         forces, limit = multipliers.copy(), stages.owners == -1
         for row, (sign, i, _) in zip(np.flatnonzero(limit), stages.limits, strict=True):
             forces[:-1, row] = sign * slopes[:, i]

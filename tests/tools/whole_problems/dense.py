@@ -17,6 +17,7 @@ from lqrsim.results.solution_parts import Status
 from .families import Case
 
 COST = 1e-7  # rounding of sums of a few hundred terms, and of steps that amplify it
+WIDE = 100.0  # limits that are this much farther apart than the largest control say nothing of its size
 ACTIVE = 1e-5  # how near to a bound or a limit, relative to its size, counts as at it
 FLAT = 1e-6  # eigenvalues up to this part of the largest are neither positive nor negative: those of differences
 SLACK = 10.0  # times the tolerance: what may still be saved; the solver's own Hessians are others
@@ -194,7 +195,8 @@ def _sizes(case: Case, z: Array) -> Array:
     span = case.high - case.low
     own = np.abs(controls).max(axis=0)
     own = np.where(own > 1e-3 * own.max(), own, own.max())
-    size = np.where(np.isfinite(span), span, np.where(own > 0, own, 1.0))
+    own = np.where(own > 0, own, 1.0)
+    size = np.where(span < WIDE * own, span, own)
     both = np.tile(size, steps)
     assert m == len(size)
     return np.append(both, dt) if case.problem.duration is not None else both

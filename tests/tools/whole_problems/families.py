@@ -9,6 +9,7 @@ scales      Costs and states from 1e-8 to 1e8 of the usual size.
 time        Least time, without an effort.
 contact     A slide of an MJCF that is to push another, with controls that do so, or without.
 units       As symmetric, with lengths in units from 1e-6 to 1e6 of the usual.
+wide        As symmetric, with limits of 100 to 1e9 that no control reaches.
 
 Each kind has few structures, so that little is compiled; all else is numbers.
 """
@@ -290,7 +291,7 @@ def outside(x: Any, u: Any, p: Any, lib: Any) -> Any:
     return (x[0] - p.at) ** 2 + x[1] ** 2 - p.radius**2
 
 
-def symmetric(rng: Generator, *, unit: float = 1.0) -> Case:
+def symmetric(rng: Generator, *, unit: float = 1.0, limits: tuple[float, float] | None = None) -> Case:
     goal, radius = float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.1, 0.35))
     numbers = {
         "effort": _log(rng, 1e-2, 1.0), "goal": goal, "at": goal * float(rng.uniform(0.4, 0.6)), "radius": radius,
@@ -298,7 +299,14 @@ def symmetric(rng: Generator, *, unit: float = 1.0) -> Case:
     }  # fmt: skip
     steps, dt = int(rng.integers(10, 30)), 0.1
     kind = int(rng.integers(3))
-    common: dict[str, Any] = {"numbers": numbers, "dt": dt, "steps": steps, "final": arrive, "unit": unit}
+    common: dict[str, Any] = {
+        "numbers": numbers,
+        "dt": dt,
+        "steps": steps,
+        "final": arrive,
+        "unit": unit,
+        "limits": limits,
+    }
     ends = {"x": goal, "y": 0.0} if rng.random() < 0.5 else None
     if kind == 2:  # beside an angle of usual size, small lengths have no size of their own
         common["unit"] = max(unit, 1.0)
@@ -316,6 +324,11 @@ def symmetric(rng: Generator, *, unit: float = 1.0) -> Case:
 
 def units(rng: Generator) -> Case:
     return symmetric(rng, unit=float(10 ** rng.uniform(-6, 6)))
+
+
+def wide(rng: Generator) -> Case:
+    far = float(10 ** rng.uniform(2, 9))
+    return symmetric(rng, limits=(-far if rng.random() < 0.5 else -50.0, far))
 
 
 def flat(rng: Generator) -> Case:
@@ -508,5 +521,5 @@ def numbers_size(case: Case) -> float:
 KINDS: dict[str, Callable[[Generator], Case]] = {
     "given": given, "symmetric": symmetric, "saturating": saturating, "flat": flat, "overflow": overflow,
     "scales": scales, "time": time, "contact": contact,
-    "units": units,
+    "units": units, "wide": wide,
 }  # fmt: skip
