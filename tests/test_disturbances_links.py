@@ -1,5 +1,7 @@
 """Measurements and commands that are late, lost or off, and actuators that are slow, weak or lost."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from comparing import assert_white
@@ -137,14 +139,18 @@ def test_motor_lag_is_the_mean_of_the_differential_equation_over_each_period(cag
 def test_limits_that_meet_stay_where_they_met(arena, seed):
     """At each strength as at the one found by small steps, within the robot's own limits, on one side or both."""
     rng, space = np.random.default_rng(seed), arena.robot.dynamics.control_coordinates
+
+    def limits_at(narrowed: Saturation, strength: float) -> Any:
+        scaled = narrowed.scaled(strength)
+        assert isinstance(scaled, Saturation)
+        return scaled.limits(arena)
+
     low, high = np.sort(rng.uniform(-0.5, 0.5, 2))
     for sides in ({"lowest": low}, {"highest": high}, {"lowest": low, "highest": high}, {"share": 0.3}):
         narrowed = Saturation(**sides)
-        found = next(
-            limits for s in np.arange(1, 200, 1e-3) if np.ptp(limits := narrowed.scaled(s).limits(arena)) < 2e-3
-        )
+        found = next(limits for s in np.arange(1, 200, 1e-3) if np.ptp(limits := limits_at(narrowed, float(s))) < 2e-3)
         for strength in (200.0, 1e6, 1e308):
-            limits = narrowed.scaled(strength).limits(arena)
+            limits = limits_at(narrowed, strength)
             np.testing.assert_array_equal(limits[0], limits[1])
             np.testing.assert_allclose(limits, found, atol=4e-3)
             np.testing.assert_array_equal(limits, np.clip(limits, space.low, space.high))
@@ -155,8 +161,11 @@ def test_saturation_narrows_the_limits(arena, cage):
     np.testing.assert_allclose(Saturation(share=0.8).limits(cage), [[0.0] * 4, [0.8 * 3.71] * 4])
     np.testing.assert_allclose(Saturation(share=0.8).limits(arena), [[-0.4] * 2, [0.4] * 2])
     np.testing.assert_allclose(Saturation(highest=(0.2, 0.3)).limits(arena), [[-0.5] * 2, [0.2, 0.3]])
-    np.testing.assert_allclose(Saturation(lowest=1.0).scaled(0.5).limits(cage), [[0.5] * 4, [3.71] * 4])
-    np.testing.assert_allclose(Saturation(share=0.5).scaled(0.0).limits(cage), [space.low, space.high])
+    half, none = Saturation(lowest=1.0).scaled(0.5), Saturation(share=0.5).scaled(0.0)
+    assert isinstance(half, Saturation)
+    assert isinstance(none, Saturation)
+    np.testing.assert_allclose(half.limits(cage), [[0.5] * 4, [3.71] * 4])
+    np.testing.assert_allclose(none.limits(cage), [space.low, space.high])
     rollout = simulate(cage, hover(), disturbances=[ControlNoise(0.5), Saturation(lowest=1.0, highest=1.4)], trials=3)
     assert rollout.applied.min() == 1.0
     assert rollout.applied.max() == 1.4

@@ -195,7 +195,7 @@ def _sizes(case: Case, z: Array) -> Array:
     span = case.high - case.low
     own = np.abs(controls).max(axis=0)
     own = np.where(own > 1e-3 * own.max(), own, own.max())
-    own = np.where(own > 0, own, 1.0)
+    own = np.where(own > 1e-100, own, 1.0)  # squares of less are no numbers
     size = np.where(span < WIDE * own, span, own)
     both = np.tile(size, steps)
     assert m == len(size)

@@ -156,7 +156,7 @@ def _case(
     if unit != 1.0:
         sizes = [unit if of.startswith("m") else 1.0 for of in states.values()]
         rate, stage, final = _in_unit(rate, sizes, sizes), _in_unit(stage, sizes), _in_unit(final, sizes)
-        rows = [(_in_unit(row, sizes), *how) for row, *how in rows]
+        rows = [(_in_unit(row, sizes), equality, last) for row, equality, last in rows]
         start = [size * number for size, number in zip(sizes, start, strict=True)]
         goal = goal and {name: sizes[names.index(name)] * number for name, number in goal.items()}
 
