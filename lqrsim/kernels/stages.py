@@ -298,7 +298,7 @@ def typical_sizes(stages, plan, hessian):
         rest = most if most > FAR or (small and most > least) else 1.0
         stages.state_size[i] = moves[i] if moves[i] > least else rest
     for j in range(M):
-        effect, largest = SLOWEST, 0.0
+        effect, largest = 0.0, 0.0
         for i in range(N):
             row_change = 0.0
             for t in range(steps):
@@ -306,8 +306,9 @@ def typical_sizes(stages, plan, hessian):
             effect = max(effect, row_change / stages.state_size[i])
         for t in range(steps):
             largest = max(largest, abs(plan.controls[t, j]))
-        span, useful = stages.model.limits.high[j] - stages.model.limits.low[j], max(1 / effect, largest)
-        stages.control_size[j] = span if span <= WIDE * useful else useful
+        span = stages.model.limits.high[j] - stages.model.limits.low[j]
+        wide = span == inf or (span * effect > WIDE and span > WIDE * largest)
+        stages.control_size[j] = max(1 / max(effect, SLOWEST), largest) if wide else span
     for row in range(rows.size):
         total, count = 0.0, 0.0
         for t in range(steps + 1):
