@@ -152,13 +152,14 @@ def _case(
 
     With a unit, lengths and speeds among the states are in 1 / unit metres.
     """
-    p, none, names = _Numbers(numbers), np.zeros(len(controls)), list(states)
+    names = list(states)
     if unit != 1.0:
-        sizes = [unit if of.startswith("m") else 1.0 for of in states.values()]
-        rate, stage, final = _in_unit(rate, sizes, sizes), _in_unit(stage, sizes), _in_unit(final, sizes)
-        rows = [(_in_unit(row, sizes), equality, last) for row, equality, last in rows]
-        start = [size * number for size, number in zip(sizes, start, strict=True)]
-        goal = goal and {name: sizes[names.index(name)] * number for name, number in goal.items()}
+        long, numbers = [of.startswith("m") for of in states.values()], {**numbers, "unit": unit}
+        rate, stage, final = _in_unit(rate, long, is_rate=True), _in_unit(stage, long), _in_unit(final, long)
+        rows = [(_in_unit(row, long), equality, last) for row, equality, last in rows]
+        start = [unit * number if is_long else number for is_long, number in zip(long, start, strict=True)]
+        goal = goal and {name: unit * goal[name] if long[names.index(name)] else goal[name] for name in goal}
+    p, none = _Numbers(numbers), np.zeros(len(controls))
 
     def stated(formula: Formula) -> Any:
         return _named(lambda x, u, p: formula(x, u, p, sympy), formula.__name__)
@@ -192,12 +193,14 @@ def _case(
     )  # fmt: skip
 
 
-def _in_unit(formula: Formula, sizes: list[float], results: list[float] | None = None) -> Formula:
-    """A formula of states that are multiples of its own, as may be its results."""
+def _in_unit(formula: Formula, long: list[bool], *, is_rate: bool = False) -> Formula:
+    """A formula of states some of which are multiples `p.unit` of its own, as are then rates of these."""
 
     def scaled(x: Any, u: Any, p: Any, lib: Any) -> Any:
-        found = formula([x[i] / size for i, size in enumerate(sizes)], u, p, lib)
-        return found if results is None else [size * rate for size, rate in zip(results, found, strict=True)]
+        found = formula([x[i] / p.unit if is_long else x[i] for i, is_long in enumerate(long)], u, p, lib)
+        return (
+            [p.unit * one if is_long else one for is_long, one in zip(long, found, strict=True)] if is_rate else found
+        )
 
     return _named(scaled, formula.__name__)
 
