@@ -116,7 +116,7 @@ def test_saddles_are_seen_in_all_units(number: int) -> None:
 
 @pytest.mark.parametrize("number", [1, 6, 7, 9, 17, 18, 20, 27, 34, 36])
 def test_limits_far_beyond_what_is_needed_measure_nothing(number: int) -> None:
-    """Limits as for none, such as 1e9, made all curvatures count as zero, and plans began far away."""
+    """With 1e9 in place of infinity, all curvatures counted as zero, and plans began far from the answer."""
     case = families.draw("wide", number)
     solution = ls.smooth(case.problem, start=case.given, threads=1)
     assert solution.success

@@ -46,7 +46,7 @@ PROBE_DISTANCE = (
 SMALLEST = 1e-3  # a state that moves less hardly moves; where none moves more, relative to what moves most
 REST = 1e-12  # where none moves more, all motions are rounding errors
 FAR = 100.0  # a state that moves more moves far
-WIDE = 1e5  # limits that are this much farther apart than a control is large are no measure of it
+WIDE = 1e5  # limits this many times farther apart than what a control needs say nothing about its size
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
 # The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of
