@@ -278,6 +278,51 @@ def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
     assert done.stdout.split() == ["True"]
 
 
+INTERRUPTED = """
+import multiprocessing, sys
+from lqrsim.stress import executors
+from lqrsim.stress.study import Shard
+
+class Job(executors.Job):
+    def prepare(self):
+        pass
+    def work(self, shard):
+        return b""
+
+def interrupt(number):
+    returned = 0
+    def count(frame, event, arg):
+        nonlocal returned
+        returned += event == "return"
+        if returned == number:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+    return count
+
+if __name__ == "__main__":
+    for number in map(int, sys.argv[1:]):
+        run = executors.run_in_processes(Job({}, "", {}, 1), [Shard(0, i, 1) for i in range(40)], 2, 100.0)
+        sys.setprofile(interrupt(number))
+        try:
+            list(run)
+        except KeyboardInterrupt:
+            print(number)
+        sys.setprofile(None)
+        for worker in multiprocessing.active_children():
+            worker.join()
+"""
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(*range(1, 10))])
+def test_workers_end_wherever_ctrl_c_comes(seed: int, tmp_path: Path) -> None:
+    """At the end of any function of Python's or ours, also where it has just locked something."""
+    (tmp_path / "run.py").write_text(INTERRUPTED)
+    numbers = [str(random.Random(seed).randrange(1, 400)) for _ in range(12)]
+    asked = [sys.executable, tmp_path / "run.py", *numbers]
+    done = subprocess.run(asked, capture_output=True, text=True, check=True, timeout=600)
+    assert done.stdout.split() == numbers
+
+
 @pytest.mark.parametrize("ready", ["manifest.json", pytest.param("shards/*.parquet", marks=pytest.mark.long)])
 def test_ctrl_c_in_a_stress_test_says_how_to_go_on(ready: str, tmp_path: Path) -> None:
     """To all processes at once, as a terminal does: while workers start, and while they work."""

@@ -1,6 +1,6 @@
 """Worker processes for a campaign, on this machine or a dask cluster. If they die or hang, the campaign continues.
 
-On this machine each worker has its own pipe, and a thread that waits for it. On a cluster dask starts workers,
+On this machine each worker has its own pipe. On a cluster dask starts workers,
 distributes tasks, and repeats the tasks of dead workers, up to its `allowed-failures`. Tables come back as bytes, so no
 folder needs to be shared. This module adds four things: a time limit that counts from the moment when a worker begins a
 task; restarts of workers that hang, because `cancel()` does not stop a running task; one task at a time per worker; and
@@ -19,11 +19,12 @@ import sys
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Generator, Iterator, Mapping
-from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from lqrsim import process
@@ -92,59 +93,70 @@ _prepared: dict[str, Trials] = {}  # trials of the last job that this process wo
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:
-    """Run the shards in worker processes, for each of which a thread waits; yield each shard with its file.
+    """Run the shards in worker processes; yield each shard with its file.
 
     If a process dies, another one runs its shard again. The trials of a shard count as failed if its process dies three
-    times, or if it exceeds the time limit.
+    times, or if it exceeds the time limit. One thread waits for all processes: with several, Ctrl-C at the wrong moment
+    would leave a lock locked forever.
     """
-    local, alive, ending = threading.local(), set[_Worker](), threading.Event()
-
-    def run(shard: Shard) -> bytes:
-        died = failed_starts = 0
-        while not ending.is_set():
-            worker, late = getattr(local, "worker", None) or _Worker(job), False
-            alive.add(worker)
-            if ending.is_set():  # it began too late to be killed with the others
-                worker.process.kill()
-            try:
-                file = worker.run(shard, time_limit)
-            except TimeoutError:
-                reason = f"took longer than {time_limit if worker.ready else _START_TIMEOUT:g} s, and was stopped"
-                late = worker.ready
-            except (EOFError, OSError):
-                worker.process.join(5.0)
-                code = worker.process.exitcode
-                end = f"exit code {code}"
-                if code is not None and code < 0:
-                    end = f"signal {-code} ({signal.strsignal(-code)})"
-                reason = f"its worker ended {ATTEMPTS} times, at last with {end}"
-            else:
-                local.worker = worker
-                return file
-            local.worker = None
-            alive.discard(worker)
-            worker.end()
-            if worker.process.exitcode == _RUNS_THE_SCRIPT:
-                raise InputError(f"workers: got a script that each worker runs as it starts, want {_GUARD}")
-            died, failed_starts = died + worker.ready, 0 if worker.ready else failed_starts + 1
-            if failed_starts == ATTEMPTS:
-                raise InputError(f"workers: got processes that do not start ({reason}), want {_GUARD}")
-            if late or died == ATTEMPTS:
-                return job.failed(shard, reason)
-        return b""  # nobody reads it
-
-    threads = ThreadPoolExecutor(max(workers, 1))
+    waiting, busy = deque(map(_Task, shards)), dict[Any, _Worker]()
     try:
-        running = {threads.submit(run, shard): shard for shard in shards}
-        for done in as_completed(running):
-            yield running.pop(done), done.result()
+        while waiting or busy:
+            while waiting and len(busy) < max(workers, 1):
+                worker = _Worker(job, waiting.popleft(), time_limit)
+                busy[worker.connection] = worker
+            wait(busy, max(min(worker.deadline for worker in busy.values()) - time.monotonic(), 0.0))
+            for worker in [*busy.values()]:
+                task = worker.task
+                try:
+                    file = worker.receive()
+                except (EOFError, OSError) as error:
+                    file = task.failed(worker, error)
+                    del busy[worker.connection]
+                    worker.end()
+                    if file is None:
+                        waiting.appendleft(task)
+                else:
+                    if file is not None and waiting:
+                        worker.begin(waiting.popleft())
+                    elif file is not None:
+                        del busy[worker.connection]
+                        worker.end()
+                if file is not None:
+                    yield task.shard, file
     finally:
-        ending.set()
-        for worker in [*alive]:
-            worker.process.kill()  # its thread sees the end of the pipe
-        threads.shutdown(cancel_futures=True)
-        for worker in alive:
+        for worker in busy.values():
             worker.end()
+
+
+@dataclass
+class _Task:
+    """A shard to be run in processes, and how often that has failed."""
+
+    shard: Shard
+    died: int = 0
+    failed_starts: int = 0  # one after the other
+
+    def failed(self, worker: "_Worker", error: Exception) -> bytes | None:
+        """The file of a shard that has failed too often, or None. Raises InputError if no worker starts."""
+        if late := isinstance(error, TimeoutError):
+            reason = f"took longer than {worker.time_limit if worker.ready else _START_TIMEOUT:g} s, and was stopped"
+        else:
+            worker.process.join(5.0)
+            code = worker.process.exitcode
+            end = f"exit code {code}"
+            if code is not None and code < 0:
+                end = f"signal {-code} ({signal.strsignal(-code)})"
+            reason = f"its worker ended {ATTEMPTS} times, at last with {end}"
+            if code == _RUNS_THE_SCRIPT:
+                raise InputError(f"workers: got a script that each worker runs as it starts, want {_GUARD}") from None
+        self.died += worker.ready
+        self.failed_starts = 0 if worker.ready else self.failed_starts + 1
+        if self.failed_starts == ATTEMPTS:
+            raise InputError(f"workers: got processes that do not start ({reason}), want {_GUARD}") from None
+        if self.died == ATTEMPTS or (late and worker.ready):
+            return worker.job.failed(self.shard, reason)
+        return None
 
 
 def end_if_started_by_import() -> None:
@@ -165,28 +177,36 @@ class _Worker:
     and if the process dies before it reads them, the writer waits forever.
     """
 
-    def __init__(self, job: Job) -> None:
-        self.job, self.ready = job, False
+    def __init__(self, job: Job, task: _Task, time_limit: float) -> None:
+        self.job, self.task, self.time_limit = job, task, time_limit  # s
+        self.ready, self.deadline = False, time.monotonic() + _START_TIMEOUT
         self.connection, theirs = _context.Pipe()
         self.process = _context.Process(target=_serve, args=(theirs,), name=_NAME, daemon=True)
         with _starting, _worker_environment(), _without_ctrl_c():
             self.process.start()
         theirs.close()  # then the end of the process closes the pipe
 
-    def run(self, shard: Shard, time_limit: float) -> bytes:
-        """The shard's file. Raises EOFError or OSError if the process dies, and TimeoutError."""
-        if not self.ready:
-            self._hear(_START_TIMEOUT)
+    def receive(self) -> bytes | None:
+        """The file of its shard, or None before. Raises EOFError or OSError if the process has died; TimeoutError."""
+        if not self.connection.poll():
+            if time.monotonic() > self.deadline:
+                raise TimeoutError
+            return None
+        message = self.connection.recv()
+        if self.ready:
+            return message
+        if message == "started":
+            self.deadline = time.monotonic() + _START_TIMEOUT
             self.connection.send(self.job)
-            self._hear(_START_TIMEOUT)
+        else:
             self.ready = True
-        self.connection.send(shard)
-        return self._hear(time_limit)
+            self.begin(self.task)
+        return None
 
-    def _hear(self, seconds: float) -> Any:
-        if not self.connection.poll(seconds):
-            raise TimeoutError
-        return self.connection.recv()
+    def begin(self, task: _Task) -> None:
+        self.task, self.deadline = task, time.monotonic() + self.time_limit
+        with contextlib.suppress(OSError):  # if the process has died, the next to receive from it sees that
+            self.connection.send(task.shard)
 
     def end(self) -> None:
         """Stop the process, even in the middle of a task."""
@@ -274,7 +294,7 @@ def connected(address: str) -> Iterator[Any]:
 
 def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float) -> FinishedShards:
     """Run the shards on the cluster; yield each shard with its file. Raises InputError if the scheduler is lost."""
-    from distributed import wait
+    import distributed
 
     waiting = iter(shards)
     submitted: dict[Any, Shard] = {}
@@ -291,7 +311,7 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
             if not submitted:
                 return
             with contextlib.suppress(TimeoutError), client.as_current():
-                wait(list(submitted), timeout=_POLL, return_when="FIRST_COMPLETED")
+                distributed.wait(list(submitted), timeout=_POLL, return_when="FIRST_COMPLETED")
             for future, shard in list(submitted.items()):
                 if future.done():
                     del submitted[future]
