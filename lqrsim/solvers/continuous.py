@@ -206,101 +206,6 @@ def _pieces(solution: Any, sample: Callable[[float, Array], Array]) -> PPoly:
     return PPoly(np.einsum("kj,ijs->kis", _FIT, points) / scale.T[:, :, None], knots)
 
 
-class System:
-    """A problem in continuous time: its compiled functions, with the stage cost per second."""
-
-    def __init__(self, problem: Problem) -> None:
-        costs, data, dynamics = compiled.costs_module(problem), compiled.arguments(problem), problem.dynamics
-        self.n, self.m = n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        self.dt, self.horizon = problem.dt, problem.steps * problem.dt
-        self.knots = np.linspace(0.0, self.horizon, problem.steps + 1)
-        self._steps, self._last, self._data = problem.steps, max(problem.steps - 1, 1), data
-        self._none = np.zeros(m)
-        # Buffers into which compiled code writes.
-        self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
-        self._hessian, self._gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
-        self._parameters = data.dynamics.parameters
-        self._linearize = dynamics.compiled.lay_out(
-            "rate_jacobian", self._f, self._none, self._parameters, self._f, self._fx, self._fu
-        )
-        self._quadratize = costs.lay_out(
-            "cost_quadratic", self._f, self._none, 1, data.stage, self._hessian, self._gradient
-        )
-
-    def _expand(self, t: float, x: Array, u: Array) -> float:
-        """Expand dynamics and stage cost about (x, u), in place; returns the cost. All are per second."""
-        self._linearize(x, u, self._parameters, self._f, self._fx, self._fu)
-        step = min(max(int(t / self.dt), 1), self._last)
-        value = self._quadratize(x, u, step, self._data.stage, self._hessian, self._gradient)
-        self._hessian /= self.dt
-        self._gradient /= self.dt
-        return value / self.dt
-
-    def end_value(self, which: str, x: Array) -> float:
-        """The `initial` or `final` cost; its derivatives are left in the buffers."""
-        return self._quadratize(x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
-
-    def end_model(self, which: str, x: Array) -> Array:
-        """The `initial` or `final` cost, quadratised at x, as V. Paper: Eqs. (23), (31)."""
-        value = self.end_value(which, x)
-        hessian, gradient = self._hessian[: self.n, : self.n], self._gradient[: self.n]
-        slope = gradient - hessian @ x
-        return bordered(hessian, slope, value - 0.5 * float(x @ (gradient + slope)))
-
-    def model(self, other: Pass, prior: InitialPrior | None) -> Callable[[float, Array], Model]:
-        """The model of a pass, about the states of least total cost and the policy of the `other` pass.
-
-        Paper: Eqs. (24)-(29), (32).
-        """
-
-        def about(t: float, V: Array) -> Model:
-            theirs, law = other.at(t)
-            x = minimizer(V + theirs, t)
-            u = law[:, :-1] @ x + law[:, -1]
-            value = self._expand(t, x, u)
-            if prior is not None:
-                # Rounding may put the horizon a little after the last step.
-                weight, error = prior.weight / self.dt, x - prior.at(min(t / self.dt, self._steps))
-                self._hessian[range(self.n), range(self.n)] += weight
-                self._gradient[: self.n] += weight * error
-                value += 0.5 * float(error @ (weight * error))
-            return homogeneous(self._fx, self._fu, self._f, self._hessian, self._gradient, value, x, u)
-
-        return about
-
-    def rollout(self, start: Array, policy: Pass, tolerances: Tolerances) -> tuple[float, PPoly]:
-        """Run a policy under the true dynamics; return its cost, and its states (n,) as a function of time."""
-
-        def rate(t: float, y: Array) -> Array:
-            x = y[: self.n]
-            law = policy.at(t)[1]
-            cost = self._expand(t, x, law[:, :-1] @ x + law[:, -1])
-            return np.append(self._f, cost)
-
-        solution = integrate(rate, np.append(start, self.end_value("initial", start)), (0.0, self.horizon), tolerances)
-        cost = solution.y[-1, -1] + self.end_value("final", np.ascontiguousarray(solution.y[:-1, -1]))
-        return float(cost), _pieces(solution, lambda t, y: y[: self.n])
-
-    def decrease(self, states: PPoly, policy: Pass, tolerances: Tolerances) -> float:
-        """The decrease of cost that a linear-quadratic model about a rollout predicts."""
-        still, no_control = np.zeros(self.n), np.zeros(self.m)
-
-        def deviation(t: float, _: Array) -> Model:
-            """The model in deviations from the rollout, so that no constants cancel."""
-            x, law = states(t), policy.at(t)[1]
-            self._expand(t, x, law[:, :-1] @ x + law[:, -1])
-            return homogeneous(self._fx, self._fu, still, self._hessian, self._gradient, 0.0, still, no_control)
-
-        def end(which: str, x: Array) -> Array:
-            self.end_value(which, x)
-            return bordered(self._hessian[: self.n, : self.n], self._gradient[: self.n], 0.0)
-
-        last, first = states(self.horizon), states(0.0)
-        backward = riccati_pass(deviation, end("final", last), self.horizon, backward=True, tolerances=tolerances)
-        total = backward.at(0.0)[0] + end("initial", first)
-        return float(-0.5 * total[-1, -1] - 0.5 * total[-1, :-1] @ minimizer(total, 0.0))
-
-
 @checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContinuousSolution:
@@ -558,7 +463,7 @@ def smooth_continuous(
     for function in functions:
         function.forget()
     solver = _Smoother(problem, state, control, prior, tolerances)
-    iterations, status, detail = _iterate(solver, tolerance, gap_tolerance, max_iterations, functions, callback)
+    iterations, status, detail = solver.iterate(tolerance, gap_tolerance, max_iterations, functions, callback)
     if (error := interrupt_of(functions)) is not None:
         raise error
     raised = raised_by(functions)
@@ -567,7 +472,7 @@ def smooth_continuous(
         remedy = "raise the control weight" if FLAT in detail else "solve with smooth, whose steps only lower the cost"
     return ContinuousSolution(
         status=status, detail=f"{detail}; {raised}" if detail and raised else detail, remedy=remedy,
-        horizon=solver.system.horizon, iterations=tuple(iterations),
+        horizon=solver.horizon, iterations=tuple(iterations),
         _backward=solver.backward, _forward=solver.forward,
     )  # fmt: skip
 
@@ -583,107 +488,187 @@ def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None)
     return check_array("start", wanted, (len(problem.dynamics.control_coordinates),)), prior
 
 
-def _iterate(
-    solver: "_Smoother", tolerance: float, gap_tolerance: float, most: int, functions: list[UserFunction],
-    callback: Callable[[Iteration], object] | None,
-) -> tuple[list[Iteration], Status, str]:  # fmt: skip
-    """Iterate until convergence, `most` times at most; return the log, the status, and where it failed."""
-    iterations: list[Iteration] = []
-    for number in range(1, most + 1):
-        clock, last = time.perf_counter(), number == most
-        try:
-            solver.passes()
-        except IntegrationFailure as failure:
-            return iterations, failure.status, _at(f"{solver.where} of iteration {number}", failure)
-        escape = solver.rollout()
-        before = iterations[-1].cost if iterations else math.inf
-        # A cost below the tolerance is noise of the integrator.
-        improvement = (before - solver.cost) / max(abs(solver.cost), solver.tolerances.atol)
-        settled = abs(improvement) < tolerance and solver.gap < gap_tolerance
-        row = Iteration(
-            cost=solver.cost, improvement=improvement, gap=solver.gap,
-            optimality=solver.optimality() if settled or last else math.nan, dynamics_residual=math.nan, violation=0.0,
-            seconds=time.perf_counter() - clock, method="smooth",
-        )  # fmt: skip
-        iterations.append(row)
-        if callback is not None:
-            callback(row)
-        if (error := interrupt_of(functions)) is not None:
-            raise error
-        if settled and row.optimality < tolerance:
-            return iterations, Status.CONVERGED, ""
-        if last and escape is not None:
-            return iterations, Status.DIVERGED, _at(f"rollout of iteration {number}", escape)
-    return iterations, Status.MAX_ITERATIONS, ""
-
-
 class _Smoother:
-    """Runs the iterations, and keeps the state between iterations.
+    """Runs the iterations for a problem in continuous time, whose stage cost is per second, and keeps their state.
 
     Attributes:
       forward, backward: the passes of the last iteration that completed both passes; None before.
-      where: the pass that is under way. cost, gap: of the last rollout; see `Iteration`.
+      horizon: the paper's l, in seconds.
     """
 
     def __init__(
         self, problem: Problem, state: Array, control: Array, prior: InitialPrior | None, tolerances: Tolerances
     ) -> None:
-        n, m = len(state), len(control)
-        self.system, self.tolerances = System(problem), tolerances
+        costs, data, dynamics = compiled.costs_module(problem), compiled.arguments(problem), problem.dynamics
+        self._n, self._m = n, m = len(state), len(control)
+        self._dt, self._steps, self.horizon = problem.dt, problem.steps, problem.steps * problem.dt
+        self._tolerances, self._data, self._none = tolerances, data, np.zeros(m)
+        # Buffers into which compiled code writes.
+        self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
+        self._hessian, self._gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
+        self._parameters = data.dynamics.parameters
+        self._linearize = dynamics.compiled.lay_out(
+            "rate_jacobian", self._f, self._none, self._parameters, self._f, self._fx, self._fu
+        )
+        self._quadratize = costs.lay_out(
+            "cost_quadratic", self._f, self._none, 1, data.stage, self._hessian, self._gradient
+        )
         self._prior, self._prior_left = prior, prior.iterations if prior is not None else 0
         self._x_hat = state  # at 0
         # Before the first pass there is no cost-to-go, and the policy applies the initial control.
         law = np.hstack([np.zeros((m, n)), control[:, None]])
-        self._to_go = Pass.constant(np.zeros((n + 1, n + 1)), law, self.system.horizon)
+        self._to_go = Pass.constant(np.zeros((n + 1, n + 1)), law, self.horizon)
         self.forward: Pass | None = None
         self.backward: Pass | None = None
-        self.where, self.cost, self.gap = "", math.nan, math.nan
+        self._where, self._cost, self._gap = "", math.nan, math.nan  # the pass that is under way; of the last rollout
         self._states: PPoly | None = None
 
-    def passes(self) -> None:
+    def iterate(
+        self, tolerance: float, gap_tolerance: float, most: int, functions: list[UserFunction],
+        callback: Callable[[Iteration], object] | None,
+    ) -> tuple[list[Iteration], Status, str]:  # fmt: skip
+        """Iterate until convergence, `most` times at most; return the log, the status, and where it failed."""
+        iterations: list[Iteration] = []
+        for number in range(1, most + 1):
+            clock, last = time.perf_counter(), number == most
+            try:
+                self._do_passes()
+            except IntegrationFailure as failure:
+                return iterations, failure.status, _at(f"{self._where} of iteration {number}", failure)
+            escape = self._roll_out()
+            before = iterations[-1].cost if iterations else math.inf
+            # A cost below the tolerance is noise of the integrator.
+            improvement = (before - self._cost) / max(abs(self._cost), self._tolerances.atol)
+            settled = abs(improvement) < tolerance and self._gap < gap_tolerance
+            row = Iteration(
+                cost=self._cost, improvement=improvement, gap=self._gap,
+                optimality=self._optimality() if settled or last else math.nan, dynamics_residual=math.nan,
+                violation=0.0, seconds=time.perf_counter() - clock, method="smooth",
+            )  # fmt: skip
+            iterations.append(row)
+            if callback is not None:
+                callback(row)
+            if (error := interrupt_of(functions)) is not None:
+                raise error
+            if settled and row.optimality < tolerance:
+                return iterations, Status.CONVERGED, ""
+            if last and escape is not None:
+                return iterations, Status.DIVERGED, _at(f"rollout of iteration {number}", escape)
+        return iterations, Status.MAX_ITERATIONS, ""
+
+    def _do_passes(self) -> None:
         """One pass forward and one backward. Paper: Secs. V-A and V-B. Raises IntegrationFailure."""
-        system, horizon, tolerances = self.system, self.system.horizon, self.tolerances
+        horizon = self.horizon
         prior, self._prior_left = self._prior if self._prior_left > 0 else None, self._prior_left - 1
-        self.where = "forward pass"
-        come = riccati_pass(
-            system.model(self._to_go, prior), system.end_model("initial", self._x_hat), horizon, backward=False,
-            tolerances=tolerances,
-        )  # fmt: skip
+        self._where = "forward pass"
+        come = self._pass(self._model(self._to_go, prior), self._end_model("initial", self._x_hat), backward=False)
         # Eq. (33). With c_l quadratised there, the next pass again begins at the minimiser, by Eq. (28) at l.
         x_end = minimizer(self._to_go.at(horizon)[0] + come.at(horizon)[0], horizon)
-        self.where = "backward pass"
-        go = riccati_pass(
-            system.model(come, prior), system.end_model("final", x_end), horizon, backward=True, tolerances=tolerances
-        )
+        self._where = "backward pass"
+        go = self._pass(self._model(come, prior), self._end_model("final", x_end), backward=True)
         first = go.at(0.0)[0]
         x_hat = minimizer(first + come.at(0.0)[0], 0.0)  # Eq. (30)
-        self._x_hat = minimizer(first + system.end_model("initial", x_hat), 0.0)
+        self._x_hat = minimizer(first + self._end_model("initial", x_hat), 0.0)
         self._to_go, self.forward, self.backward = go, come, go
 
-    def rollout(self) -> IntegrationFailure | None:
-        """Run the new policy and set `cost` and `gap`; infinite if it diverges. Returns the failure, if any."""
+    def _pass(self, model: Callable[[float, Array], Model], end: Array, *, backward: bool) -> Pass:
+        return riccati_pass(model, end, self.horizon, backward=backward, tolerances=self._tolerances)
+
+    def _expand(self, t: float, x: Array, u: Array) -> float:
+        """Expand dynamics and stage cost about (x, u), in place; returns the cost. All are per second."""
+        self._linearize(x, u, self._parameters, self._f, self._fx, self._fu)
+        step = min(max(int(t / self._dt), 1), max(self._steps - 1, 1))
+        value = self._quadratize(x, u, step, self._data.stage, self._hessian, self._gradient)
+        self._hessian /= self._dt
+        self._gradient /= self._dt
+        return value / self._dt
+
+    def _end_value(self, which: str, x: Array) -> float:
+        """The `initial` or `final` cost; its derivatives are left in the buffers."""
+        return self._quadratize(x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
+
+    def _end_model(self, which: str, x: Array) -> Array:
+        """The `initial` or `final` cost, quadratised at x, as V. Paper: Eqs. (23), (31)."""
+        value = self._end_value(which, x)
+        hessian, gradient = self._hessian[: self._n, : self._n], self._gradient[: self._n]
+        slope = gradient - hessian @ x
+        return bordered(hessian, slope, value - 0.5 * float(x @ (gradient + slope)))
+
+    def _model(self, other: Pass, prior: InitialPrior | None) -> Callable[[float, Array], Model]:
+        """The model of a pass, about the states of least total cost and the policy of the `other` pass.
+
+        Paper: Eqs. (24)-(29), (32).
+        """
+
+        def about(t: float, V: Array) -> Model:
+            theirs, law = other.at(t)
+            x = minimizer(V + theirs, t)
+            u = law[:, :-1] @ x + law[:, -1]
+            value = self._expand(t, x, u)
+            if prior is not None:
+                # Rounding may put the horizon a little after the last step.
+                weight, error = prior.weight / self._dt, x - prior.at(min(t / self._dt, self._steps))
+                self._hessian[range(self._n), range(self._n)] += weight
+                self._gradient[: self._n] += weight * error
+                value += 0.5 * float(error @ (weight * error))
+            return homogeneous(self._fx, self._fu, self._f, self._hessian, self._gradient, value, x, u)
+
+        return about
+
+    def _roll_out(self) -> IntegrationFailure | None:
+        """Run the new policy under the true dynamics, and set cost, gap and states, the first two infinite if it fails.
+
+        Returns the failure, if any.
+        """
         assert self.forward is not None
+        times, policy = np.linspace(0.0, self.horizon, self._steps + 1), self._to_go
+
+        def rate(t: float, y: Array) -> Array:
+            x = y[: self._n]
+            law = policy.at(t)[1]
+            cost = self._expand(t, x, law[:, :-1] @ x + law[:, -1])
+            return np.append(self._f, cost)
+
         try:
-            self.cost, self._states = self.system.rollout(self._x_hat, self._to_go, self.tolerances)
-            times = self.system.knots
-            total = self.forward.at(times)[0] + self._to_go.at(times)[0]
+            start = np.append(self._x_hat, self._end_value("initial", self._x_hat))
+            solution = integrate(rate, start, (0.0, self.horizon), self._tolerances)
+            end = self._end_value("final", np.ascontiguousarray(solution.y[:-1, -1]))
+            self._cost, self._states = float(solution.y[-1, -1] + end), _pieces(solution, lambda t, y: y[: self._n])
+            total = self.forward.at(times)[0] + policy.at(times)[0]
             x_hats = np.array([minimizer(V, t) for V, t in zip(total, times.tolist(), strict=True)])
         except IntegrationFailure as failure:
-            self.cost, self.gap, self._states = math.inf, math.inf, None
+            self._cost, self._gap, self._states = math.inf, math.inf, None
             return failure
         states = self._states(times)
-        self.gap = float((np.abs(x_hats - states).max(axis=0) / np.maximum(np.ptp(states, axis=0), 1.0)).max())
+        self._gap = float((np.abs(x_hats - states).max(axis=0) / np.maximum(np.ptp(states, axis=0), 1.0)).max())
         return None
 
-    def optimality(self) -> float:
-        """See `Iteration.optimality`; infinite if a model about the rollout has no minimum."""
-        if self._states is None:
+    def _optimality(self) -> float:
+        """The decrease of cost that a linear-quadratic model about the rollout predicts; see `Iteration.optimality`.
+
+        Infinite if that has no minimum.
+        """
+        states, policy, still = self._states, self._to_go, np.zeros(self._n)
+        if states is None:
             return math.inf
+
+        def deviation(t: float, _: Array) -> Model:
+            """The model in deviations from the rollout, so that no constants cancel."""
+            x, law = states(t), policy.at(t)[1]
+            self._expand(t, x, law[:, :-1] @ x + law[:, -1])
+            return homogeneous(self._fx, self._fu, still, self._hessian, self._gradient, 0.0, still, self._none)
+
+        def end(which: str, t: float) -> Array:
+            self._end_value(which, states(t))
+            return bordered(self._hessian[: self._n, : self._n], self._gradient[: self._n], 0.0)
+
         try:
-            decrease = self.system.decrease(self._states, self._to_go, self.tolerances)
+            backward = self._pass(deviation, end("final", self.horizon), backward=True)
+            total = backward.at(0.0)[0] + end("initial", 0.0)
+            decrease = float(-0.5 * total[-1, -1] - 0.5 * total[-1, :-1] @ minimizer(total, 0.0))
         except IntegrationFailure:
             return math.inf
-        return decrease / max(abs(self.cost), self.tolerances.atol)
+        return decrease / max(abs(self._cost), self._tolerances.atol)
 
 
 def _at(where: str, failure: IntegrationFailure) -> str:
