@@ -81,7 +81,7 @@ FLOORS_WITHIN = {
         ("curvature",),
         ("engine", "interior_point", "parallel"),
         ("assembly", "augmented_lagrangian", "contact_modes", "multistart"),
-        ("control_rates", "interior_run", "restoration", "risk", "tree", "ways"),
+        ("control_rates", "interior_run", "risk", "tree", "ways"),
         ("between_knots", "constrained", "free_duration", "reach"),
         ("strategy",),
     ),

@@ -19,9 +19,8 @@ from lqrsim.solvers import augmented_lagrangian
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import STRONG, WEAK, Barrier
+from lqrsim.solvers.interior_point import STRONG, WEAK, Barrier, Restored, restore
 from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
-from lqrsim.solvers.restoration import Restored, restore
 from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Sizes
 

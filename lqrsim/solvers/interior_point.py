@@ -1,12 +1,12 @@
-"""The interior point and the active set of `kernels/` from one plan.
+"""The interior point, the restoration and the active set of `kernels/` from one plan.
 
-An interior point runs in slices between which its caller is told, an active set in pieces short enough for a deadline.
+The first two run in slices between which their caller is told, an active set in pieces short enough for a deadline.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,11 +14,11 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels import active_set
-from lqrsim.kernels.declarations import CONVERGED, RUNNING
+from lqrsim.kernels.declarations import CONVERGED, NO_PROGRESS, NOT_FINITE, RUNNING
 from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SCALE
-from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning, StructuredArray
+from lqrsim.kernels.records import MEASURES, RESTORED, Motion, PlanBeginning, StructuredArray
 from lqrsim.problem.derivative_check import functions_of
-from lqrsim.problem.problem import FixedState
+from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.solvers.budget import ATTENTION, Laps
 from lqrsim.solvers.settings import INSIDE
@@ -126,7 +126,6 @@ class InteriorPoint:
           watch: called with the measures of each iteration, and its seconds; True ends the run.
           hurried: whether it is to be called after each iteration, rather than after `ATTENTION` seconds.
         """
-        functions = functions_of(self._stages.problem)
         self._log = np.zeros(most, MEASURES)
         if len(self._arrays.filter) < most:  # like the log, the filter gets a row at each iteration
             self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
@@ -138,18 +137,14 @@ class InteriorPoint:
             self._iterations = 1
             watch(Measures.of(self._memory), time.perf_counter() - clock)
             return self._result(True)
-        outcome, ended, bite = RUNNING, False, 1
-        while outcome == RUNNING and not ended and self._iterations < most:
-            first, clock = self._iterations, time.perf_counter()
-            done, outcome = self._call(ITERATE, min(first + bite, most))
-            seconds = (time.perf_counter() - clock) / max(done - first, 1)
-            self._iterations = done
-            for row in self._log[first:done].tolist():
-                ended = watch(Measures(*row), seconds) or ended
-            if error := interrupt_of(functions):
-                raise error
-            if not hurried and not functions:
-                bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
+        outcome = RUNNING
+        slices = _in_slices(
+            self._stages.problem, self._log, lambda _, last: self._call(ITERATE, last),
+            lambda row, seconds: watch(Measures(*row), seconds), hurried=hurried,
+        )  # fmt: skip
+        for self._iterations, outcome, _ in slices:
+            if outcome != RUNNING:
+                break
         if outcome == RUNNING:
             self._call(CLOSE, self._iterations)
         return self._result(bool(self._memory["solved"][0]) or self._rests())
@@ -178,6 +173,73 @@ class InteriorPoint:
             pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self._sizes,
             scale=float(self._memory["scale"][0]),
         )  # fmt: skip
+
+
+def _in_slices(
+    problem: Problem, log: StructuredArray, run: Callable[[int, int], tuple[int, int]],
+    watch: Callable[[tuple[Any, ...], float], bool], *, hurried: bool,
+) -> Iterator[tuple[int, int, bool]]:  # fmt: skip
+    """Run iterations as long as the log has room. After each slice, their number, the outcome, and whether it is over.
+
+    It is over once `watch` is true for one of the slice's rows in the log and its seconds. If `hurried`, a slice is one
+    iteration, else some of `ATTENTION` seconds.
+    """
+    functions, done, over, size = functions_of(problem), 0, False, 1
+    while not over and done < len(log):
+        first, clock = done, time.perf_counter()
+        done, outcome = run(first, min(first + size, len(log)))
+        seconds = (time.perf_counter() - clock) / max(done - first, 1)
+        for row in log[first:done].tolist():
+            over = watch(row, seconds) or over
+        if error := interrupt_of(functions):
+            raise error
+        if not hurried and not functions:
+            size = max(1, int(ATTENTION / max(seconds, 1e-9)))
+        yield done, outcome, over
+
+
+class Restored(NamedTuple):
+    """A trajectory, and two facts about it."""
+
+    plan: Motion
+    stationary: bool  # whether its violation is
+    near: bool  # whether it is nearly feasible
+
+
+def restore(
+    stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
+    watch: Callable[[float, float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
+    hurried: bool = True,
+) -> Restored | None:  # fmt: skip
+    """Descend from the rollout of a plan's controls (T, m); None if a trajectory is not finite, or there is no step.
+
+    Args:
+      price: of violating a constraint by its typical size, in units of the typical cost.
+      watch: called with cost, violation, relative predicted decrease and seconds of each iteration; True ends it.
+      stationary: called once the predicted decrease is negligible; returns whether the violation of a trajectory is
+        stationary, which ends it. It gets each constraint's multipliers relative to the price, (T+1, rows), in -1 to 1.
+      hurried: as in `InteriorPoint.run`.
+    """
+    work, memory = stages.restoration
+    stages.resize(sizes)
+    work.plan.states[...], work.plan.controls[...] = plan
+    log, price = np.zeros(most, RESTORED), float(price * sizes.cost)
+
+    def run(first: int, last: int) -> tuple[int, int]:
+        return stages.call("restoration", first, last, price, stages.about, work, memory, log)
+
+    run(0, 0)
+    outcome, at_minimum = RUNNING, False
+    watched = _in_slices(stages.problem, log, run, lambda row, seconds: watch(*row, seconds), hurried=hurried)
+    for _, outcome, over in watched:
+        if outcome == NO_PROGRESS and not over:
+            shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
+            at_minimum = stationary(Motion(*map(np.copy, work.plan)), shares)
+        if at_minimum or outcome not in (RUNNING, NO_PROGRESS):
+            break
+    if outcome == NOT_FINITE:
+        return None
+    return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["nearly_feasible"][0]))
 
 
 class ActiveSet:

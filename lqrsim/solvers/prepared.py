@@ -26,10 +26,9 @@ from lqrsim.solvers.constrained import ConstrainedRun, Known
 from lqrsim.solvers.control_rates import feedback, narrowed, widened
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
-from lqrsim.solvers.interior_point import WEAK, ActiveSet, Barrier, InteriorPoint, Measures
+from lqrsim.solvers.interior_point import WEAK, ActiveSet, Barrier, InteriorPoint, Measures, restore
 from lqrsim.solvers.interior_run import copied
 from lqrsim.solvers.parallel import check_threads
-from lqrsim.solvers.restoration import restore
 from lqrsim.solvers.settings import FINE, SmootherSettings
 from lqrsim.solvers.stages import Sizes
 
