@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from copy import deepcopy
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -74,8 +74,8 @@ def assemble(
         detail="; ".join(part for part in said if part),
         remedy=remedy_of(problem, result, log, options, shorter=shorter),
         policy=policy(*law, nominal[:-1]),
-        cost_to_go=copy_of(result.values.get("cost_to_go")),
-        cost_to_come=copy_of(result.values.get("cost_to_come")),
+        cost_to_go=deepcopy(result.values.get("cost_to_go")),
+        cost_to_come=deepcopy(result.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=tuple(log),
         certificate=result.certificate,
@@ -300,13 +300,6 @@ def _flat_controls(problem: Problem, result: RunResult) -> list[str]:
     stage = compiled.arguments(problem).stage
     _, _, hessian = compiled.quadratic_at(problem, stage, result.states[0], result.controls[0], 0)
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
-
-
-def copy_of(value: Any) -> Any:
-    """A copy of a value function; None for None."""
-    if value is None:
-        return None
-    return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
 
 
 def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:

@@ -11,6 +11,7 @@ So each control is charged for the changes before and after it, whatever the con
 """
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -29,7 +30,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
-from lqrsim.solvers.assembly import clearance_of, copy_of, parts_of
+from lqrsim.solvers.assembly import clearance_of, parts_of
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, is_function, resolve
@@ -96,7 +97,7 @@ def _gains(
     with problem.dynamics.quiet():
         if np.isfinite(run.linearize_about_plan()):
             gain = run.work.arrays.policy.gain.copy()
-            cost_to_go = copy_of(Quadratic(*run.work.arrays.to_go))
+            cost_to_go = deepcopy(Quadratic(*run.work.arrays.to_go))
     run.give_back()
     return gain, cost_to_go
 

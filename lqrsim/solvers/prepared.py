@@ -1,6 +1,7 @@
 """Repeated solves in real time: everything is compiled beforehand, and each solve ends by its deadline."""
 
 import time
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.solution_parts import Iteration, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
-from lqrsim.solvers.assembly import clearance_of, copy_of, goal_radius_of
+from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.constrained import ConstrainedRun, Known
@@ -207,7 +208,7 @@ class PreparedSolver(OneVersion):
             status=result.status, detail=result.detail, improved=best.improved,
             policy=compiled.policy_of(problem, gain, offset, states[:-1].copy()),
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
-            violation=best.violation, cost_to_go=copy_of(best.cost_to_go), multipliers=best.multipliers,
+            violation=best.violation, cost_to_go=deepcopy(best.cost_to_go), multipliers=best.multipliers,
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
             seconds=time.perf_counter() - clock, iterating=best.rolling_out + sum(seconds),
         )  # fmt: skip
