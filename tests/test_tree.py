@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sampling import examples
 from scipy.integrate import solve_ivp
 
 import lqrsim as ls
@@ -186,6 +189,18 @@ def test_the_metric_is_the_least_cost_of_time_and_controls(pushed_trap: ls.Probl
         wanted = np.concatenate([np.zeros(2 * steps), (target - drift) / spread])
         least = np.linalg.lstsq(rows, wanted, rcond=None)[0]
         assert found == pytest.approx(steps + np.sum((rows @ least - wanted) ** 2) / 2, rel=1e-8)
+
+
+@settings(max_examples=examples(20))
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, -1]))
+def test_short_plans_stay_as_they_are_while_others_are_made(pushed_trap: ls.Problem, seed: int, sign: int) -> None:
+    """Others may be of another thread, and have the memory that the first one gave back."""
+    planner = LocalPlanner(pushed_trap, np.zeros(4), np.ones(4), 10)
+    ends = np.random.default_rng(seed).normal(size=(4, 4))
+    plan, come = planner._smoothed(ends[0], sign, 8, 3, ends[1])
+    before = [array.copy() for array in (*plan, *come)]
+    planner._smoothed(ends[2], sign, 8, 3, ends[3])
+    assert all(map(np.array_equal, (*plan, *come), before))
 
 
 def test_without_a_goal_or_steps_backwards_there_is_no_way(pushed_trap: ls.Problem) -> None:

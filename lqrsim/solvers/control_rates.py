@@ -92,7 +92,7 @@ def _gains(
     """Gains (T, m, n) about a finite plan, and the cost-to-go; zeros and None if there are none."""
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
     guess = InitialGuess(gain, controls, multipliers=multipliers)
-    run = SolveRun.lent(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
+    run = SolveRun(problem, SmootherSettings(), guess, states[0].copy(), Budget(1))
     run.work.set_best(Motion(states, controls), compiled.cost_of(problem, states, controls))
     with problem.dynamics.quiet():
         if np.isfinite(run.linearize_about_plan()):

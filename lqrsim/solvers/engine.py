@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import Call, in_c_order
+from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
@@ -135,7 +135,7 @@ class SolveRun:
     """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
-      initial_guess: the start. work: the memory. budget: the iterations and the time. entry: the compiled function.
+      initial_guess: the start. work: the memory. budget: the iterations and the time.
       ending: the state of smoothing or iLQR; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method, or with constraints the interior point, ends the solve. final, rough: the
         tolerances of the answer, and of the smoothing before it; see `SmootherSettings`.
@@ -145,46 +145,28 @@ class SolveRun:
         self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
         entry: str = "smoother",
     ) -> None:  # fmt: skip
-        self.problem, self.settings, self.entry = problem, settings, entry
+        """If possible in memory that an earlier run gave back, whose result this overwrites."""
         if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
-        self.work = Workspace(problem, settings, initial_guess, start)
-        self._begin(initial_guess, budget)
-        self._loop = self.work.core.lay_out(entry, *self._arguments(0, 0, self._rows))
-
-    @classmethod
-    def lent(
-        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
-        entry: str = "smoother",
-    ) -> "SolveRun":  # fmt: skip
-        """A run, if possible in memory that an earlier solve gave back, whose result it overwrites."""
-        wanted = entry, compiled.core(problem, settings.form), problem.steps
-        run = None
-        if settings.first_pass == "forward":
-            run = _pool.take(lambda idle: (idle.entry, idle.work.core, idle.problem.steps) == wanted)
-        if run is None:
-            return cls(problem, settings, initial_guess, start, budget, entry)
-        run.problem, run.settings = problem, settings
-        run.work.begin(problem, settings, initial_guess, start)
-        run._begin(initial_guess, budget)
-        return run
-
-    def give_back(self) -> None:
-        self._release_stages()
-        _pool.give_back(self, self.problem)
-
-    def _begin(self, initial_guess: InitialGuess, budget: Budget) -> None:
-        self.initial_guess, self.budget = initial_guess, budget
+        self.problem, self.settings, self.initial_guess, self.budget = problem, settings, initial_guess, budget
+        kind = entry, compiled.core(problem, settings.form), problem.steps
+        self.work = _pool.take(lambda idle: idle.kind == kind) or Workspace(problem, settings.form, entry)
+        self.work.begin(problem, settings, initial_guess, start)
         self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
         self._last: Iteration | None = None  # the last iteration of smoothing
         self.ending = Ending(declarations.RUNNING)
-        settings, problem = self.settings, self.problem
         self.second_order = settings.second_order(problem)
         self.final, self.rough = settings.final(problem), settings.rough(problem)
         self._valley = VALLEY if self.second_order and has_curvature(problem) else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
         self._fractions = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
+        self._loop = self.work.laid_out(self.work.core, entry, *self._arguments(0, 0, self._rows))
+
+    def give_back(self) -> None:
+        """Let later runs have the memory."""
+        self._release_stages()
+        _pool.give_back(self.work, self.problem)
 
     @property
     def cost(self) -> float:
@@ -662,9 +644,6 @@ class SolveRun:
         return self.work.violation(self.work.constraint_values(plan)) if self.problem.constraints else 0.0
 
 
-_pool = Pool[SolveRun]()
-
-
 class Workspace:
     """The memory of a run, which its iterations read and write.
 
@@ -673,24 +652,29 @@ class Workspace:
         `MEMORY`; memory_rows: (1,) that row.
       multipliers: multipliers of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
-        that a line search from the best plan tries. core: the compiled iterations.
+        that a line search from the best plan tries. core: the compiled iterations. kind: what its runs have in common.
       fixed: whether the start is given exactly.
     """
 
-    def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        self._dual = settings.form == "dual"
-        self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
-        self._evaluation: Call | None = None
-        self._rollout: Call | None = None
+    def __init__(self, problem: Problem, form: str, entry: str) -> None:
+        self._dual, self._calls = form == "dual", dict[str, Call]()
+        self.core, self._costs = compiled.core(problem, form), compiled.costs_module(problem)
+        self.kind = entry, self.core, problem.steps
         self.memory_rows = np.zeros(1, records.MEMORY)
         self.memory = self.memory_rows[0]
-        sizes = {"T": problem.steps, "N": len(start), "M": initial_guess.offset.shape[1]}
+        space, controls = problem.dynamics.state_coordinates, problem.control_coordinates
+        sizes = {"T": problem.steps, "N": len(space), "M": len(controls)}
         self.no_prior = zeros_of(Prior, **sizes)
         stated = {"homotopy_scaled": None, "prior": self.no_prior, "certificate": np.zeros(1, CERTIFICATE)}
         self.arrays = zeros_of(records.SmootherArrays, stated, **sizes, S=problem.steps if self._dual else 1)
         self.start, self.trial = self.arrays.start, zeros_of(Motion, **sizes)
         self.best, self.last = self.arrays.best, self.arrays.last
-        self.begin(problem, settings, initial_guess, start)
+
+    def laid_out(self, module: CompiledModule, name: str, *arguments: Any) -> Call:
+        """The call of a compiled function, whose arguments are laid out once."""
+        if name not in self._calls:
+            self._calls[name] = module.lay_out(name, *arguments)
+        return self._calls[name]
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve. The memory may have served another solve of the same size and number of steps."""
@@ -775,21 +759,16 @@ class Workspace:
     def roll_out(self, policy: Policy, state: Array) -> Motion:
         plan = Motion(np.empty_like(self.last.states), np.empty_like(self.last.controls))
         of = self._problem.steps, in_c_order(state), Policy(*map(in_c_order, policy)), self.model, plan
-        if self._rollout is None:
-            self._rollout = self.core.lay_out("rollout", *of)
         with self._problem.dynamics.quiet():
-            self._rollout(*of)
+            self.laid_out(self.core, "rollout", *of)(*of)
         return plan
 
     def constraint_values(self, plan: Motion) -> list[Array]:
         """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero if it does not act."""
         values = [np.empty_like(multipliers.values) for multipliers in self.multipliers]
         if values:
-            constraints = self.model.stage.constraints
-            of = self._problem.steps, *map(in_c_order, plan), constraints, tuple(values)
-            if self._evaluation is None:
-                self._evaluation = self._costs.lay_out("evaluate_constraints", *of)
-            self._evaluation(*of)
+            of = self._problem.steps, *map(in_c_order, plan), self.model.stage.constraints, tuple(values)
+            self.laid_out(self._costs, "evaluate_constraints", *of)(*of)
         return [numbers.reshape(self._problem.steps + 1, -1) for numbers in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
@@ -807,6 +786,9 @@ class Workspace:
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
         pairs = zip((multipliers.term for multipliers in self.multipliers), values, strict=True)
         return self.priced or all(violation_of(term, numbers) <= allowed(term) for term, numbers in pairs)
+
+
+_pool = Pool[Workspace]()
 
 
 def _cost_of(iteration: Iteration | None) -> float:

@@ -184,7 +184,7 @@ class PreparedSolver(OneVersion):
             stop.deadline = clock + time_limit
         budget = Budget(self.settings.max_iterations, stop)
         begin = np.asarray(state, dtype=np.float64)
-        run = SolveRun.lent(problem, self.settings, resolve(start, problem), begin, budget)
+        run = SolveRun(problem, self.settings, resolve(start, problem), begin, budget)
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
             if problem.constraints and run.second_order:

@@ -306,7 +306,7 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
         start = problem.start.copy()
         check_functions(problem, start, guess.offset[0].copy())
         options = SmootherSettings(stop=settings.stop, tolerance=settings.tolerance, finish=None)
-        run = SolveRun.lent(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
+        run = SolveRun(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
         run.work.fixed = True  # if by the initial cost alone
     with stop.reporting("ilqr"):
         ending = run.ilqr()

@@ -124,7 +124,7 @@ def _search(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: 
         first = resolve(starts[0][1], problem).penalised(problem, settings.penalty)
         check_functions(problem, start, first.offset[0].copy())
         runs = [
-            SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop))
+            SolveRun(problem, settings, guess, start, Budget(settings.max_iterations, stop))
             for guess in (first, *(resolve(choice, problem) for _, choice in starts[1:]))
         ]
     is_plan = settings.start is not None and first.prior is None and first.interior is None
@@ -158,7 +158,7 @@ def outlined(
         guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
         check_functions(free, start, guess.offset[0].copy())
-        run = SolveRun.lent(free, rough, guess, start, budget)
+        run = SolveRun(free, rough, guess, start, budget)
     budget.report_to(stop.callback)
     with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
         run.smooth(OUTLINED)

@@ -14,6 +14,7 @@ and controls with which the linearised system is in a state at that step. So it 
 
 import itertools
 from collections.abc import Iterator
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -192,9 +193,8 @@ class LocalPlanner:
 
     def plan(self, state: Array, target: Array, sign: int, steps: int) -> Motion:
         """A plan from a state towards a target, forwards or backwards in time; empty if it is not finite."""
-        states, controls = map(np.copy, self._smoothed(state, sign, steps, ITERATIONS, target).work.last)
-        good = np.isfinite(states).all()
-        return Motion(states, controls) if good else Motion(states[:0], controls[:0])
+        plan, _ = self._smoothed(state, sign, steps, ITERATIONS, target)
+        return plan if np.isfinite(plan.states).all() else Motion(plan.states[:0], plan.controls[:0])
 
     def free_until(self, states: Array) -> int:
         """The number of first states (K, n) up to which nothing is violated, there and in the middles between."""
@@ -209,19 +209,22 @@ class LocalPlanner:
 
     def _come(self, state: Array, sign: int) -> CostToCome:
         """The cost-to-come about the nominal control, at up to as many steps as an extension may take."""
-        return self._smoothed(state, sign, int(self.arrivals[-1]), 1, None).work.arrays.to_come
+        return self._smoothed(state, sign, int(self.arrivals[-1]), 1, None)[1]
 
-    def _smoothed(self, state: Array, sign: int, steps: int, iterations: int, target: Array | None) -> SolveRun:
-        """A run after so many iterations, whose memory the next one overwrites."""
+    def _smoothed(
+        self, state: Array, sign: int, steps: int, iterations: int, target: Array | None
+    ) -> tuple[Motion, CostToCome]:
+        """The plan and the cost-to-come after so many iterations."""
         problem = self._free._with(steps=steps, dt=sign * self._free.dt)
         if target is not None:
             problem = problem.with_costs(final_cost=QuadraticCost(self._spread**-2.0, about=target))
         offset = np.tile(problem.nominal_control, (steps, 1))
         guess = InitialGuess(np.zeros((*offset.shape, len(state))), offset)
-        run = SolveRun.lent(problem, self._settings, guess, state, Budget(iterations, self._stop))
+        run = SolveRun(problem, self._settings, guess, state, Budget(iterations, self._stop))
         run.smooth(iterations)
+        results = deepcopy((run.work.last, run.work.arrays.to_come))  # before another run overwrites them
         run.give_back()
-        return run
+        return results
 
 
 class Tree:
