@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
+from lqrsim.scenes.least_distance import least_distance
 from lqrsim.scenes.mjcf_kinematics import Equalities, placed
 from lqrsim.scenes.mjcf_model import MjcfModel, ranges
 from lqrsim.scenes.mujoco_log import unlogged
@@ -358,11 +359,9 @@ def _least_squares(
 ) -> Array | None:
     """The x with the least |rows x - aims|, for which equalities hold and rows of `sides` are within their limits.
 
-    Equalities are eliminated; what remains is a least-distance problem, which is one of non-negative least squares
-    (Lawson and Hanson, Solving Least Squares Problems, ch. 23). None if there is no such x.
+    Equalities are eliminated; what remains is a least-distance problem. None if there is no such x.
     """
     from scipy.linalg import null_space, solve_triangular
-    from scipy.optimize import nnls
 
     start = np.linalg.lstsq(*equal, rcond=None)[0]
     if np.abs(equal[0] @ start - equal[1]).max(initial=0.0) > _REST * (1 + np.abs(equal[1]).max(initial=0.0)):
@@ -382,10 +381,8 @@ def _least_squares(
         return None
     bound, least = bound[~fixed] / norms[~fixed, None], least[~fixed] / norms[~fixed]
     farthest = float(least.max(initial=0.0))
-    aim = np.append(np.zeros(len(bound.T)), 1.0)
     for distance in farthest * _SCALES if farthest > 0 else ():
-        matrix = np.concatenate([bound.T, least[None] / distance])
-        residual = matrix @ nnls(matrix, aim)[0] - aim
+        residual, _ = least_distance(bound, least / distance)
         if -residual[-1] > _WELL_SCALED:
             nearest = nearest - distance * residual[:-1] / residual[-1]
             break

@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
-import scipy.optimize
 
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
@@ -33,6 +32,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import ContactCertificate, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.scenes.contact_modes import ContactModes, Period, Switches
+from lqrsim.scenes.least_distance import least_distance
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget, Laps
 from lqrsim.solvers.certify import faults
@@ -179,20 +179,13 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     rows, which, lengths = rows[felt] / lengths[felt, None], which[felt], lengths[felt]
     bounds = bounds[which] / lengths
     free = np.zeros(size) if across is not None else -scipy.linalg.solve_triangular(factor, model.gradient, lower=True)
-    # The nearest point to `free` with rows y >= bounds, by Lawson and Hanson's least-distance algorithm.
+    # The nearest point to `free` with rows y >= bounds.
     short, nearest, weights = bounds - rows @ free, free, np.zeros(len(bounds))
     active = np.flatnonzero(short > 0)
     for _ in range(ROUNDS):
         if not len(active):
             break
-        matrix = np.vstack([rows[active].T, short[active]])
-        target = np.zeros(size + 1)
-        target[-1] = 1.0
-        try:
-            forces, _ = scipy.optimize.nnls(matrix, target, maxiter=30 * matrix.shape[1])
-        except RuntimeError:
-            return None
-        residual = matrix @ forces - target
+        residual, forces = least_distance(rows[active], short[active])
         if not abs(residual[-1]) > 1e-13:  # the rows contradict each other
             return None
         nearest = free - residual[:size] / residual[-1]
