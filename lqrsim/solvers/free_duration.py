@@ -452,21 +452,14 @@ def with_duration_state(problem: Problem, *, by_segment: bool = False) -> Proble
 
 def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
     """The dynamics with the duration as last state; at the stated duration they are unchanged."""
-    space, controls, n = dynamics.state_coordinates, dynamics.control_coordinates, len(dynamics.state_coordinates)
-    names = space.names
-    state, parameter = free_name(STATE, names), free_name(STATED, (*dynamics.parameters, *dynamics.disturbances))
+    space, n = dynamics.state_coordinates, len(dynamics.state_coordinates)
+    state, parameter = free_name(STATE, space.names), free_name(STATED, (*dynamics.parameters, *dynamics.disturbances))
 
     def f(x: Any, u: Any, p: Any) -> list[Any]:
         share = x[n] / getattr(p, parameter)
         return [*(share * rate for rate in dynamics.f(x[:n], u, p)), 0]
 
-    return Dynamics(
-        f, states=dict(zip(names, space.units, strict=True)) | {state: "s"},
-        controls=dict(zip(controls.names, controls.units, strict=True)),
-        parameters=dict(dynamics.parameters) | {parameter: stated},
-        disturbances={name: value for name, value in dynamics.disturbances.items() if name not in dynamics.parameters},
-        position=tuple(names[i] for i in space.position), plane=space.plane, offset=space.offset,
-        angles=tuple(names[i] for i in space.angles),
-        rotation_vectors=tuple(names[i : i + 3] for i in space.rotation_vectors),
-        control_limits=(controls.low, controls.high),
-    ).with_substeps(dynamics.substeps)  # fmt: skip
+    coordinates = replace(space, names=(*space.names, state), units=(*space.units, "s"), low=(), high=())
+    return dynamics._traced_anew(
+        f=f, state_coordinates=coordinates, parameters=dynamics.parameters | {parameter: stated}
+    )
