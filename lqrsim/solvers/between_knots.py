@@ -7,7 +7,7 @@ inequality is violated. If it is still violated between these, they spare that m
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,47 +35,29 @@ SPARED = 1.2  # of what is violated between the times of a period, is spared at 
 ROUNDING = 1e-9  # violation that is not mentioned
 
 
-@dataclass(frozen=True, eq=False)
-class PlanErrors:
-    """What a plan does between its knots."""
+def plan_errors(problem: Problem, plan: Trajectory) -> tuple[BetweenKnots, list[Array]]:
+    """What a plan does between its knots, with a problem's inequalities; the problem's dt is the plan's.
 
-    step_error: float  # see `BetweenKnots`
-    end_error: float
-    # For each constraint, the largest violation in each period, and the part of the period after which it is (T, rows),
-    # not above 0 for what is not violated, or does not act between the knots.
-    worst: list[Array]
-    times: list[Array]
-
-    @property
-    def missed(self) -> float:
-        return max((float(violations.max(initial=0.0)) for violations in self.worst), default=0.0)
-
-    def record(self, problem: Problem) -> BetweenKnots:
-        """The record of it, with the names of the problem's constraints."""
-        violations: dict[str, tuple[float, float]] = {}
-        for constraint, term, worst, times in zip(
-            problem.constraints, problem.constraint_terms, self.worst, self.times, strict=True
-        ):
-            for row, name in enumerate(names_of(constraint, term)):
-                t = int(np.argmax(worst[:, row]))
-                violation = float(worst[t, row]), problem.dt * (t + float(times[t, row]))
-                if violation[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
-                    violations[name] = violation
-        return BetweenKnots(self.step_error, self.end_error, violations)
-
-
-def plan_errors(problem: Problem, plan: Trajectory) -> PlanErrors:
-    """What a plan does between its knots, with a problem's inequalities; the problem's dt is the plan's."""
+    Also for each constraint the largest violation in each period, (T, rows), not above 0 for what is not violated, or
+    does not act between the knots.
+    """
     motion = Motion(in_c_order(plan.states), in_c_order(plan.controls))
-    step_error, end_error = _errors(problem, motion)
     worst, times = _violations(problem, motion)
-    return PlanErrors(step_error, end_error, worst, times)
+    violations: dict[str, tuple[float, float]] = {}
+    pairs = zip(problem.constraints, problem.constraint_terms, strict=True)
+    for k, (constraint, term) in enumerate(pairs):
+        for row, name in enumerate(names_of(constraint, term)):
+            t = int(np.argmax(worst[k][:, row]))
+            violation = float(worst[k][t, row]), problem.dt * (t + float(times[k][t, row]))
+            if violation[0] > max(ROUNDING, violations.get(name, (0.0, 0.0))[0]):
+                violations[name] = violation
+    return BetweenKnots(*_errors(problem, motion), violations), worst
 
 
 def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
     """What a plan for a problem does between its knots; its duration is the plan's."""
     stated = replace(problem, dt=plan.dt, duration=None, time_weight=0.0, accuracy=None, between_knots=False)
-    return plan_errors(stated, plan).record(stated)
+    return plan_errors(stated, plan)[0]
 
 
 def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
@@ -102,7 +84,7 @@ def _errors(problem: Problem, plan: Motion) -> tuple[float, float]:
 
 
 def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array]]:
-    """The largest violation of each constraint's rows in each period, and where it is; see `PlanErrors`.
+    """The largest violation of each constraint's rows in each period, and after which part of it, (T, rows) each.
 
     A start that violates a row, and so cannot be helped, leaves out the first period.
     """
@@ -205,9 +187,9 @@ def solve_between_knots(
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)
-        errors = plan_errors(at_knots, solution.trajectory)
+        errors, worst = plan_errors(at_knots, solution.trajectory)
         coarse = errors.step_error > accuracy
-        missed = problem.between_knots and errors.missed > tolerance
+        missed = problem.between_knots and any((violations > tolerance).any() for violations in worst)
         if not (coarse or missed):
             break
         if rounds >= ROUNDS or stop.due:
@@ -217,7 +199,7 @@ def solve_between_knots(
                 remedy = f"use {times} times as many steps, or a larger accuracy than {accuracy:g}"
             if stop.due:
                 status, remedy = Status.TIME_LIMIT, "raise time_limit"
-            wrong = errors.record(at_knots)._faults(tolerance, accuracy)
+            wrong = errors._faults(tolerance, accuracy)
             detail = f"after {rounds + 1} plans, {'; '.join(wrong.values())}"
             ended = {"status": status, "remedy": remedy, "detail": detail}
             break
@@ -227,7 +209,7 @@ def solve_between_knots(
             substeps = min(at_knots.dynamics.substeps * finer, MOST)
             at_knots = replace(at_knots, dynamics=at_knots.dynamics.with_substeps(substeps))
         if missed:
-            rows = [added.against(worst, tolerance) for added, worst in zip(rows, errors.worst, strict=True)]
+            rows = [added.against(violations, tolerance) for added, violations in zip(rows, worst, strict=True)]
         solution = again(solution)
         rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
     ordinary = replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)

@@ -8,8 +8,6 @@ The recursion takes long, so compiled ones come first, which can only say that a
 constraints that of `kernels/certificate.py` (`SolveRun.check_curvature`), else `Stages.least_curvatures`.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
@@ -33,15 +31,10 @@ SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below whi
 Flags = npt.NDArray[np.bool_]
 
 
-class CurvatureCheck(NamedTuple):
-    """The curvature at a plan, and for a saddle a direction of negative curvature, scaled to the typical sizes."""
-
-    curvature: Curvature
-    direction: Motion | None = None
-
-
-def curvature_at(stages: Stages, plan: Motion, gain: Array, multipliers: Array) -> CurvatureCheck:
+def curvature_at(stages: Stages, plan: Motion, gain: Array, multipliers: Array) -> tuple[Curvature, Motion | None]:
     """The curvature of the Lagrangian at a stationary plan.
+
+    At a saddle also a direction of negative curvature, scaled to the typical sizes.
 
     Args:
       stages: whose models are overwritten. gain: (T, m, n) of a policy about the plan.
@@ -82,15 +75,15 @@ class _Reduced:
         self._all: Flags = at_zero
         self._strict: Flags = at_zero & (stages.equality | pressing)
 
-    def check(self) -> CurvatureCheck:
+    def check(self) -> tuple[Curvature, Motion | None]:
         """A saddle if it bends down with all rows held that are at zero; a minimum if it bends up with fewer held."""
         if self._surely_convex(self._strict):
-            return CurvatureCheck(Curvature.MINIMUM)
+            return Curvature.MINIMUM, None
         kind, direction = self._recursion(self._all)
         if kind is Curvature.MINIMUM and (self._all & ~self._strict).any():
             kind = self._recursion(self._strict)[0]
             kind = Curvature.SINGULAR if kind is Curvature.SADDLE else kind
-        return CurvatureCheck(kind, direction)
+        return kind, direction
 
     def _weights(self, held: Flags) -> Array:
         """Weights (T+1, R) on these rows."""

@@ -24,7 +24,7 @@ from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
 from lqrsim.solvers.certify import CANCELLATION, SLACK, certificate_of, faults, no_value
-from lqrsim.solvers.curvature import FLAT, CurvatureCheck, curvature_at
+from lqrsim.solvers.curvature import FLAT, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import Pool, Stages
@@ -435,7 +435,7 @@ class SolveRun:
             certificate = replace(certificate, cost=self.expected_cost(result))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         result = replace(result, certificate=certificate, cost=cost, violation=violation)
-        curvature = Curvature.NOT_CHECKED if wrong else self.check_curvature(result).curvature
+        curvature = Curvature.NOT_CHECKED if wrong else self.check_curvature(result)[0]
         self._release_stages()
         if not wrong:
             return replace(result, certificate=replace(certificate, curvature=curvature))
@@ -453,17 +453,17 @@ class SolveRun:
         certificate = certificate_of(self.problem, numbers[0], result.states, violation=violation, least=least)
         return certificate, float(numbers["scale"][0])
 
-    def check_curvature(self, result: RunResult) -> CurvatureCheck:
+    def check_curvature(self, result: RunResult) -> tuple[Curvature, Motion | None]:
         """The curvature at a result by exact second derivatives, with a direction of negative curvature at a saddle."""
         problem = self.problem
         exact = self.second_order and has_curvature(problem) and problem.noise_term is None
         if not (result.status is Status.CONVERGED and exact):
-            return CurvatureCheck(Curvature.NOT_CHECKED)
+            return Curvature.NOT_CHECKED, None
         if not problem.constraints:
             out = np.zeros(1, CERTIFICATE)
             self._loop(*self._check_arguments(declarations.CURVE, result, no_value(result.states), out))
             if out["curvature"][0] > FLAT:
-                return CurvatureCheck(Curvature.MINIMUM)
+                return Curvature.MINIMUM, None
         stages, plan = self.stages, Motion(*map(in_c_order, result.plan))
         multipliers = stages.of_constraints([multipliers.values for multipliers in result.multipliers])
         return curvature_at(stages, plan, result.law.gain, multipliers)

@@ -516,7 +516,7 @@ class Search:
 
     def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
         """Leave a saddle; return whether a plan was found that costs less."""
-        direction = run.check_curvature(at_saddle).direction
+        _, direction = run.check_curvature(at_saddle)
         if direction is None:
             return False
         saddle = at_saddle.kept()
