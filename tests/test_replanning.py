@@ -22,7 +22,7 @@ from lqrsim.errors import Array
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import resolve
-from lqrsim.solvers.prepared import _Best, _unchanged
+from lqrsim.solvers.prepared import _Best
 from lqrsim.solvers.settings import SmootherSettings
 
 STEPS, DT = 20, 0.1
@@ -231,14 +231,29 @@ class TestPreparedSolver:
         changed = problem(balls((state[0], state[1] + 0.2, 0.5)), weight=1.0).from_state(state)
         run = SolveRun(changed, SmootherSettings(), resolve(solution.shifted(9), changed), state, Budget(1))
         best = _Best(run)
-        first = best.violation, best.cost
+        first = best.result.violation, best.result.cost
         assert 0.4 < first[0] < 0.5
         for missed, cost in offers:
-            best.consider(replace(_unchanged(best), cost=cost, violation=missed))
+            best.consider(replace(best.result, cost=cost, violation=missed))
         ranks = {0.0: 0, 3e-7: 0, 0.1: 1, 0.1004: 1, 0.3: 2}
         allowed = [(ranks[missed], cost) for missed, cost in offers if missed in ranks] or [(3, first[1])]
-        assert (ranks.get(best.violation, 3), best.cost) == min(allowed)
-        assert best.improved == (best.violation < 0.4)
+        assert (ranks.get(best.result.violation, 3), best.result.cost) == min(allowed)
+        assert best.improved == (best.result.violation < 0.4)
+
+    @settings(max_examples=examples(10), suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(st.integers(0, STEPS - 3), st.integers(0, 2**32 - 1))
+    def test_the_cost_to_go_is_that_of_the_plan(
+        self, stated: ls.Problem, solution: ls.Solution, after: int, seed: int
+    ) -> None:
+        """And not what a later attempt left in the memory."""
+        state = solution.trajectory.states[after] + 0.05 * np.random.default_rng(seed).normal(size=4)
+        rest, start = stated.from_state(state, after=after), solution.shifted(after, horizon="shrinking")
+        run = SolveRun(rest, SmootherSettings(finish=None), resolve(start, rest), state, Budget(30))
+        best, result = _Best(run), run.run_to_end().kept()
+        run.work.arrays.to_go.hessian[...] = 0.0
+        best.adopt(result)
+        np.testing.assert_array_equal(best.result.values["cost_to_go"].hessian, result.values["cost_to_go"].hessian)
+        assert best.result.values["cost_to_go"].hessian.any()
 
     def test_another_structure_is_refused(
         self, stated: ls.Problem, solver: ls.types.PreparedSolver, solution: Any

@@ -1,7 +1,6 @@
 """Repeated solves in real time: everything is compiled beforehand, and each solve ends by its deadline."""
 
 import time
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -202,13 +201,12 @@ class PreparedSolver(OneVersion):
         seconds = [iteration.seconds for iteration in budget.log]
         self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
         best.consider(result)
-        # The next solve overwrites this memory.
-        states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
+        found = best.result.kept()  # the next solve overwrites this memory
         answer = Replan(
             status=result.status, detail=result.detail, improved=best.improved,
-            policy=compiled.policy_of(problem, gain, offset, states[:-1].copy()),
-            trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
-            violation=best.violation, cost_to_go=deepcopy(best.cost_to_go), multipliers=best.multipliers,
+            policy=compiled.policy_of(problem, *found.law, found.states[:-1].copy()),
+            trajectory=Trajectory(*found.plan, problem.dt), cost=found.cost, before=best.before,
+            violation=found.violation, cost_to_go=found.values.get("cost_to_go"), multipliers=found.multipliers,
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
             seconds=time.perf_counter() - clock, iterating=best.rolling_out + sum(seconds),
         )  # fmt: skip
@@ -246,11 +244,11 @@ def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
     A moving horizon has a last step for which the old policy was not made. If the rollout violates constraints, the old
     plan itself is used, from the new state.
     """
-    plan = copied(best.plan)
+    plan = copied(best.result)
     if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
         return plan
     planned = start.trajectory
-    if best.violation > 0:
+    if best.result.violation > 0:
         plan.states[1:], plan.controls[...] = planned.states[1:], planned.controls
     plan.states[-1] = planned.states[-1]
     return plan
@@ -267,7 +265,7 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
             result = meet_constraints(run, result)
         return result
     except InputError as error:  # a function that is not finite at the start
-        return replace(_unchanged(best), status=Status.NOT_FINITE, detail=str(error))
+        return replace(best.result, status=Status.NOT_FINITE, detail=str(error), cost=np.inf)
 
 
 def _cost_of(run: SolveRun, cost: float, plan: Motion, law: Policy) -> float:
@@ -275,11 +273,6 @@ def _cost_of(run: SolveRun, cost: float, plan: Motion, law: Policy) -> float:
     if run.problem.noise_term is None or not run.problem.constraints or not np.isfinite(cost):
         return cost
     return run.expected_cost(RunResult(status=Status.STALLED, plan=plan, law=law))
-
-
-def _unchanged(best: "_Best") -> RunResult:
-    """The result before the first iteration."""
-    return RunResult(status=Status.TIME_LIMIT, plan=best.plan, law=best.law)
 
 
 class _Finder:
@@ -321,17 +314,17 @@ class _Neighbour(_Finder):
     def find(self) -> RunResult:
         run, budget = self._run, self._budget
         if self._late(0.0):
-            return _unchanged(self._best)
-        if not np.isfinite(self._best.cost):
+            return self._best.result
+        if not np.isfinite(self._best.result.cost):
             detail = "the policy that it begins with diverges"
-            return replace(_unchanged(self._best), status=Status.NOT_FINITE, detail=detail)
+            return replace(self._best.result, status=Status.NOT_FINITE, detail=detail)
         known = tuple(multipliers.values for multipliers in run.initial_guess.multipliers)
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
             self.laps.ended = time.perf_counter()
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.model_seconds)) and budget.left:
-                point = InteriorPoint(self._stages, copied(self._best.plan), WEAK, multipliers=known)
+                point = InteriorPoint(self._stages, copied(self._best.result), WEAK, multipliers=known)
 
                 def watch(measures: Measures, seconds: float) -> bool:
                     measures.record(self.laps, seconds=seconds)
@@ -359,7 +352,7 @@ class _Neighbour(_Finder):
         """The rollout of the plan with a policy about it."""
         problem = self._run.problem
         if not np.isfinite(active.measures).all():
-            return replace(_unchanged(self._best), status=self._unsolved, detail=raised_by(functions_of(problem)))
+            return replace(self._best.result, status=self._unsolved, detail=raised_by(functions_of(problem)))
         plan, gain, cost, values = active.carried_out()
         for term, numbers in zip(problem.constraint_terms, values, strict=True):
             solved = solved and violation_of(term, numbers) <= allowed_violation(term, self._allowed)
@@ -402,15 +395,15 @@ class _Yielding(_Finder):
                 return self._late(model_seconds + seconds)  # the next iteration may compute the derivatives anew
 
             if self._late(model_seconds) or not budget.left:
-                return replace(_unchanged(self._best), status=self._unsolved)
+                return replace(self._best.result, status=self._unsolved)
             result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
             law = compiled.law_about(*result.plan, result.gain.copy())
             plan = run.work.roll_out(law, self._plan.states[0])
             reached = run.stages.trial(plan)[0]
             rank = self._rank(plan, reached)
             solved = result.solved and rank[1] == 0
-            if not solved and rank > self._rank(self._best.plan, self._best.cost):
-                return replace(_unchanged(self._best), status=self._unsolved)
+            if not solved and rank > self._rank(self._best.result.plan, self._best.result.cost):
+                return replace(self._best.result, status=self._unsolved)
         work, status = run.work, Status.CONVERGED if solved else self._unsolved
         violation, detail = work.violation(work.constraint_values(plan)), ""
         if violation > self._allowed:
@@ -442,26 +435,31 @@ def _finder(run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) ->
 
 
 class _Best:
-    """The best plan so far, initially the plan that the solve starts from. It is called after each iteration."""
+    """The best plan so far, initially the plan that the solve starts from. It is called after each iteration.
+
+    Attributes:
+      result: that plan. improved: whether it differs from the first plan.
+      before: cost of the first plan. rolling_out: seconds of its rollout.
+    """
 
     def __init__(self, run: SolveRun) -> None:
         self._run, self._work, guess = run, run.work, run.initial_guess
         clock = time.perf_counter()
         run.roll_out()
-        self.rolling_out = time.perf_counter() - clock  # of the first plan, in s
-        values = self._work.constraint_values(self._work.last)
-        self.cost = _cost_of(run, self._work.cost, self._work.last, self._work.arrays.last_policy)
-        self.violation = self._work.violation(values)
-        self.before = self.cost  # of the first plan
-        self.plan = copied(self._work.last)
-        self.law = Policy(guess.gain, guess.offset)
-        self.cost_to_go, self.multipliers = guess.cost_to_go, guess.multipliers
-        self.improved = False  # whether it differs from the first plan
+        self.rolling_out = time.perf_counter() - clock
+        last = self._work.last
+        self.result = RunResult(
+            status=Status.TIME_LIMIT, plan=copied(last), law=Policy(guess.gain, guess.offset),
+            cost=_cost_of(run, self._work.cost, last, self._work.arrays.last_policy),
+            violation=self._work.violation(self._work.constraint_values(last)),
+            values={"cost_to_go": guess.cost_to_go}, multipliers=guess.multipliers,
+        )  # fmt: skip
+        self.before, self.improved = self.result.cost, False
         # Equalities are kept only within a tolerance.
         allowed = run.settings.violation_tolerance(run.problem)
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
         self._negligible = min(allowed, EQUALITY_TOLERANCE)
-        self._most = max(self.violation, self._none)
+        self._most = max(self.result.violation, self._none)
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
@@ -469,10 +467,11 @@ class _Best:
             return  # probably the last one; `consider` sees it
         if iteration.method not in ("smooth", "newton"):
             return
-        arrays, cost = self._work.arrays, iteration.cost
+        arrays = self._work.arrays
         if iteration.method == "smooth":
-            cost = _cost_of(self._run, cost, arrays.last, arrays.last_policy)
-        if self._better(cost, iteration.violation, self.cost, self.violation):
+            cost = _cost_of(self._run, iteration.cost, arrays.last, arrays.last_policy)
+            iteration = replace(iteration, cost=cost)
+        if self._better(iteration, self.result):
             if iteration.method == "newton":
                 parts = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
             else:
@@ -485,38 +484,33 @@ class _Best:
             copies = self._copies[: len(parts)]  # the cost-to-go about Newton's plans is computed at the end
             for copy, array in zip(copies, parts, strict=True):
                 np.copyto(copy, array)
-            self._keep(cost, iteration.violation, copies)
+            states, controls, gain, offset, *to_go = copies
+            self.adopt(replace(
+                self.result, plan=Motion(states, controls), law=Policy(gain, offset), cost=iteration.cost,
+                violation=iteration.violation, values={"cost_to_go": Quadratic(*to_go)} if to_go else {},
+            ))  # fmt: skip
 
     def consider(self, result: RunResult) -> None:
         """Adopt the final result if it converged and is as good as the best, or if it is better."""
-        pair, own = (result.cost, result.violation), (self.cost, self.violation)
-        as_good = result.success and (self.violation > self._none or not self._better(*own, *pair))
-        if as_good or self._better(*pair, *own):
+        as_good = result.success and (self.result.violation > self._none or not self._better(self.result, result))
+        if as_good or self._better(result, self.result):
             self.adopt(result)
 
     def adopt(self, result: RunResult) -> None:
-        parts = *result.plan, *result.law, *(self._work.arrays.to_go if result.values else ())
-        self._keep(result.cost, result.violation, parts)
-        self.multipliers = result.multipliers
+        self.result, self.improved = result, True
 
-    def _better(self, cost: float, violation: float, than_cost: float, than_violation: float) -> bool:
+    def _better(self, plan: RunResult | Iteration, other: RunResult | Iteration) -> bool:
         """Whether one plan is better than another: constraints first, then the cost, beyond rounding.
 
         Often the first step decides the largest violation, whatever comes after it. So violations that agree to two
         digits count as equal, as in `RunResult.rank`; but none may be larger than that of the first plan.
         """
-        if not np.isfinite(cost) or not violation <= self._most:
+        if not np.isfinite(plan.cost) or not plan.violation <= self._most:
             return False
-        missed, than_missed = self._missed(violation), self._missed(than_violation)
-        if missed != than_missed:
-            return missed < than_missed
-        return not cost >= than_cost - ROUNDING * abs(than_cost)
+        missed, others = self._missed(plan.violation), self._missed(other.violation)
+        if missed != others:
+            return missed < others
+        return not plan.cost >= other.cost - ROUNDING * abs(other.cost)
 
     def _missed(self, violation: float) -> float:
         return 0.0 if violation <= self._negligible else float(f"{violation:.2g}")
-
-    def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
-        states, controls, gain, offset, *to_go = arrays
-        self.cost, self.violation, self.improved = cost, violation, True
-        self.plan, self.law = Motion(states, controls), Policy(gain, offset)
-        self.cost_to_go = Quadratic(*to_go) if to_go else None
