@@ -42,24 +42,11 @@ NEAR_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrie
 NAMED = 3  # largest number of constraints that a message names in addition to the most violated constraint
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """A plan whose violation is stationary."""
-
-    plan: RunResult
-    missed: float  # its violation, in a measure that is the same for a whole search
-    against: tuple[str, ...] = ()  # the other constraints that conflict, in words, the strongest first
-
-    def beside(self, worst: str) -> tuple[str, ...]:
-        """The conflicting constraints other than the one that a message begins with, in words."""
-        return tuple(name for name in self.against if not worst.startswith(name.rsplit(" at ", 1)[0]))[:NAMED]
-
-
 @dataclass(eq=False)
 class Known:
     """Results that the runs of one search share."""
 
-    evidence: list[Evidence] = field(default_factory=list)  # plans whose violation is stationary
+    evidence: list[RunResult] = field(default_factory=list)  # plans whose violation is stationary
     from_start: bool = False  # whether the start itself was tried
     rows: Array | None = None  # (R,) typical sizes of the constraint rows, in which violations are measured
 
@@ -305,25 +292,26 @@ class ConstrainedRun:
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
             if best.violation > self._allowed and (same := alike(self._known.evidence)):
-                best = same[0].plan
+                best = same[0]
                 lagrangian.evaluate(best.plan)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                best = replace(best, against=same[0].beside(detail))
-                detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
+                others = [name for name in best.against if not detail.startswith(name.rsplit(" at ", 1)[0])][:NAMED]
+                best = replace(best, against=tuple(others))
+                detail += f"; against it stand {', '.join(others)}" if others else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return best if best.certificate is not None else run.certified(best)
 
 
-def alike(cases: Sequence[Evidence]) -> list[Evidence]:
+def alike(cases: Sequence[RunResult]) -> list[RunResult]:
     """The evidence with equally small violations, the least first; empty unless it is from `STARTS` starts."""
     least = sorted(cases, key=lambda case: case.missed)
     same = [case for case in least if case.missed <= (1 + ALIKE) * least[0].missed]
     return same if len(same) >= STARTS else []
 
 
-def evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) -> Evidence | None:
-    """The evidence that a plan for the problem of a run provides, or None.
+def evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) -> RunResult | None:
+    """A plan for the problem of a run with what it is evidence of, or None.
 
     The total violation, each row relative to its size, has a gradient in the controls. It is recomputed here from the
     problem's own functions, on a code path that the solvers do not use. Rows that are just satisfied balance the
@@ -340,7 +328,7 @@ def evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) 
     if size > 0:
         forces = zip(problem.dynamics.control_coordinates.names, pressed.tolist(), strict=True)
         holding += [(force / size, f"the limits of {name}") for name, force in forces if force > 1e-2 * min(pull, size)]
-    return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))
+    return replace(plan, missed=missed, against=tuple(name for _, name in sorted(holding, reverse=True)))
 
 
 def _violation_slopes(

@@ -105,7 +105,10 @@ class RunResult:
     certificate: Certificate | None = None
     final: bool = False  # whether no other start can do better
     stuck: bool = False  # whether the violation no longer falls, however large the penalty
-    against: tuple[str, ...] = ()  # in words, what conflicts with the violated constraints, the strongest first
+    # Of a plan whose violation is stationary: this in a measure that is the same for a whole search, and in words, what
+    # conflicts with the violated constraints, the strongest first.
+    missed: float = np.nan
+    against: tuple[str, ...] = ()
     remedy: str = ""  # one that is known already; empty for the usual one
 
     @property

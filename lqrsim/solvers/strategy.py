@@ -37,7 +37,7 @@ from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.between_knots import between_knots, solve_between_knots
 from lqrsim.solvers.budget import Budget, Stop
-from lqrsim.solvers.constrained import ConstrainedRun, Evidence, Known, alike
+from lqrsim.solvers.constrained import ConstrainedRun, Known, alike
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
@@ -179,7 +179,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
     result = by_multipliers(run)
     # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
     if result.stuck and not known.evidence:
-        known.evidence.append(Evidence(result, result.violation))
+        known.evidence.append(replace(result, missed=result.violation))
     return result
 
 
@@ -190,8 +190,9 @@ def refine(run: SolveRun, known: Known) -> RunResult:
     result = damped_from_rollout(run)
     if not result.stuck:
         return result
-    known.evidence.append(new_evidence := Evidence(result, result.violation))
-    return replace(result, status=Status.INFEASIBLE) if new_evidence in alike(known.evidence) else result
+    result = replace(result, missed=result.violation)
+    known.evidence.append(result)
+    return replace(result, status=Status.INFEASIBLE) if result in alike(known.evidence) else result
 
 
 def from_states(run: SolveRun, known: Known) -> RunResult:
