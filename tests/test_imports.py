@@ -77,8 +77,8 @@ FLOORS_WITHIN = {
     ),
     "solvers": (
         ("budget", "compiled", "initial_guess"),
-        ("certify", "settings", "stages"),
-        ("curvature",),
+        ("settings", "stages"),
+        ("certify",),
         ("engine", "interior_point", "parallel"),
         ("assembly", "augmented_lagrangian", "contact_modes", "multistart"),
         ("control_rates", "interior_run", "risk", "tree", "ways"),

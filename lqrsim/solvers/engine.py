@@ -23,8 +23,7 @@ from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Ite
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
-from lqrsim.solvers.certify import CANCELLATION, SLACK, certificate_of, faults, no_value
-from lqrsim.solvers.curvature import FLAT, curvature_at
+from lqrsim.solvers.certify import CANCELLATION, FLAT, SLACK, certificate_of, curvature_at, faults, no_value
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import Pool, Stages
