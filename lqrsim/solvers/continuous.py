@@ -44,14 +44,8 @@ _EVALUATIONS = 100_000
 # The dense output of DOP853 is a polynomial of degree 7 per step, which eight points determine.
 _NODES = 0.5 * (1.0 - np.cos(np.pi * np.arange(8) / 7))
 _FIT = np.linalg.inv(np.vander(_NODES))
+Tolerances = dict[str, float]  # rtol and atol, those of `solve_ivp`
 RelativeTolerance = Annotated[float, Bounds(at_least=1e-13)]  # SciPy replaces a smaller tolerance, with a warning
-
-
-class Tolerances(NamedTuple):
-    """Relative and absolute tolerance of the integration."""
-
-    rtol: float
-    atol: float
 
 
 class IntegrationFailure(Exception):
@@ -185,7 +179,7 @@ def integrate(
         guarded(span[0], start)
         if last:
             raise last[0]
-        solution = solve_ivp(guarded, span, start, method="DOP853", dense_output=True, **tolerances._asdict())
+        solution = solve_ivp(guarded, span, start, method="DOP853", dense_output=True, **tolerances)
     if not solution.success:
         t = float(solution.t[-1])
         if last and abs(last[0].time - t) < 1e-6 * abs(span[1] - span[0]):
@@ -337,7 +331,7 @@ def smooth_lq_continuous(
     Returns:
       A ContinuousSolution. A problem without a minimum raises no exception; the status says where this was noticed.
     """
-    tolerances = Tolerances(rtol, atol)
+    tolerances = Tolerances(rtol=rtol, atol=atol)
 
     def at(t: float) -> Stage:
         value = stage(t) if callable(stage) else stage
@@ -453,7 +447,7 @@ def smooth_continuous(
         raise InputError(
             f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"
         )
-    tolerances = Tolerances(rtol, atol)
+    tolerances = Tolerances(rtol=rtol, atol=atol)
     control, prior = _initial_guess(problem, start)
     state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     check_functions(problem, state, control)
@@ -538,7 +532,7 @@ class _Smoother:
             escape = self._roll_out()
             before = iterations[-1].cost if iterations else math.inf
             # A cost below the tolerance is noise of the integrator.
-            improvement = (before - self._cost) / max(abs(self._cost), self._tolerances.atol)
+            improvement = (before - self._cost) / max(abs(self._cost), self._tolerances["atol"])
             settled = abs(improvement) < tolerance and self._gap < gap_tolerance
             row = Iteration(
                 cost=self._cost, improvement=improvement, gap=self._gap,
@@ -668,7 +662,7 @@ class _Smoother:
             decrease = float(-0.5 * total[-1, -1] - 0.5 * total[-1, :-1] @ minimizer(total, 0.0))
         except IntegrationFailure:
             return math.inf
-        return decrease / max(abs(self._cost), self._tolerances.atol)
+        return decrease / max(abs(self._cost), self._tolerances["atol"])
 
 
 def _at(where: str, failure: IntegrationFailure) -> str:
