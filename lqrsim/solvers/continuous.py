@@ -179,7 +179,8 @@ def integrate(
         guarded(span[0], start)
         if last:
             raise last[0]
-        solution = solve_ivp(guarded, span, start, method="DOP853", dense_output=True, **tolerances)
+        rtol, atol = tolerances["rtol"], tolerances["atol"]
+        solution = solve_ivp(guarded, span, start, method="DOP853", dense_output=True, rtol=rtol, atol=atol)
     if not solution.success:
         t = float(solution.t[-1])
         if last and abs(last[0].time - t) < 1e-6 * abs(span[1] - span[0]):

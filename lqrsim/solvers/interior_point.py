@@ -230,7 +230,9 @@ def restore(
 
     run(0, 0)
     outcome, at_minimum = RUNNING, False
-    watched = _in_slices(stages.problem, log, run, lambda row, seconds: watch(*row, seconds), hurried=hurried)
+    watched = _in_slices(
+        stages.problem, log, run, lambda row, seconds: watch(row[0], row[1], row[2], seconds), hurried=hurried
+    )
     for _, outcome, over in watched:
         if outcome == NO_PROGRESS and not over:
             shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
