@@ -50,10 +50,6 @@ SMALL = 1e-3  # change of a control in neighbouring plans, as a fraction of its 
 SAMPLES, RAY = 50, 8  # number of sampled neighbouring plans; number of doublings of a ray across a switch
 
 
-class OutOfTime(Exception):
-    """No time is left for a descent and its certificate."""
-
-
 class CostedPlan(NamedTuple):
     """A plan and its cost: states (T+1, n) and controls (T, m)."""
 
@@ -414,14 +410,14 @@ def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
 
     def check_time() -> None:
         if run.budget.stop.due:
-            raise OutOfTime
+            raise TimeoutError
 
     modes.check_time = check_time
     descent = None
     try:
         descent = Descent(problem, modes, plan, run.final, run.budget)
         return with_certificate(run, modes, descent, descent.run())
-    except OutOfTime:
+    except TimeoutError:
         if descent is None or descent.plan is plan:
             return None
         detail = "no time was left for a certificate within its contact modes"
