@@ -3,8 +3,7 @@
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.chance_constrained import SafePlan
 from lqrsim.control.controllers import ControllerRun
-from lqrsim.control.replan_rule import ReplanRecord
-from lqrsim.control.replanner import LiveReplanner
+from lqrsim.control.replanner import LiveReplanner, ReplanRecord
 from lqrsim.control.tubes import Tube
 from lqrsim.outlines import Box, Capsule
 from lqrsim.problem.collision_spheres import SphereCenters

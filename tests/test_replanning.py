@@ -17,7 +17,7 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
-from lqrsim.control.replan_rule import ActivePlan, ReplanLog
+from lqrsim.control.replanner import ActivePlan, ReplanLog
 from lqrsim.errors import Array
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun

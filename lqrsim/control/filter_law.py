@@ -12,7 +12,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.kalman import KalmanFilter, kalman_filter
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest
+from lqrsim.control.replanner import ReplanLog, ReplanRule, SolveRequest
 from lqrsim.control.tracking_laws import Laws, Weights, tracking_laws
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.estimation import FAR

@@ -18,7 +18,7 @@ from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, ReplannedRun
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
-from lqrsim.control.replan_rule import ReplanRule
+from lqrsim.control.replanner import ReplanRule
 from lqrsim.control.sampled_loop import DeviationNorm
 from lqrsim.control.sensor_filter import SensorFilter, SensorRun
 from lqrsim.control.tracking import Predictions, choose_tolerances, narrowest, tolerances_to_try, with_filter
