@@ -69,8 +69,12 @@ POSTS = (
 FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos="0 0 0.05"/>'
 
 
-def test_an_arm_between_posts_and_on_a_floor_that_it_reaches_agrees() -> None:
-    found = ls.check_plant(Arm(), arm(POSTS + FLOOR))
+@pytest.mark.parametrize("paired", [(), ("post",), ("floor",), ("floor", "post")])
+def test_an_arm_between_posts_and_on_a_floor_that_it_reaches_agrees(paired: tuple[str, ...]) -> None:
+    """An obstacle of a pair would collide whatever its contype."""
+    pairs = "".join(f'<pair geom1="fist" geom2="{obstacle}"/>' for obstacle in paired)
+    xml = arm(POSTS + FLOOR).xml.replace("</mujoco>", f"<contact>{pairs}</contact></mujoco>")
+    found = ls.check_plant(Arm(), scene_from_xml(xml, "bench"))
     assert found.good, found
     assert found.contacts == ()
     assert not ls.check_plant(Arm(length=0.6), arm(POSTS + FLOOR)).good

@@ -272,6 +272,9 @@ class Plant(OneVersion):
             for geom in geoms:
                 if geom.name in self.obstacles:
                     geom.contype = geom.conaffinity = 0
+            for pair in list(spec.pairs):  # which collide whatever their contype
+                if not {pair.geomname1, pair.geomname2}.isdisjoint(self.obstacles):
+                    spec.delete(pair)
         for root, name in itertools.product(self._roots.tolist() if contacts else [], self.obstacles):
             sensor = free_name(f"contact with {name}", sensors)
             sensors.add(sensor)

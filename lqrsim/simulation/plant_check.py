@@ -146,8 +146,7 @@ def check_plant(
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
     region = _Region.of(robot, problem, plan, around, spread, controls)
-    obstacles = [plant.model.geom(name).id for name in plant.obstacles]
-    plant.model.geom_contype[obstacles] = plant.model.geom_conaffinity[obstacles] = 0
+    plant.model = plant.without_contacts
     rng = np.random.default_rng(seed)
     if settle is None:
         settle = 0.5 if simulator is None and 2 * len(plant.qvel) > n else 0.0
