@@ -141,9 +141,8 @@ def smooth_chance_constrained(
             if deviations is None:
                 break
             search.solve(deviations)
-        for done, times in enumerate(search.heavier()):
+        for done, _ in enumerate(search.heavier()):
             tell(rounds + done)
-            search.solve_heavier(times)
         tell(most)
     return search.result()
 
@@ -240,19 +239,16 @@ class _Search:
         return tube
 
     def heavier(self) -> Iterator[float]:
-        """The weights of obstacles to try, as long as no plan is safe enough and larger weights help."""
-        if self.problem.obstacle_costs:
-            first = len(self.plans)
-            for times in HEAVIER:
-                if self._best().success or self._gave_up(first):
-                    return
-                yield times
-
-    def solve_heavier(self, times: float) -> None:
-        problem = _weighing(self.problem, times)
-        solution, self.margin = smooth(problem), np.zeros((1, 1))
-        if solution.success:
-            self._keep(problem, solution, times)
+        """Plan with heavier obstacles, as long as no plan is safe enough and that helps; yields before each plan."""
+        first = len(self.plans)
+        for times in HEAVIER if self.problem.obstacle_costs else ():
+            if self._best().success or self._gave_up(first):
+                return
+            yield times
+            problem = _weighing(self.problem, times)
+            solution, self.margin = smooth(problem), np.zeros((1, 1))
+            if solution.success:
+                self._keep(problem, solution, times)
 
     def _gave_up(self, first: int) -> bool:
         """Whether the last plans, counted from the given one on, were no safer than the safest of them."""
