@@ -15,16 +15,14 @@ one kind of disturbance in a set.
 import ast
 import contextlib
 import importlib
-import importlib.util
 import inspect
 import os
 import re
 import shlex
 import sys
 from collections.abc import Callable
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from lqrsim.errors import InputError, check_name, excerpt
@@ -132,26 +130,18 @@ def _own_function(target: str) -> Callable[..., object]:
     return functions[name]
 
 
-class _Uncached(SourceFileLoader):
-    """Reads the source each time: Python takes bytecode on disk for current if a file was changed within a second."""
-
-    def get_code(self, fullname: str) -> CodeType:
-        return self.source_to_code(self.get_data(self.path), self.path)
-
-
 def _load_file(path: Path) -> ModuleType:
     if not os.path.isfile(path):  # Path.is_file raises for names that are too long
         raise InputError(f"scenario: got {path}, want a Python file that exists")
     name = str(path.resolve())  # the stem may be the name of another module
-    spec = importlib.util.spec_from_file_location(name, path, loader=_Uncached(name, str(path)))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(name)
+    module.__file__ = str(path)
     sys.modules[name] = module  # dataclasses look up their module while it runs
     folder = str(path.resolve().parent)
     if folder not in sys.path:  # for the modules beside it, as if Python ran the file; last, to hide no other module
         sys.path.append(folder)
-    spec.loader.exec_module(module)
+    # Not by a loader: it takes bytecode on disk for current if the file was changed within a second.
+    exec(compile(path.read_bytes(), path, "exec", dont_inherit=True), vars(module))
     return module
 
 
