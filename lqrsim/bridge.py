@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from lqrsim import rotations
 from lqrsim.annotations import Bounds, checked
-from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback
+from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback, check_measures_states
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
@@ -190,7 +190,7 @@ class SimulatedRobot:
         patience: Annotated[float, Bounds(above=0.0, at_most=1e6)] = 10.0,
         domain: int | None = None,
     ) -> None:
-        policy = plan.policy if isinstance(plan, Plan) else check_kind("plan", plan, AffinePolicy, "a plan or a policy")
+        policy = plan.policy if isinstance(plan, Plan) else plan
         self._controls = policy.control_coordinates
         self._patience = patience
         topics = _topics(commands, odometry, joints)
@@ -257,6 +257,7 @@ def _law_of(source: Bridgeable) -> tuple[Controller, float, int, Array]:
     wanted = "a plan, a policy, a Controller with a plan, or a live re-planner"
     policy = check_kind("controller", plan, Plan, wanted).policy
     law = source if isinstance(source, Controller) else Feedback(policy)
+    check_measures_states(law)
     return law, policy.dt, policy.steps, policy.nominal[0]
 
 

@@ -22,12 +22,14 @@ import numpy.typing as npt
 import pytest
 from sampling import rarely
 from scipy.spatial.transform import Rotation
+from tracking import hover
 
 import lqrsim as ls
 
 pytest.importorskip("cyclonedds", reason="needs the `ros` extra")
 
 from lqrsim import bridge, rotations
+from lqrsim.control.controllers import Feedback
 
 LOOPBACK = """<CycloneDDS><Domain>
   <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces></General>
@@ -288,11 +290,18 @@ def test_a_live_replanner_runs(topics: dict[str, Any], quadrotor: ls.Scenario, q
     np.testing.assert_allclose(got[0], quadrotor_solution.policy(state, 0.0), rtol=0, atol=1e-12)
 
 
+class Reading(Feedback):
+    """The numbers that it wants are no states, however many there are."""
+
+    sensors, plan = property(lambda self: object()), property(lambda self: hover())  # pyright: ignore
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"controller": 3}, "controller: got"),
         ({"controller": ls.lq}, "controller: got"),
+        ({"controller": Reading(hover().policy)}, "controller: got a Reading that reads sensors, want one of the meas"),
         ({"safe": [6.0]}, r"safe: got \[6.0\], want numbers from"),
         ({"safe": [0.0, 0.0]}, "safe: got shape"),
         ({"joints": None}, "odometry: got none, want a topic of states"),

@@ -18,6 +18,7 @@ from sampling import rarely
 
 import lqrsim as ls
 import lqrsim.gym
+from lqrsim.control.controllers import Feedback
 from lqrsim.errors import InputError
 from lqrsim.gym.environment import LARGEST
 from lqrsim.view import gl
@@ -189,6 +190,12 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
     np.testing.assert_array_equal(again, calm)
 
 
+class Reading(Feedback):
+    """The numbers that it wants are no observations, however many there are."""
+
+    sensors = property(lambda self: object())  # pyright: ignore
+
+
 @pytest.mark.parametrize(
     ("call", "line"),
     [
@@ -204,6 +211,7 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
         (lambda env: lqrsim.gym.Expert(env)(np.zeros((0, 13))), "observation: got shape (0, 13), want (13,) or"),
         (lambda env: lqrsim.gym.Expert(env)(np.zeros((2, 3, 13))), "observation: got shape (2, 3, 13), want (13,)"),
         (lambda env: lqrsim.gym.Expert(env)(np.zeros(12)), "observation: got shape (12,)"),
+        (lambda env: lqrsim.gym.Expert(env, Reading(env.solution.policy)), "controller: got a Reading that reads sen"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_refused(call: Any, line: str, quadrotor_solution: ls.Solution) -> None:

@@ -151,6 +151,13 @@ def as_controller(controller: ControllerLike | None, plan: Plan | None, dynamics
             return FunctionController(controller, dynamics, plan.trajectory.dt), plan
 
 
+def check_measures_states(controller: Controller) -> None:
+    """Raise InputError for a controller of sensors, where only states are measured."""
+    if controller.sensors is not None:
+        got = f"a {type(controller).__name__} that reads sensors"
+        raise InputError(f"controller: got {got}, want one of the measured states")
+
+
 @dataclass(frozen=True, eq=False)
 class _OfPolicy(Controller):
     """Base of controllers that are a policy."""
