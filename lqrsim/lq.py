@@ -5,11 +5,4 @@ from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smo
 from lqrsim.solvers.control_rates import rate_feedback
 from lqrsim.solvers.linear_quadratic import smooth_lq
 
-__all__ = [
-    "ContinuousSolution",
-    "Stage",
-    "rate_feedback",
-    "smooth_continuous",
-    "smooth_lq",
-    "smooth_lq_continuous",
-]
+__all__ = ["ContinuousSolution", "Stage", "rate_feedback", "smooth_continuous", "smooth_lq", "smooth_lq_continuous"]

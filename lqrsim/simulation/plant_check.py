@@ -1,7 +1,7 @@
 """A comparison of a robot's dynamics with its MJCF in MuJoCo, or with another simulator."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
@@ -145,7 +145,7 @@ def check_plant(
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
-    region = _Region.of(robot, problem, plan, around, spread, controls)
+    draw = _sampler(robot, problem, plan, around, spread, controls)
     plant.model = plant.without_contacts
     rng = np.random.default_rng(seed)
     if settle is None:
@@ -157,7 +157,7 @@ def check_plant(
     compared, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
-            state, control = region.draw(rng)
+            state, control = draw(rng)
             if simulator is None:
                 sample, touched = _sample(plant, data, state, control, round(settling), period)
                 touching.update(sorted(touched))
@@ -176,51 +176,42 @@ class _Sample(NamedTuple):
     predicted: Array
 
 
-class _Region(NamedTuple):
-    """Where samples are."""
+def _sampler(
+    robot: Robot, problem: Problem | None, plan: Plan | None, around: npt.ArrayLike | None, spread: float | None,
+    controls: Limits | None,
+) -> Callable[[np.random.Generator], tuple[Array, Array]]:  # fmt: skip
+    """A function that draws a state and a control, by the arguments of `check_plant`."""
+    spaces = states, inputs = spaces_of(robot.dynamics)
+    # Each of the points is the mean of some states, and each of the middles of some controls. Without middles, controls
+    # are equally probable in their range.
+    n, points, middles, seconds = len(states), np.zeros((1, len(states))), None, 0.0
+    if problem is not None:
+        check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces, "the robot")
+        start, goal, seconds = problem.start, problem.weighed_goal, problem.steps * problem.dt
+        start = np.zeros(n) if start is None else start
+        points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), POINTS)
+    if plan is not None:
+        check_same_system("plan", "a plan", spaces_of(plan.policy), spaces, "the robot")
+        points, middles = plan.trajectory.states[:-1], plan.trajectory.controls
+        check_array("plan: trajectory", np.hstack([points, middles]), (None, n + len(inputs)))
+    scale = SPREAD * _changes(points, states.units, seconds)
+    if around is not None:
+        points, middles = check_array("around", around, (n,))[None], None
+    if spread is not None:
+        scale = np.full(n, spread)
+    within = _state_range(robot, problem, points[0])
+    ranges = _control_range(robot, controls, problem, bounded=middles is None)
+    points = np.clip(points, *within)
+    control_scale = np.zeros(len(inputs)) if middles is None else SPREAD * _changes(middles, inputs.units, 0.0)
+    middles = None if middles is None else np.clip(middles, *ranges)
 
-    states: Array  # (k, n), each the mean of some samples
-    spread: Array  # (n,), their standard deviation
-    within: Array  # (2, n), bounds
-    controls: Array | None  # (k, m), means; None for controls that are equally probable in their range
-    control_spread: Array  # (m,)
-    control_range: Array  # (2, m)
+    def draw(rng: np.random.Generator) -> tuple[Array, Array]:
+        k = int(rng.integers(len(points))) if len(points) > 1 else 0
+        state = _drawn(rng, points[k], scale, *within)
+        control = rng.uniform(*ranges) if middles is None else _drawn(rng, middles[k], control_scale, *ranges)
+        return state, control
 
-    @classmethod
-    def of(
-        cls, robot: Robot, problem: Problem | None, plan: Plan | None, around: npt.ArrayLike | None,
-        spread: float | None, controls: Limits | None,
-    ) -> "_Region":  # fmt: skip
-        """The region by the arguments of `check_plant`."""
-        spaces = states, inputs = spaces_of(robot.dynamics)
-        n, points, middles, seconds = len(states), np.zeros((1, len(states))), None, 0.0
-        if problem is not None:
-            check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces, "the robot")
-            start, goal, seconds = problem.start, problem.weighed_goal, problem.steps * problem.dt
-            start = np.zeros(n) if start is None else start
-            points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), POINTS)
-        if plan is not None:
-            check_same_system("plan", "a plan", spaces_of(plan.policy), spaces, "the robot")
-            points, middles = plan.trajectory.states[:-1], plan.trajectory.controls
-            check_array("plan: trajectory", np.hstack([points, middles]), (None, n + len(inputs)))
-        scale = SPREAD * _changes(points, states.units, seconds)
-        if around is not None:
-            points, middles = check_array("around", around, (n,))[None], None
-        if spread is not None:
-            scale = np.full(n, spread)
-        within = _state_range(robot, problem, points[0])
-        ranges = _control_range(robot, controls, problem, bounded=middles is None)
-        control_spread = np.zeros(len(inputs))
-        if middles is not None:
-            control_spread, middles = SPREAD * _changes(middles, inputs.units, 0.0), np.clip(middles, *ranges)
-        return cls(np.clip(points, *within), scale, within, middles, control_spread, ranges)
-
-    def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        k = int(rng.integers(len(self.states))) if len(self.states) > 1 else 0
-        state = _drawn(rng, self.states[k], self.spread, *self.within)
-        if self.controls is None:
-            return state, rng.uniform(*self.control_range)
-        return state, _drawn(rng, self.controls[k], self.control_spread, *self.control_range)
+    return draw
 
 
 def _changes(points: Array, units: Sequence[str], seconds: float) -> Array:
