@@ -1,8 +1,6 @@
 """The registered scenarios. To add one, add a function here."""
 
 import inspect
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -110,23 +108,16 @@ class Scenario(OneVersion):
 
 
 def names() -> list[str]:
-    """The names of the registered scenarios."""
-    return sorted(_functions())
+    """The names of the registered scenarios: the public functions of this module that return a Scenario, but `get`."""
+    functions = {name: item for name, item in globals().items() if inspect.isfunction(item) and name[0] != "_"}
+    return sorted(
+        name for name, f in functions.items() if f.__annotations__.get("return") is Scenario and name != "get"
+    )
 
 
 def get(name: str) -> Scenario:
     """The registered scenario of a name, with its default settings."""
-    return _functions()[check_name("scenario", name, names())]()
-
-
-def _functions() -> dict[str, Callable[..., Scenario]]:
-    """The public functions of this module that return a Scenario."""
-    functions = inspect.getmembers(sys.modules[__name__], inspect.isfunction)
-    return {
-        name: f
-        for name, f in functions
-        if f.__annotations__.get("return") is Scenario and name[0] != "_" and name != "get"
-    }
+    return globals()[check_name("scenario", name, names())]()
 
 
 def differential_drive() -> Scenario:
