@@ -35,9 +35,8 @@ class Collisions:
         self._displaced, self._any_displaced = plant.shape.across(displaced), bool(displaced.any())
         self.at = np.full(len(states), np.inf)
         self.obstacles = [""] * len(states)
-        self._places = self.shape.places(states)
         self._time = 0.0  # of the last places, in s
-        self.clearance = self._clear(self._places, self._time)
+        self.relocate(states)
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._places[row])
 
@@ -47,7 +46,7 @@ class Collisions:
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
             running = np.isinf(self.at) & ~ignored & (part < period.stable)
             start = (step + part / parts) * self.dt
-            for row in np.flatnonzero(running & touching.any(axis=1)) if len(touching) else ():
+            for row in np.flatnonzero(running & touching.any(axis=1)):
                 self.touch(int(row), start, touching[row])
             if len(self.plant.world) or len(self._velocities):
                 self._search_line(step, part, parts, self.shape.places(states), running)
@@ -62,7 +61,7 @@ class Collisions:
         self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching))]
 
     def relocate(self, states: Array) -> None:
-        """Replace the current states: obstacles have stopped some of the trials."""
+        """Replace the current states, as after obstacles have stopped some of the trials."""
         self._places = self.shape.places(states)
         self.clearance = self._clear(self._places, self._time)
 
@@ -91,10 +90,9 @@ class Collisions:
                 self._hit(int(rows[k]), float(times[k]), places[k])
             searching &= (clear >= 0) & ~at_end
 
-    def _clear(self, places: Array, time: float | Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
+    def _clear(self, places: Array, time: float | Array, rows: npt.NDArray[np.intp] | slice = slice(None)) -> Array:
         """The clearance (k,) of these trials with their balls at places (k, B, 2 or 3), at times (k,) in s."""
-        displaced = self._displaced if rows is None else self._displaced[rows]
-        clear = self.shape.clearance(places, displaced if self._any_displaced else None)
+        clear = self.shape.clearance(places, self._displaced[rows] if self._any_displaced else None)
         if self._passing is None:
             return clear
         return np.minimum(clear, self._passing.clearance(places, self._motion(np.broadcast_to(time, len(places)))))

@@ -30,7 +30,7 @@ class Period:
     states: list[Array]  # S arrays (K, n), at the end of each part; angles are not unwrapped
     frames: list[Array]  # S arrays (K, nq), MuJoCo's qpos at these times
     # S arrays (K, obstacles), whether MuJoCo detected a contact at the beginning of the last physics step of the part;
-    # empty arrays if contacts are not sensed.
+    # nowhere if contacts are not sensed.
     touching: list[npt.NDArray[np.bool_]]
     stable: npt.NDArray[np.int64]  # (K,) number of leading parts in which the simulation was stable
 
@@ -225,16 +225,11 @@ class MujocoPhysics(Physics):
         for part in range(self.parts):
             period.states[part][rows] = again.states[part][rows]
             period.frames[part][rows] = again.frames[part][rows]
-            if len(period.touching[part]):  # the others' contacts are those of their own period
-                period.touching[part][rows] = again.touching[part][rows]
-            else:
-                period.touching[part] = again.touching[part]
+            period.touching[part][rows] = again.touching[part][rows]  # the others' are those of their own period
         period.stable[rows] = again.stable[rows]
 
     def touched(self, period: Period) -> npt.NDArray[np.bool_]:
         """Whether each trial with solid obstacles touched one, (K,)."""
-        if not self.solid.any():
-            return np.zeros(len(self.solid), dtype=bool)
         return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
     def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
@@ -250,7 +245,7 @@ class MujocoPhysics(Physics):
             self.simulations.warning[:] = 0
         if self._sensors is not None and (self.senses_contacts or self.solid.any()):
             return (self._sensors[:, self.plant.contact] > 0).any(axis=1)
-        return np.zeros((0, 0), dtype=bool)
+        return np.zeros((len(self.solid), len(self.plant.obstacles)), dtype=bool)
 
 
 class SimulatorPhysics(Physics):
@@ -301,7 +296,7 @@ class SimulatorPhysics(Physics):
     def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
         self._simulator.step(self._simulations, *self._inputs, self._part)
         self._read_states()
-        return np.zeros((0, 0), dtype=bool)
+        return np.zeros((len(self._states), len(self.plant.obstacles)), dtype=bool)
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
         self._simulator.place(self._simulations, self._states + jumps)
