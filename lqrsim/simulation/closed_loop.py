@@ -301,7 +301,9 @@ class ClosedLoop:
             states = np.tile(self.full_trajectory.states[step], (self.trials, 1))
             controls = np.tile(self.full_trajectory.controls[step], (self.trials, 1))
             self.effects.follow(step, states, controls)
-            observed = states if self._readings is None else self._readings.follow(step, states, self._held(step))
+            observed = states
+            if self._readings is not None:
+                observed = self._readings.arriving(step, states, states, self._held(step), planned=True)
             try:
                 self.controller_run.control(step, observed)
             except Exception as error:
@@ -336,7 +338,8 @@ class ClosedLoop:
         shape = self.trials, len(self._names)
         observed, knot = measured, self.knot + step
         if self._readings is not None:
-            observed = self._readings.arriving(knot, self.states, measured, None if step else self._held(knot))
+            held = None if step else self._held(knot)
+            observed = self._readings.arriving(knot, self.states, measured, held, planned=False)
         try:
             commands = shaped("commands", self.controller_run.control(knot, observed), shape)
             failed = _not_finite(commands)

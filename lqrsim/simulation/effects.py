@@ -86,7 +86,7 @@ class Effects:
     def follow(self, step: int, states: Array, controls: Array) -> None:
         """Call all hooks with the plan's states (K, n) and controls (K, m), for disturbances that have a memory.
 
-        Those of readings are called where a controller reads: see `Readings.follow`.
+        Those of readings are called where a controller reads: see `Readings.arriving`.
         """
         for _, measure in self._measures:
             measure(step, states.copy())
@@ -144,28 +144,24 @@ class Readings:
         self._sensors, self._effects, self._physics, self._dt = sensors, effects, physics, dt
         self._late, self._readings = sensors.delay_periods(dt), dict[int, Array]()
 
-    def follow(self, step: int, states: Array, controls: Array) -> Array:
-        """The exact readings that arrive at a knot of the plan, before the run begins; as `arriving`."""
-        exact = self._sensors.reader()(states[:1], controls[:1], np.zeros((1, 6)))
-        exact = np.repeat(exact, len(states), axis=0)
-        self._with_errors(step, exact)
-        return self._arriving(step, exact)
+    def arriving(self, step: int, states: Array, measured: Array, held: Array | None, planned: bool) -> Array:
+        """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already.
 
-    def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
-        """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already."""
-        return self._arriving(step, self._with_errors(step, self._sensors.readings(self._physics.sense(held))))
-
-    def _with_errors(self, step: int, exact: Array) -> Array:
-        pairs = zip(self._sensors.sensors, self._sensors.columns, strict=True)
+        Those of `planned` states, before the run begins, are exact.
+        """
+        sensors = self._sensors
+        if planned and held is not None:
+            exact = np.repeat(sensors.reader()(states[:1], held[:1], np.zeros((1, 6))), len(states), axis=0)
+        else:
+            exact = sensors.readings(self._physics.sense(held))
+        pairs = zip(sensors.sensors, sensors.columns, strict=True)
         named = self._effects.read(step, {sensor.name: exact[:, at] for sensor, at in pairs})
-        return np.concatenate([named[sensor.name] for sensor in self._sensors.sensors], axis=1)
-
-    def _arriving(self, step: int, readings: Array) -> Array:
-        self._readings[step] = readings
+        noisy = np.concatenate([named[sensor.name] for sensor in sensors.sensors], axis=1)
+        self._readings[step] = readings = exact if planned else noisy
         self._readings.pop(step - max(self._late) - 1, None)
         out = np.full(readings.shape, np.nan)
-        for i, (at, late) in enumerate(zip(self._sensors.columns, self._late, strict=True)):
-            if step - late in self._readings and self._sensors.due(step - late, self._dt)[i]:
+        for i, (at, late) in enumerate(zip(sensors.columns, self._late, strict=True)):
+            if step - late in self._readings and sensors.due(step - late, self._dt)[i]:
                 out[:, at] = self._readings[step - late][:, at]
         return out
 
@@ -179,22 +175,17 @@ class BeliefReadings:
     def __init__(self, belief: Belief, effects: Effects) -> None:
         self.belief, self._effects, self._readings = belief, effects, list[Array]()
 
-    def follow(self, step: int, states: Array, controls: Array) -> Array:
-        """Exact readings and states at a knot of the plan, before the run begins; as `arriving`."""
-        exact, deviations = self.belief.read(states)
-        self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})
-        return self._late(exact, states)
+    def arriving(self, step: int, states: Array, measured: Array, held: Array | None, planned: bool) -> Array:
+        """The readings (K, Y) that arrive in the true states (K, n), NaN for lost ones; and measured known states.
 
-    def arriving(self, step: int, states: Array, measured: Array, held: Array | None) -> Array:
-        """The readings (K, Y) that arrive in the true states (K, n), NaN for lost ones; and measured known states."""
+        Those of `planned` states, before the run begins, are exact.
+        """
         exact, deviations = self.belief.read(states)
-        return self._late(self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS], measured)
-
-    def _late(self, readings: Array, states: Array) -> Array:
-        self._readings.append(readings)
+        noisy = self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS]
+        self._readings.append(exact if planned else noisy)
         arrived = len(self._readings) > self.belief.sensors.delay
-        arriving = self._readings.pop(0) if arrived else np.full_like(readings, np.nan)
-        return np.hstack([arriving, states[:, self.belief.known]])
+        arriving = self._readings.pop(0) if arrived else np.full_like(exact, np.nan)
+        return np.hstack([arriving, measured[:, self.belief.known]])
 
 
 class _Streams(Sequence[np.random.Generator]):
