@@ -29,7 +29,7 @@ from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.linear_loop import LinearLoop, moments_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import DeviationNorm, sample_loop
-from lqrsim.control.tracking_laws import AT_END, Averse, Laws, Weights, check_plan, effort_of, tracking_laws
+from lqrsim.control.tracking_laws import AT_END, Laws, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import LoopArrays, LoopMoments
@@ -316,7 +316,7 @@ def _law(problem: Problem, solution: Solution, model: PlanModel, weights: Weight
 
     def law_of(tried: float) -> Laws | None:
         try:
-            return tracking_laws(model, weights, Averse(matrices, tried))
+            return tracking_laws(model, weights, matrices, tried)
         except np.linalg.LinAlgError:
             return None
 

@@ -91,28 +91,11 @@ def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
     return CONTROL_SHARE * ranges
 
 
-@dataclass(frozen=True, eq=False)
-class Averse:
-    """Noise on the states about a plan, and the aversion to large deviations."""
-
-    matrices: Array  # M (T, n, k), at each step
-    risk: float  # theta, for half the sum that the law minimises
-
-    def worst(self, t: int, S: Array, s: Array) -> tuple[Array, Array]:
-        """Hessian and gradient of the cost-to-go at t + 1 under the worst noise: S + S Y S and s + S Y s.
-
-        Raises LinAlgError if the risk is too high.
-        """
-        M = np.zeros((len(S), self.matrices.shape[2]))
-        M[: self.matrices.shape[1]] = self.matrices[t]
-        inner = np.eye(M.shape[1]) - self.risk * M.T @ S @ M
-        np.linalg.cholesky(inner)
-        spread = self.risk * S @ M @ np.linalg.solve(inner, M.T)
-        return S + spread @ S, s + spread @ s
-
-
-def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> Laws:
+def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None, risk: float = 0.0) -> Laws:
     """The law for these weights, or the laws for C of them.
+
+    With noise on the states, M (T, n, k), a law is averse to large deviations; the risk is theta, for half the sum that
+    it minimises. Raises LinAlgError if the risk is too high.
 
     The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot. The cost
     of d alone does not change the law.
@@ -149,8 +132,13 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
     improve = module_of(source_of(tracking_law), "tracking laws").lay_out("improve", 0, sizes, arrays, work)
     for t in range(steps - 1, -1, -1):
-        if averse is not None:
-            cost[0, :, :movable], cost[0, :, -1] = averse.worst(t, cost[0, :, :movable], cost[0, :, -1])
+        if noise is not None:  # under the worst of it, the Hessian is S + S Y S, and the gradient s + S Y s
+            S, M = cost[0, :, :movable], np.zeros((movable, noise.shape[2]))
+            M[:n] = noise[t]
+            inner = np.eye(M.shape[1]) - risk * M.T @ S @ M
+            np.linalg.cholesky(inner)
+            spread = risk * S @ M @ np.linalg.solve(inner, M.T)
+            cost[0, :, :movable], cost[0, :, -1] = S + spread @ S, cost[0, :, -1] + spread @ cost[0, :, -1]
         np.matmul(adjoint[t], cost @ forward[t], out=products)
         improve(t, sizes, arrays, work)
         if emphasis is not None:
