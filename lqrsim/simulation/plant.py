@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import mujoco
 import numpy as np
@@ -229,23 +229,21 @@ class Plant(OneVersion):
         One with neither balls nor a position is represented by a ball about its outermost part.
         """
         balls, dynamics, known = self.robot.balls, self.robot.dynamics, np.isfinite(driven).all(axis=2)
-        if balls is None:
-            if dynamics.state_coordinates.position:
-                return None
+        if balls is not None:
+            anchors, radii, centres = np.full((len(balls), 4), np.nan), balls.radii, partial(balls.centres, dynamics)
+            for k, site in enumerate(balls.sites):
+                if site is not None:
+                    anchors[k] = plant_validation.anchor_of(self.model, site)
+        elif dynamics.state_coordinates.position:
+            return None
+        else:
             number, place, radius = mjcf_kinematics.farthest_out(self.model, self.body)
-            places = np.full((*driven.shape[:2], 1, 3), np.nan)
-            places[known] = self._places_on(number, place, driven[known])
-            planned, anchor = self._places_on(number, place, planned), np.array([[number, *place]])
-            return BallRecord(driven=places, planned=planned, radii=np.array([radius]), anchors=anchor)
-        anchors, places = np.full((len(balls), 4), np.nan), np.full((*driven.shape[:2], len(balls), 3), np.nan)
-        places[known] = balls.centres(dynamics, driven[known])
-        for k, site in enumerate(balls.sites):
-            if site is not None:
-                anchors[k] = plant_validation.anchor_of(self.model, site)
-        planned = balls.centres(dynamics, planned)
-        return BallRecord(driven=places, planned=planned, radii=balls.radii, anchors=anchors)
+            anchors, radii, centres = np.array([[number, *place]]), np.array([radius]), partial(self._at, number, place)
+        places = np.full((*driven.shape[:2], len(radii), 3), np.nan)
+        places[known] = centres(driven[known])
+        return BallRecord(driven=places, planned=centres(planned), radii=radii, anchors=anchors)
 
-    def _places_on(self, number: int, place: Array, states: Array) -> Array:
+    def _at(self, number: int, place: Array, states: Array) -> Array:
         """The position of a point of a body, (k, 1, 3), in these states (k, n)."""
         positions = np.tile(self.model.qpos0, (len(states), 1))
         positions[:, self.qpos] = self.robot.configuration(states)[0]
