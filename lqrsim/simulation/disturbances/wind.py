@@ -14,7 +14,7 @@ from lqrsim.annotations import Bounds, Finite, Positive, checked
 from lqrsim.control.uncertainty import Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, normal, words
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, GaussianDisturbance, Numbers, normal, words
 from lqrsim.simulation.plant import Plant
 
 FOOT = 0.3048  # m
@@ -67,7 +67,7 @@ class MeanWind(Wind):
 
 @checked
 @dataclass(frozen=True)
-class Gusts(Wind):
+class Gusts(Wind, GaussianDisturbance):
     """Gusts, or currents, that rise and fade: an Ornstein-Uhlenbeck process on each axis.
 
     It is in its stationary state from the start.
@@ -80,21 +80,17 @@ class Gusts(Wind):
     std: Numbers = 1.0
     time_constant: Positive = 1.0
 
-    _scales = "std"
-
-    def __post_init__(self) -> None:
-        keep(self, std=self._checked("std", self.std, at_least=0.0))
-        self._fit(self.std, "xyz")
+    along = "xyz"
 
     def describe(self, plant: Plant) -> str:
         return f"gusts, std {words(self.std)} m/s, time constant {self.time_constant:g} s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         noise = normal(generators, plan.steps, 3)
-        return self.blow(self._fit(self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
+        return self.blow(self._fit(self.std, self.along) * first_order(noise, plan.dt / self.time_constant))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        winds = zip("xyz", self._fit(self.std, "xyz"), strict=True)
+        winds = zip(self.along, self._fit(self.std, self.along), strict=True)
         return self._unknowns(plant, [Unknown(f"wind_{axis}", std, self.time_constant) for axis, std in winds])
 
 
