@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from lqrsim import rotations
 from lqrsim.annotations import Bounds, checked
-from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback, check_measures_states
+from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
@@ -257,7 +257,7 @@ def _law_of(source: Bridgeable) -> tuple[Controller, float, int, Array]:
     wanted = "a plan, a policy, a Controller with a plan, or a live re-planner"
     policy = check_kind("controller", plan, Plan, wanted).policy
     law = source if isinstance(source, Controller) else Feedback(policy)
-    check_measures_states(law)
+    law._check_reads_states()
     return law, policy.dt, policy.steps, policy.nominal[0]
 
 

@@ -121,6 +121,12 @@ class Controller(abc.ABC):
         """What the controller reads in place of the measured states: sensors of the MJCF, or those of a belief."""
         return None
 
+    def _check_reads_states(self) -> None:
+        """Raise InputError for a controller of sensors, where only states are measured."""
+        if self.sensors is not None:
+            got = f"a {type(self).__name__} that reads sensors"
+            raise InputError(f"controller: got {got}, want one of the measured states")
+
 
 # The argument `controller` of `simulate` and of everything else that runs trials.
 ControllerLike = Controller | AffinePolicy | OutputFeedbackPolicy | ControlFunction
@@ -149,13 +155,6 @@ def as_controller(controller: ControllerLike | None, plan: Plan | None, dynamics
         case _:
             check_function("controller", controller, WANTED, arguments=2)
             return FunctionController(controller, dynamics, plan.trajectory.dt), plan
-
-
-def check_measures_states(controller: Controller) -> None:
-    """Raise InputError for a controller of sensors, where only states are measured."""
-    if controller.sensors is not None:
-        got = f"a {type(controller).__name__} that reads sensors"
-        raise InputError(f"controller: got {got}, want one of the measured states")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,14 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from lqrsim.annotations import Count, OneOf, Seed, checked
-from lqrsim.control.controllers import (
-    Controller,
-    ControllerLike,
-    ControllerRun,
-    as_controller,
-    check_measures_states,
-    turn_to_nearest,
-)
+from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, as_controller, turn_to_nearest
 from lqrsim.errors import (
     Array,
     InputError,
@@ -410,7 +403,7 @@ class Expert:
         kinds = (Environment, VectorEnvironment)
         unwrapped = check_kind("env", getattr(env, "unwrapped", env), kinds, "an environment of lqrsim.gym")
         self._law, _ = as_controller(controller, unwrapped.solution, unwrapped.task.plant.robot.dynamics)
-        check_measures_states(self._law)
+        self._law._check_reads_states()
         self._task, self._steps = unwrapped.task, unwrapped.solution.trajectory.steps
         self._run: ControllerRun | None = None
 
