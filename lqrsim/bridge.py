@@ -404,27 +404,27 @@ class _Node:
             if not setting.isdecimal():
                 raise InputError(f"ROS_DOMAIN_ID: got {excerpt(setting)}, want a number")
             domain = int(setting)
-        self._participant = self._ros.DomainParticipant(check_count("domain", domain, at_least=0, at_most=232))
-        self.second = self._ros.duration(seconds=1)
+        self._participant = self._ros.domain.DomainParticipant(check_count("domain", domain, at_least=0, at_most=232))
+        self.second = self._ros.util.duration(seconds=1)
 
     def reader(self, topic: str, kind: str, *, reliable: bool = True) -> "_Reader":
         return _Reader(self._ros, self._participant, self._topic(topic, kind), self._quality(reliable, kind))
 
     def writer(self, topic: str, kind: str) -> Any:
-        return self._ros.DataWriter(self._participant, self._topic(topic, kind), qos=self._quality(True, kind))
+        return self._ros.pub.DataWriter(self._participant, self._topic(topic, kind), qos=self._quality(True, kind))
 
     def _topic(self, topic: str, kind: str) -> Any:
-        return self._ros.Topic(self._participant, f"rt{_checked_topic(topic)}", self._ros.messages[kind])
+        return self._ros.topic.Topic(self._participant, f"rt{_checked_topic(topic)}", self._ros.messages[kind])
 
     def _quality(self, reliable: bool, kind: str) -> Any:
         """Of states only the newest counts, of commands every one. A reliable writer also serves unreliable readers.
 
         The representation is the first version of CDR, as in ROS 2.
         """
-        ros, policy = self._ros, self._ros.Policy
+        core, policy = self._ros.core, self._ros.core.Policy
         history = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
         sure = policy.Reliability.Reliable(self.second) if reliable else policy.Reliability.BestEffort
-        return ros.Qos(sure, history, policy.DataRepresentation(use_cdrv0_representation=True))
+        return core.Qos(sure, history, policy.DataRepresentation(use_cdrv0_representation=True))
 
     def numbers(self, numbers: Array) -> Any:
         make = self._ros.messages
@@ -467,13 +467,15 @@ class _Reader:
     """A reader of a topic that can be waited for."""
 
     def __init__(self, ros: SimpleNamespace, participant: Any, topic: Any, quality: Any) -> None:
-        self._ros, self._reader = ros, ros.DataReader(participant, topic, qos=quality)
-        self._new, self._waits = ros.ReadCondition(self._reader, ros.NEW), ros.WaitSet(participant)
+        self._ros, self._reader = ros, ros.sub.DataReader(participant, topic, qos=quality)
+        core = ros.core
+        new = core.SampleState.NotRead | core.ViewState.Any | core.InstanceState.Any
+        self._new, self._waits = core.ReadCondition(self._reader, new), core.WaitSet(participant)
         self._waits.attach(self._new)
 
     def wait(self, seconds: float) -> bool:
         """Wait for a message until the time is over. Returns whether a message is there."""
-        return self._waits.wait(self._ros.duration(seconds=seconds)) > 0
+        return self._waits.wait(self._ros.util.duration(seconds=seconds)) > 0
 
     def receive(self) -> list[Any]:
         """The oldest message, in a list; an empty list if there is none."""
@@ -487,14 +489,9 @@ class _Reader:
 def _ros() -> SimpleNamespace:
     """The parts of cyclonedds that are used, and the messages. Raises InputError if cyclonedds is not installed."""
     try:
-        from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
-        from cyclonedds.domain import DomainParticipant
+        from cyclonedds import core, domain, pub, sub, topic, util
         from cyclonedds.idl import make_idl_struct
         from cyclonedds.idl.types import array, float64, int32, sequence, uint32
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
-        from cyclonedds.util import duration
     except ImportError as error:
         raise InputError(f"lqrsim.bridge: got no cyclonedds ({error}), want pip install 'lqrsim[ros]'") from None
     messages: dict[str, Any] = {}
@@ -519,8 +516,4 @@ def _ros() -> SimpleNamespace:
     dimension = message("std_msgs", "MultiArrayDimension", label=str, size=uint32, stride=uint32)
     layout = message("std_msgs", "MultiArrayLayout", dim=sequence[dimension], data_offset=uint32)
     message("std_msgs", "Float64MultiArray", layout=layout, data=many)
-    return SimpleNamespace(
-        Policy=Policy, Qos=Qos, DomainParticipant=DomainParticipant, DataWriter=DataWriter,
-        DataReader=DataReader, ReadCondition=ReadCondition, WaitSet=WaitSet, Topic=Topic, duration=duration,
-        NEW=SampleState.NotRead | ViewState.Any | InstanceState.Any, messages=messages,
-    )  # fmt: skip
+    return SimpleNamespace(core=core, domain=domain, pub=pub, sub=sub, topic=topic, util=util, messages=messages)

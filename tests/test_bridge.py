@@ -377,7 +377,7 @@ def test_a_message_without_a_joint_that_was_there_is_not_used(topics: dict[str, 
 
 
 def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cyclonedds.core", None)
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
     bridge._ros.cache_clear()
     with pytest.raises(ls.InputError, match=r"want pip install 'lqrsim\[ros\]'"):
         bridge.run(policy(), commands="/c", safe=[0.0], joints="/j")
