@@ -322,6 +322,22 @@ class TestReplanner:
         alone = simulated(plant, quadrotor_solution, law, disturbances=NOISE, first_trial=2)
         np.testing.assert_array_equal(alone.states[0], together.states[2])
 
+    @pytest.mark.parametrize("seed", [10**9 + 1, 2**64, 2**128 - 1])
+    def test_seeds_are_as_large_as_those_of_simulate(
+        self, stated: ls.Problem, solution: ls.Solution, seed: int
+    ) -> None:
+        drawn: list[float] = []
+
+        def took(random: np.random.Generator) -> float:
+            drawn.append(random.random())
+            return 0.0
+
+        for one in (seed, seed, 0):
+            run = ls.Replanner(stated, solution, every=DT, computing=took, seed=one).start(1)
+            for step in range(2):
+                run.control(step, solution.trajectory.states[[step]])
+        assert drawn[0] == drawn[1] != drawn[2]
+
     def test_a_delay_that_is_predicted_costs_nothing_where_nothing_disturbs(
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
     ) -> None:

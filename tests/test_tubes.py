@@ -292,6 +292,17 @@ def test_moments_of_what_is_late_need_samples(field: str) -> None:
 # Sampled trials.
 
 
+@pytest.mark.parametrize("seed", [10**9 + 1, 2**64, 2**128 - 1])
+def test_seeds_are_as_large_as_those_of_simulate(seed: int) -> None:
+    system = double_integrator(steps=5)
+    late = Uncertainty(latency=1, start=0.1)
+    tube, same, other = (
+        ls.predict_tube(system.problem, system.solution, late, samples=20, seed=one) for one in (seed, seed, 0)
+    )
+    np.testing.assert_array_equal(tube.covariance, same.covariance)
+    assert (tube.covariance != other.covariance).any()
+
+
 @pytest.mark.parametrize("estimates", [False, True])
 @pytest.mark.parametrize("lost", [0.0, 0.2])
 def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates: bool, lost: float) -> None:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import LINE, Bounds, Index, Line, Want, checked
+from lqrsim.annotations import LINE, Bounds, Index, Line, Seed, Want, checked
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
 from lqrsim.errors import Array, InputError, check_array, check_function, check_kind, check_number, excerpt
@@ -445,7 +445,7 @@ class Replanner(Controller):
         when: Funnel | None = None,
         share: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 1.0,
         computing: Computing = 0.0,
-        seed: Index = 0,
+        seed: Seed = 0,
     ) -> None:
         who = "Replanner"
         if callable(computing):

@@ -23,7 +23,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import DeviationNorm, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_seed
 from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
@@ -123,7 +123,7 @@ def predict_tube(
     check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, wanted)
     assert uncertainty is not None
     check_count("predict_tube: samples", 0 if samples is None else samples, at_least=0, at_most=40_000)
-    check_count("predict_tube: seed", seed, at_least=0)
+    check_seed("predict_tube: seed", seed)
     plan = solution.trajectory
     if isinstance(controller, OffsetFree):
         other = controller.solution.trajectory
