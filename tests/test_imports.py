@@ -73,7 +73,7 @@ FLOORS_WITHIN = {
             "state_bounds",
         ),
         ("problem",),
-        ("belief", "last_command"),
+        ("belief",),
     ),
     "solvers": (
         ("budget", "compiled", "initial_guess"),

@@ -95,8 +95,7 @@ from lqrsim.kernels.records import (
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
-from lqrsim.problem.control_rate import RateCost, RateLimits
-from lqrsim.problem.last_command import LastCommand
+from lqrsim.problem.control_rate import LastCommand, RateCost, RateLimits
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.problem.within_periods import WithinPeriods
 from lqrsim.results.archive import sha256

@@ -13,8 +13,8 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import check_symmetric
+from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.costs import CostSum
-from lqrsim.problem.last_command import with_last_command
 from lqrsim.solvers import compiled
 
 

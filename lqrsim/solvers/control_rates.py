@@ -21,7 +21,7 @@ import numpy.typing as npt
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.last_command import with_last_command
+from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
 from lqrsim.results.plan import Plan, Replan

@@ -17,8 +17,8 @@ from lqrsim.annotations import Progress, checked
 from lqrsim.errors import InputError, check_items, check_kind, check_memory, check_number
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Policy
+from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.derivative_check import check_functions, functions_of
-from lqrsim.problem.last_command import with_last_command
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
