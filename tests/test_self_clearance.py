@@ -108,22 +108,29 @@ def test_links_are_those_that_mujoco_lets_collide(seed: int) -> None:
 THROUGH = [((2.58, 3.49), (1.94, 2.18)), ((2.38, 1.6), (2.06, 3.36)), ((2.12, 1.38), (2.38, 3.31))]
 
 
-def arm(base: str = "", things: str = "") -> ls.MjcfRobot:
+def arm(base: str = "", things: str = "", *, first: str = "", motors: str = "") -> ls.MjcfRobot:
+    """Other bodies come before the arm or after it; `motors` are besides those of the joints."""
     links = mechanisms.arm(
         0.35, 0.3, 0.22, names=("shoulder", "elbow", "wrist"), joint='axis="0 0 1" damping="0.1"',
         geom='size="0.02" mass="0.5"', gap=0.05, option='gravity="0 0 0" timestep="0.01" integrator="implicitfast"',
     )  # fmt: skip
-    whole = links.replace("<worldbody>", f'<worldbody><body name="base">{base}').replace(
+    whole = links.replace("<worldbody>", f'<worldbody>{first}<body name="base">{base}').replace(
         "</worldbody>", f"</body>{things}</worldbody>"
     )
-    return ls.MjcfRobot(scene_from_xml(whole, "arm"))
+    return ls.MjcfRobot(scene_from_xml(whole.replace("</actuator>", f"{motors}</actuator>"), "arm"), body="upper")
 
 
-def test_links_keep_clear_of_their_base_but_not_of_what_they_handle() -> None:
-    """The upper arm is within the base in every position, and a box on the floor is no link."""
+@pytest.mark.parametrize("motors", ["", '<adhesion body="hand" ctrlrange="0 1" gain="1"/>'])
+@pytest.mark.parametrize("place", ["first", "things"])
+def test_links_keep_clear_of_their_base_but_not_of_what_they_handle(place: str, motors: str) -> None:
+    """The upper arm is within the base in every position, and a box on the floor is no link, wherever it stands.
+
+    A hand that holds by suction moves nothing before it touches something.
+    """
     base = '<geom type="cylinder" size="0.06 0.1"/>'
     box = '<body name="box" pos="0.5 0 0"><freejoint/><geom type="box" size="0.05 0.05 0.05"/></body>'
-    assert arm(base, box).self_clearance().links == (("base", "fore"), ("base", "hand"), ("upper", "hand"))
+    robot = arm(base, motors=motors, **{place: box})
+    assert robot.self_clearance().links == (("base", "fore"), ("base", "hand"), ("upper", "hand"))
 
 
 @pytest.mark.parametrize(("start", "goal"), THROUGH)

@@ -40,7 +40,8 @@ def posed(
 def driven_trees(model: mujoco.MjModel, body: int) -> set[int]:
     """The kinematic trees that actuators move, and the tree of a body."""
     data = next(posed(model, [model.qpos0], mujoco.mj_fwdPosition))
-    return {int(model.body_treeid[body]), *model.dof_treeid[data.moment_colind].tolist()}
+    dofs = data.moment_colind[: data.moment_rownnz.sum()]  # the rest is unused, as of an adhesion that touches nothing
+    return {int(model.body_treeid[body]), *model.dof_treeid[dofs].tolist()}
 
 
 @unlogged()
