@@ -10,7 +10,7 @@ import pytest
 from sampling import is_short
 from scipy.linalg import solve_discrete_are
 from scipy.stats import norm
-from sympy import cos, sin, sqrt
+from sympy import Matrix, cos, sin, sqrt
 
 import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
@@ -214,6 +214,23 @@ def test_the_tube_of_a_linear_system_is_that_of_lqg() -> None:
         ls.predict_tube(problem, solution, ls.disturbances.Uncertainty())
 
 
+@pytest.mark.parametrize("form", [list, tuple, np.array, Matrix])
+def test_readings_and_chance_constraints_are_lists_arrays_or_matrices(form: Any) -> None:
+    def near(x: Any, u: Any, p: Any) -> list[Any]:
+        return [1 - x.x, 2 - x.v**2]
+
+    of = linear_belief()
+    sensors = ls.belief.NoisySensors(lambda x, u, p: form(linear_readings(x, u, p)))
+    read = ls.belief.Belief(of.robot, dt=DT, noise=ls.Noise(M), sensors=sensors)
+    states = np.array([[0.3, -0.2], [1.0, 2.0]])
+    for one, other in zip(of.read(states), read.read(states), strict=True):
+        np.testing.assert_array_equal(one, other)
+    kept, formed = (of.chance_constraint(f, chance=0.1) for f in (near, lambda x, u, p: form(near(x, u, p))))
+    point = np.concatenate([of.state([0.3, -0.2], np.diag([0.1, 0.2])), np.zeros(2)])
+    terms = [PlainTerm(one.bind(of), 5, 2) for one in (kept, formed)]
+    assert [terms[0].value(point, row) for row in (0, 1)] == [terms[1].value(point, row) for row in (0, 1)]
+
+
 def test_what_is_no_belief_is_refused() -> None:
     given: dict[str, Any] = {"dt": DT, "noise": ls.Noise(0.1 * np.eye(3)), "sensors": ls.belief.NoisySensors(beacons)}
     two: dict[str, Any] = given | {"noise": ls.Noise(M)}
@@ -227,6 +244,9 @@ def test_what_is_no_belief_is_refused() -> None:
         ("covariance: got one that is not positive definite", lambda: belief().state([0, 0, 0], [1, 1, 0])),
         ("covariance: got -1, want standard deviations >= 0", lambda: belief().state([0, 0, 0], [1, -1, 1])),
         ("covariance: got .* want a symmetric", lambda: belief().state([0, 0, 0], np.eye(3) + np.eye(3, k=1))),
+        ("got None, want expressions", lambda: linear_belief().chance_constraint(lambda x, u, p: None, chance=0.1).bind(
+            linear_belief()
+        )),
         ("chance: got 0.7", lambda: belief().chance_constraint(unicycle, chance=0.7)),
         ("parameters: got 'skid' twice", lambda: ls.belief.Belief(
             robot(), dt=DT, noise=belief().process, sensors=ls.belief.NoisySensors(beacons, parameters={"skid": 1.0}),

@@ -318,6 +318,19 @@ def test_a_lambda_is_called_by_its_expressions() -> None:
         ls.SymbolicCost(line, name="")
 
 
+@pytest.mark.parametrize("form", [lambda one: one, np.array, lambda one: np.array([one]), lambda one: [one]])
+def test_one_expression_is_itself_or_an_array_or_a_list(form: Callable[[Any], Any]) -> None:
+    """An array without axes, too, such as a number of NumPy's."""
+    z = np.array([0.25, 0.0, 0.0])
+    constraint = ls.SymbolicConstraint(lambda x, u, p: form(1 - x.x**2))
+    assert PlainTerm(constraint.bind(DYNAMICS), 2, 1).value(z, 0) == 1 - 0.25**2
+    for expected, cost in (
+        (1 - 0.25**2, lambda x, u, p: form(1 - x.x**2)),
+        (2.0, lambda x, u, p: form(np.float64(2.0))),
+    ):
+        assert PlainTerm(ls.SymbolicCost(cost).bind(DYNAMICS), 2, 1).cost(z)[0] == expected
+
+
 def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path) -> None:
     case = problem(ls.GoalState([1, 0]), ls.StateBounds(v=(-np.inf, 0.6)))
     solution = ls.smooth(case)

@@ -143,11 +143,8 @@ def trace(
         raise InputError(f"{called}: got {got}, want {want}") from None
     if returned is None:
         raise InputError(f"{called}: got None, want expressions: is a return missing?")
-    if hasattr(returned, "tolist"):  # a NumPy array or a SymPy matrix
-        returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
-    listed = returned if isinstance(returned, (list, tuple)) else [returned]
     expressions = []
-    for i, entry in enumerate(listed):
+    for i, entry in enumerate(entries_of(returned)):
         try:
             expression = sympy.sympify(entry, strict=True)
         except sympy.SympifyError:
@@ -167,6 +164,15 @@ def trace(
                 raise InputError(f"{called}: got {piecewise} in entry {i}, want its last case to be (expression, True)")
         expressions.append(without_kinks(expression))
     return expressions, x, u
+
+
+def entries_of(returned: Any) -> list[Any]:
+    """The entries of what a function returned: of a list, or row by row; of a single expression, itself."""
+    if not hasattr(returned, "tolist"):
+        return list(returned) if isinstance(returned, (list, tuple)) else [returned]
+    listed = returned.tolist()  # of a NumPy array, which may be a single number, or of a SymPy matrix
+    rows = listed if isinstance(listed, list) else [listed]
+    return [entry for row in rows for entry in (row if isinstance(row, list) else [row])]
 
 
 @contextlib.contextmanager

@@ -407,8 +407,8 @@ class Term:
         _ = self.code  # which is checked
 
 
-def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[list[Any]]:
-    """This number of rows that a user's function returned, in lists or arrays."""
+def rows_of(returned: Any, count: int | None, wanted: str, what: str = "rows") -> list[list[Any]]:
+    """This number of rows, or any, that a user's function returned, in lists or arrays."""
     if returned is None:
         raise InputError(f"got None, want {wanted}: is a return missing?")
     listed = returned.tolist() if hasattr(returned, "tolist") else returned
@@ -416,7 +416,7 @@ def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[
         rows = [row.tolist() if hasattr(row, "tolist") else list(row) for row in listed]
     except TypeError:
         raise InputError(f"got {excerpt(returned)}, want {wanted}") from None
-    if len(rows) != count:
+    if count is not None and len(rows) != count:
         raise InputError(f"got {len(rows)} {what}, want {wanted}")
     return rows
 

@@ -210,12 +210,13 @@ class Belief(Dynamics):
         quantile, deviations = -NormalDist().inv_cdf(chance), free_name("deviations", values)
 
         @functools.wraps(function)
-        def margin(x: Any, u: Any, p: Any) -> list[Any]:
+        def margin(x: Any, u: Any, p: Any) -> list[Any] | None:
             from sympy import sqrt, sympify
 
-            returned = function(symbolic.Vector(x[:n], names), u, p)
+            if (returned := function(symbolic.Vector(x[:n], names), u, p)) is None:
+                return None  # which is refused
             root, margins = _lower(x[n:], len(rows)), []
-            for entry in returned if isinstance(returned, list | tuple) else [returned]:
+            for entry in symbolic.entries_of(returned):
                 slopes = [sympify(entry).diff(x[i]) for i in rows]
                 spread = sum(sum(slopes[i] * root[i][j] for i in range(j, len(rows))) ** 2 for j in range(len(rows)))
                 margins.append(entry - getattr(p, deviations) * sqrt(spread))
@@ -285,8 +286,7 @@ class Belief(Dynamics):
         @functools.wraps(function)
         def listed(x: Any, u: Any, p: Any) -> list[Any]:
             returned, wanted = function(x, u, p), "pairs of a reading and the standard deviation of its noise"
-            count = len(returned) if isinstance(returned, list | tuple) else -1
-            pairs = rows_of(returned, count, wanted)
+            pairs = rows_of(returned, None, wanted)
             if not pairs or any(len(pair) != 2 for pair in pairs):
                 raise InputError(f"got {returned}, want {wanted}, at least one")
             return [entry for pair in pairs for entry in pair]
