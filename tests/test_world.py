@@ -13,7 +13,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance_derivatives
 from lqrsim.problem import collision_shape
-from lqrsim.scenes.world import KINDS
+from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 SIZES = {
     "plane": (0.0, 0.0, 0.0),
@@ -138,3 +138,20 @@ def test_seen_from_above() -> None:
 def test_a_row_is_as_long_as_said() -> None:
     assert ls.World([obstacle("box")]).table.shape == (ROW,)
     assert ls.World().distance(np.zeros((7, 3))).tolist() == [np.inf] * 7
+
+
+@pytest.mark.parametrize("kind", [*OTHER_KINDS, "mesh"])
+@settings(max_examples=examples(10))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_obstacles_without_a_distance_here_are_refused_for_that_reason(kind: str, seed: int) -> None:
+    """Whatever their place: in space, from above, and as prisms. A mesh without corners has no distance."""
+    rng = np.random.default_rng(seed)
+    size, turned = rng.uniform(0.1, 1.0, size=3), Rotation.random(rng=rng).as_matrix()
+    world = ls.World([ls.Obstacle("thing", kind, rng.normal(size=3), turned, size)])
+    for distances in (
+        lambda: world.distances(np.zeros(3)),
+        lambda: world.seen_by("xy").distances(np.zeros(2)),
+        lambda: world.seen_by("xz", 0.0).upright().distances(np.zeros(2)),
+    ):
+        with pytest.raises(ls.InputError, match=f"^obstacle 'thing': got a {kind}, want one of: plane, .*corners"):
+            distances()

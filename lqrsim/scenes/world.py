@@ -88,14 +88,18 @@ class Obstacle:
     def _equals(self, other: "Obstacle", *fields: str) -> bool:
         return self is other or all(np.array_equal(getattr(self, field), getattr(other, field)) for field in fields)
 
-    @property
-    def row(self) -> Array:
-        """This obstacle as `ROW` numbers."""
+    def _check_kind(self) -> None:
+        """Raise InputError unless a distance to it is implemented here."""
         if self.kind not in KINDS or (self.kind == "mesh" and not len(self.corners)):
             raise InputError(
                 f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)} with corners; or an"
                 " MjcfRobot, with geoms=robot.geoms, whose distances are MuJoCo's"
             )
+
+    @property
+    def row(self) -> Array:
+        """This obstacle as `ROW` numbers."""
+        self._check_kind()
         high = np.inf if self.size[2] == np.inf else 0.0
         size = (0.0, len(self.corners), high) if len(self.corners) else self.size
         return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), size])
@@ -252,6 +256,7 @@ def _parallel(obstacle: Obstacle, across: int) -> bool:
 
 def _prism(obstacle: Obstacle) -> Obstacle:
     """An obstacle of a plane as an infinite prism. Raises InputError if its outline depends on the height."""
+    obstacle._check_kind()
     axis = np.abs(obstacle.rotation[2])  # how much of each local axis is along the normal of the plane
     up, high, size = int(axis.argmax()), abs(obstacle.position[2]), obstacle.size.copy()
     size[up], cylinder_size = np.inf, np.array([obstacle.size[0], np.inf, 0.0])
@@ -274,6 +279,7 @@ def _prism(obstacle: Obstacle) -> Obstacle:
 
 def _from_above(obstacle: Obstacle) -> Obstacle:
     """The obstacle with infinite height; planes are unchanged. Raises InputError if it is tilted."""
+    obstacle._check_kind()
     upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # flags of a vertical local axis
     size = obstacle.size.copy()
     match obstacle.kind:
