@@ -353,7 +353,9 @@ class Problem(OneVersion):
 
     def _checked_parts(self) -> "Problem":
         """The same problem, whose costs or constraints must go with the rest."""
-        self._check_end_costs()
+        for name in ("initial", "final_cost"):
+            if any(term.uses_control for term in self._terms[name]):
+                raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         self._check_duration()
         self._check_between_knots()
         return self
@@ -501,11 +503,6 @@ class Problem(OneVersion):
         if self.accuracy is not None or self.between_knots:
             parts.append(repr((self.accuracy, self.between_knots)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
-
-    def _check_end_costs(self) -> None:
-        for name in ("initial", "final_cost"):
-            if any(term.uses_control for term in self._terms[name]):
-                raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
 
     def _check_duration(self) -> None:
         knots = self.segments

@@ -108,9 +108,7 @@ class GeomsInWorld(ShapeInWorld):
 
     def clearances(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distances (..., O) in m at states (..., n); (K, ..., n), if obstacles are displaced by (K, O, 3)."""
-        states = vectors_of("states", states, len(self.dynamics.state_coordinates))
-        distances, _ = _distances(states.reshape(-1, states.shape[-1]), self._to_each()[1], displaced)
-        return distances.reshape(*states.shape[:-1], len(self.world))
+        return _distances(self.dynamics, states, self._to_each()[1], displaced)[0]
 
     def clearance(self, places: Array, displaced: Array | None = None) -> Array:
         """NaN where a state has a NaN."""
@@ -140,7 +138,7 @@ class GeomsInWorld(ShapeInWorld):
             return None
         state = np.where(np.isnan(state), 0.0, state)  # velocities and activations, which move no geom
         chosen, data = self._to_each()
-        distances, pairs = _distances(state[None], data)
+        distances, pairs = _distances(self.dynamics, state, data)
         if distances.min() >= -TOUCHING:
             return None
         nearest, model = int(distances.argmin()), self.geoms.scene.model
@@ -210,11 +208,8 @@ class SelfClearance(Constraint):
 
     def distances(self, dynamics: MjcfDynamics, states: npt.ArrayLike) -> Array:
         """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m."""
-        states = vectors_of("states", states, len(dynamics.state_coordinates))
         data = mjcf_obstacles.distance_data(self._mjcf.model, self._pairs, self._rows, len(self.links), 1.0)
-        data = np.concatenate([[float(dynamics.physics.address())], data])
-        distances, _ = _distances(states.reshape(-1, states.shape[-1]), data)
-        return distances.reshape(*states.shape[:-1], len(self.links))
+        return _distances(dynamics, states, np.concatenate([[float(dynamics.physics.address())], data]))[0]
 
     def check(self, field: str, dynamics: MjcfDynamics, state: Array) -> None:
         """Raises InputError if links are nearer to each other than the margin at a state (n,), named `field`."""
@@ -228,18 +223,21 @@ class SelfClearance(Constraint):
             )
 
 
-def _distances(states: Array, data: Array, displaced: Array | None = None) -> tuple[Array, Array]:
-    """Distances (K rows,) at states (K, n) by the kernel's data, and the pair of each row at the last state.
+def _distances(
+    dynamics: Dynamics, states: npt.ArrayLike, data: Array, displaced: Array | None = None
+) -> tuple[Array, Array]:
+    """Distances (..., rows) at states (..., n) by the kernel's data, and the pair of each row at the last state.
 
-    Obstacles are displaced by (D, rows, 3) in m, by the first of these for the first K / D states.
+    Obstacles are displaced by (D, rows, 3) in m, by the first of these for the first of D equal parts of the states.
     """
-    flat, rows = in_c_order(states), int(data[1])
+    states = vectors_of("states", states, len(dynamics.state_coordinates))
+    flat, rows = in_c_order(states.reshape(-1, states.shape[-1])), int(data[1])
     displaced = np.zeros((1, rows, 3)) if displaced is None else displaced
     distances, pairs, each = np.empty(len(flat) * rows), np.empty(rows), max(1, len(flat) // max(1, len(displaced)))
     _module(flat.shape[1]).distances_of(
         len(flat), flat, each, in_c_order(displaced.reshape(-1)), data, distances, pairs, np.empty((rows, 6))
     )
-    return distances, pairs
+    return distances.reshape(*states.shape[:-1], rows), pairs
 
 
 def _module(states: int) -> Any:
