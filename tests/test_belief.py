@@ -15,7 +15,7 @@ from sympy import Matrix, cos, sin, sqrt
 import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
-from lqrsim.problem.plain_term import PlainTerm
+from lqrsim.problem.constraints import PlainTerm
 from lqrsim.results.solution_parts import Status
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.view.figure_parts import accuracy

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
-from lqrsim.problem.plain_term import PlainTerm
+from lqrsim.problem.constraints import PlainTerm
 from lqrsim.problem.within_periods import TIMES, WithinPeriods
 from lqrsim.solvers import between_knots as solver
 

@@ -68,7 +68,6 @@ FLOORS_WITHIN = {
             "control_rate",
             "formulas",
             "obstacle_cost",
-            "plain_term",
             "quadratic_cost",
             "state_bounds",
         ),

@@ -33,12 +33,12 @@ from lqrsim.problem.constraints import (
     by_name,
     goals_of,
     names_of,
+    violated,
 )
 from lqrsim.problem.control_rate import ControlRate, RateLimits
 from lqrsim.problem.costs import Cost, CostSum, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
-from lqrsim.problem.plain_term import violated
 from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
