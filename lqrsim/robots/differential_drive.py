@@ -1,7 +1,7 @@
 """The iRobot Create: two wheels, driven by their speeds. Paper: Sec. VI-A."""
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -36,9 +36,17 @@ class DifferentialDrive(Robot):
     actuators = ("create_wheel_left", "create_wheel_right")
     wheels = ("create_tread_left", "create_tread_right")
 
-    @property
-    def dynamics(self) -> Dynamics:
-        return _dynamics(self)
+    @cached_property
+    def dynamics(self) -> Dynamics:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return Dynamics(
+            _rate,
+            states={"x": "m", "y": "m", "heading": "rad"},
+            controls={"left": "m/s", "right": "m/s"},
+            parameters={"axle_length": self.axle_length},
+            position=("x", "y"),
+            angles=("heading",),
+            control_limits=(-self.max_speed, self.max_speed),
+        )
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         qpos, _ = configuration_of(qpos, qvel, 9, 8)
@@ -56,19 +64,6 @@ class DifferentialDrive(Robot):
         qpos[..., 3] = np.cos(state[..., 2] / 2)
         qpos[..., 6] = np.sin(state[..., 2] / 2)
         return qpos, np.zeros((*state.shape[:-1], 8))
-
-
-@cache
-def _dynamics(robot: DifferentialDrive) -> Dynamics:
-    return Dynamics(
-        _rate,
-        states={"x": "m", "y": "m", "heading": "rad"},
-        controls={"left": "m/s", "right": "m/s"},
-        parameters={"axle_length": robot.axle_length},
-        position=("x", "y"),
-        angles=("heading",),
-        control_limits=(-robot.max_speed, robot.max_speed),
-    )
 
 
 def _rate(x: Any, u: Any, p: Any) -> list[Any]:

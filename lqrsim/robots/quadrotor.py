@@ -1,7 +1,7 @@
 """The quadrotor, driven by the forces of its rotors. Paper: Sec. VI-B."""
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,9 +53,22 @@ class Quadrotor(Robot):
         """The force of each rotor in hover, in N: a quarter of the weight."""
         return self.mass * self.gravity / 4
 
-    @property
-    def dynamics(self) -> Dynamics:
-        return _dynamics(self)
+    @cached_property
+    def dynamics(self) -> Dynamics:  # pyright: ignore[reportIncompatibleMethodOverride]
+        units = {"x y z": "m", "vx vy vz": "m/s", "rx ry rz": "rad", "wx wy wz": "rad/s"}
+        constants = ("mass", "inertia", "arm", "torque_ratio", "drag", "gravity")
+        if self.yaw_inertia is not None:
+            constants += ("yaw_inertia",)
+        return Dynamics(
+            _rate if self.yaw_inertia is None else _rate_with_two_inertias,
+            states={name: unit for names, unit in units.items() for name in names.split()},
+            controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
+            parameters={name: getattr(self, name) for name in constants},
+            disturbances={f"{kind}_{axis}": 0.0 for kind in ("wind", "force", "torque") for axis in "xyz"},
+            position=("x", "y", "z"),
+            rotation_vectors=(("rx", "ry", "rz"),),
+            control_limits=(self.min_force, self.max_force),
+        )
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         qpos, qvel = configuration_of(qpos, qvel, 7, 6)
@@ -68,24 +81,6 @@ class Quadrotor(Robot):
         position, velocity, rotation, angular_velocity = np.split(state, 4, axis=-1)
         qpos = np.concatenate([position, rotations.quaternion(rotation)], axis=-1)
         return qpos, np.concatenate([velocity, angular_velocity], axis=-1)
-
-
-@cache
-def _dynamics(robot: Quadrotor) -> Dynamics:
-    units = {"x y z": "m", "vx vy vz": "m/s", "rx ry rz": "rad", "wx wy wz": "rad/s"}
-    constants = ("mass", "inertia", "arm", "torque_ratio", "drag", "gravity")
-    if robot.yaw_inertia is not None:
-        constants += ("yaw_inertia",)
-    return Dynamics(
-        _rate if robot.yaw_inertia is None else _rate_with_two_inertias,
-        states={name: unit for names, unit in units.items() for name in names.split()},
-        controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
-        parameters={name: getattr(robot, name) for name in constants},
-        disturbances={f"{disturbance}_{axis}": 0.0 for disturbance in ("wind", "force", "torque") for axis in "xyz"},
-        position=("x", "y", "z"),
-        rotation_vectors=(("rx", "ry", "rz"),),
-        control_limits=(robot.min_force, robot.max_force),
-    )
 
 
 def _rate_with_two_inertias(x: Any, u: Any, p: Any) -> list[Any]:
