@@ -227,7 +227,7 @@ def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
     """The terms of a sum; a single cost is its own."""
     if isinstance(cost, CostSum):
         return cost.terms
-    check_kind(field, cost, Cost, Cost._want + (", or a FixedState" if field == "initial" else ""))
+    check_kind(field, cost, Cost, Cost._want)
     return (cost,)
 
 
