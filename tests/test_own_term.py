@@ -1,18 +1,24 @@
 """A kind of cost that a user writes, class and kernel in one file, goes wherever those of the package go."""
 
+import importlib
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 from huber_distance import HuberDistance
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen.compiled_module import module_of
 from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.sources import source_of
 from lqrsim.solvers.multistart import passable
 from lqrsim.view.viewer import MovableGoal
 
@@ -167,3 +173,28 @@ def test_what_else_a_file_says_is_no_part_of_the_problem(tmp_path: Path) -> None
         done = subprocess.run([sys.executable, "own.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
         digests.append(done.stdout)
     assert digests[0] == digests[1] != digests[2]
+
+
+OWN_KERNEL = "SCALE = {}\n\n\ndef value(x, u, t, data):\n    return {}\n"
+
+
+@settings(max_examples=examples(5), phases=[Phase.explicit, Phase.generate])
+@given(
+    versions=st.lists(
+        st.tuples(st.integers(1, 9), st.sampled_from(["SCALE * x[0]", "SCALE - x[0]"])), min_size=2, max_size=5
+    )
+)
+def test_a_file_that_is_loaded_again_has_its_new_kernels(versions: list[tuple[int, str]]) -> None:
+    """As in a notebook, where a file is edited and loaded again."""
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        patch.setattr(sys, "dont_write_bytecode", True)  # Python tells versions of a file apart by size and second
+        own = None
+        for scale, formula_of_it in versions:
+            Path(folder, "loaded_again.py").write_text(OWN_KERNEL.format(scale, formula_of_it), encoding="utf-8")
+            own = importlib.import_module("loaded_again") if own is None else importlib.reload(own)
+            source, wanted = source_of(own), eval(formula_of_it, {"SCALE": scale, "x": [2.0]})
+            compiled = module_of(source, "a file loaded again", N=1, M=1).value
+            for value in (plain_functions(source, {"N": 1, "M": 1}, ["value"])["value"], compiled):
+                assert value(np.array([2.0]), np.zeros(1), 0, np.zeros(0)) == wanted
+        del sys.modules["loaded_again"]

@@ -40,6 +40,7 @@ class Source:
     """Functions of a module or a text; `source_of` and `text_source` make it.
 
     Attributes:
+      text: of a user's module, as it was loaded: it may be edited, and loaded again. Of the package's modules empty.
       constants: (name, number or tuple of numbers), which replace the module's.
       fills: (name, source, name there) of functions that take the place of functions of the module or its imports.
     """
@@ -61,8 +62,7 @@ class Source:
     def digest(self) -> str:
         """A hash of everything that defines the source."""
         filled = (f"{name}={source.digest}.{inner_name}" for name, source, inner_name in self.fills)
-        text = _text_of(self.module) if self.module else ""
-        return sha256(self.module, text, self.text, repr(self.constants), *filled)
+        return sha256(self.module, _defining(self), repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
         """This source with functions filled in: name -> source, or (source, name there).
@@ -97,7 +97,8 @@ def source_of(module: ModuleType | str, **constants: Constant) -> Source:
         if not (_is_constant(getattr(home, constant, None)) and _is_constant(number)):
             want = "a number or a tuple of numbers, in place of one that the file declares"
             raise InputError(f"source_of: {constant}: got {excerpt(number)}, want {want}")
-    return Source(name, constants=tuple(sorted(constants.items())), what=name)
+    text = "" if _is_packaged(name) else _text_of(name)
+    return Source(name, text, tuple(sorted(constants.items())), what=name)
 
 
 def text_source(text: str, what: str = "source") -> Source:
@@ -183,7 +184,7 @@ class Scope:
 
     def __init__(self, source: Source, sizes: Mapping[str, int]) -> None:
         self.source, self.sizes = source, {"W": sizes.get("N", 0) + sizes.get("M", 0), **sizes}
-        parsed = _parsed_module(source.module) if source.module else _parse(source.text)
+        parsed = _parse(source.text or _text_of(source.module))
         self._functions, self._imports = parsed.functions, parsed.imports
         self._constants = dict(source.constants)
         self._fills = {name: (filled, inner_name) for name, filled, inner_name in source.fills}
@@ -249,7 +250,7 @@ class Scope:
         if name in MATH:
             return self._imported("math", name)
         for module in (rotation_ratios, signed_distance, linear_algebra):
-            if name in _parsed_module(module.__name__).functions:
+            if name in _parse(_text_of(module.__name__)).functions:
                 return self._module(module.__name__).find(name)
         return self._declared(name)
 
@@ -283,28 +284,37 @@ def _imported(module: str) -> ModuleType:
         raise InputError(f"source: module: got {excerpt(module)}, want the name of one that can be imported") from None
 
 
-@functools.cache
+def _is_packaged(module: str) -> bool:
+    return module.startswith(__name__.partition(".")[0] + ".")
+
+
+_texts: dict[str, tuple[Any, str]] = {}  # of modules, beside the specification with which each was loaded
+
+
 def _text_of(module: str) -> str:
-    """What defines a module's kernels: its functions, and the constants in them, for what else stands in a user's file
-    changes no compiled code. Of a module of the package it is the whole text, which need not be parsed.
+    """The text of a module when it was last loaded, as far as it was read before an edit."""
+    spec = _imported(module).__spec__
+    if module not in _texts or _texts[module][0] is not spec:
+        _texts[module] = spec, inspect.getsource(_imported(module))
+    return _texts[module][1]
+
+
+def _defining(source: Source) -> str:
+    """What defines a source: of a user's module its functions, and the constants in them, for what else stands in the
+    file changes no compiled code. Of a module of the package it is the whole text, which need not be parsed.
     """
-    if module.startswith(__name__.partition(".")[0] + "."):
-        return inspect.getsource(_imported(module))
-    home, parsed = _imported(module), _parsed_module(module)
+    if not source.module or _is_packaged(source.module):
+        return source.text or _text_of(source.module)
+    home, parsed = _imported(source.module), _parse(source.text or _text_of(source.module))
     names = {node.id for tree in parsed.functions.values() for node in ast.walk(tree) if isinstance(node, ast.Name)}
     constants = ((name, getattr(home, name, None)) for name in sorted(names))
     return "\n".join([parsed.text, *(f"{name} = {value!r}" for name, value in constants if _is_constant(value))])
 
 
 @functools.cache
-def _parsed_module(module: str) -> _Parsed:
-    return _parse(inspect.getsource(_imported(module)))
-
-
-@functools.cache
 def _left_open(module: str) -> frozenset[str]:
     """The names that can be filled in for a module: its functions, and the declarations that it and its imports use."""
-    parsed = _parsed_module(module)
+    parsed = _parse(_text_of(module))
     declared = {name for home, name in parsed.imports.values() if home == declarations.__name__}
     others = {home for home, _ in parsed.imports.values() if _is_kernels(home) and home not in _WITHOUT_FUNCTIONS}
     return frozenset(declared | parsed.functions.keys()).union(*(_left_open(home) for home in others))
@@ -313,7 +323,7 @@ def _left_open(module: str) -> frozenset[str]:
 _WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=512)
 def _parse(text: str) -> _Parsed:
     functions, imports, lines, texts = {}, {}, text.splitlines(), []
     try:
