@@ -15,7 +15,7 @@ from lqrsim.verify.checks import EMPTY
 from lqrsim.view import gl
 from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import INTERPOLATED, DrawnTube, Overlays, Scale, colour_of, legend_entries
-from lqrsim.view.picture import PictureOptions, open_picture
+from lqrsim.view.picture import open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
@@ -115,10 +115,10 @@ def test_it_is_seen_where_it_is(flight: ls.Rollout, quadrotor_solution: ls.Solut
     def picture(*levels: float, knots: tuple[int, ...] = (60, 110)) -> np.ndarray:
         funnel = funnel_by_hand(quadrotor_solution, 0.15**2 * np.eye(3), knots=knots, levels=levels or (0.0, 0.0))
         show: tuple[Overlay, ...] = ("funnel",) if levels else ()
-        options = PictureOptions(
-            camera="top", overlays=show, funnel=funnel if levels else None, quality="draft", size=(640, 360)
-        )
-        with open_picture(flight, options) as drawn:
+        about = funnel if levels else None
+        with open_picture(
+            flight, camera="top", overlays=show, funnel=about, quality="draft", size=(640, 360)
+        ) as drawn:  # fmt: skip
             camera = drawn.panes[0].camera
             assert camera is not None
             for knot in (10, 60, 85, 110, 130):

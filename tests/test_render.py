@@ -22,7 +22,7 @@ from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.captions import Legend
 from lqrsim.view.options import ALL_OVERLAYS, DRAWN_BY, OVERLAYS, Overlay
 from lqrsim.view.overlays import DrawnTube, Overlays, Scale, colour_of, legend_entries
-from lqrsim.view.picture import PictureOptions, open_picture
+from lqrsim.view.picture import open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.render import render
 
@@ -168,7 +168,7 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
 def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
     """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
     with (
-        open_picture(rollout, PictureOptions(size=(640, 360), overlays=BARE)) as drawn,
+        open_picture(rollout, size=(640, 360), overlays=BARE) as drawn,
         mujoco.Renderer(drawn.parts[0].model, 360, 640) as segmenter,
     ):
         segmenter.enable_segmentation_rendering()
@@ -332,7 +332,7 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
 @pytest.mark.parametrize("camera", ["overview", *rarely("top", "side", "chase")])
 def test_captions_cover_neither_the_plan_nor_one_another(camera: str, flight: ls.Rollout) -> None:
     """Texts are strips beside the panes, and calibrated panes show the whole plan."""
-    with open_picture(flight, PictureOptions(camera=camera, size=(640, 360), insets=("top",))) as drawn:
+    with open_picture(flight, camera=camera, size=(640, 360), insets=("top",)) as drawn:
         (part,) = drawn.parts
         assert part.caption is not None
         assert drawn.legend is not None
@@ -350,12 +350,12 @@ def test_captions_cover_neither_the_plan_nor_one_another(camera: str, flight: ls
 def test_runs_side_by_side_have_one_zoom(camera: str, quadrotor: ls.Scenario, flight: ls.Rollout) -> None:
     """The farther run is what both panes show, and a metre of both has as many pixels."""
     far = dataclasses.replace(flight, states=flight.states + np.r_[[3.0, 0, 0], np.zeros(flight.states.shape[2] - 3)])
-    with open_picture([flight, far], PictureOptions(camera=camera, size=(640, 360))) as drawn:
+    with open_picture([flight, far], camera=camera, size=(640, 360)) as drawn:
         drawn.draw(0.0)
         seen = [part.scene.camera[0] for part in drawn.parts]
         for name in ("pos", "forward", "frustum_top", "orthographic"):
             np.testing.assert_allclose(*(getattr(one, name) for one in seen), rtol=1e-6, atol=0)
-    with open_picture(flight, PictureOptions(camera=camera, size=(320, 360))) as alone:
+    with open_picture(flight, camera=camera, size=(320, 360)) as alone:
         alone.draw(0.0)
         before = alone.parts[0].scene.camera[0]
         assert before.frustum_top != seen[0].frustum_top or not np.allclose(before.pos, seen[0].pos)
@@ -364,7 +364,7 @@ def test_runs_side_by_side_have_one_zoom(camera: str, quadrotor: ls.Scenario, fl
 @draws
 def test_captions_of_narrow_parts_are_not_cut_off(flight: ls.Rollout) -> None:
     """No ink in the last columns of a caption's strip: what is too long for one line goes on in the next."""
-    with open_picture([flight] * 3, PictureOptions(size=(720, 360))) as drawn:
+    with open_picture([flight] * 3, size=(720, 360)) as drawn:
         for time in (0.0, drawn.end):
             image = drawn.draw(time)
             for part in drawn.parts:
@@ -378,7 +378,7 @@ def test_captions_of_narrow_parts_are_not_cut_off(flight: ls.Rollout) -> None:
 @pytest.mark.parametrize("camera", ["side", *rarely("top")])
 def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, tmp_path: Path) -> None:
     """Green pixels of a pane, against where the camera's own formula sees the marker on the simulator's body."""
-    with open_picture(rollout, PictureOptions(insets=(camera,), size=(640, 360))) as drawn:
+    with open_picture(rollout, insets=(camera,), size=(640, 360)) as drawn:
         pane, data = drawn.panes[1], mujoco.MjData(drawn.parts[0].recorded.model)
         assert pane.camera is not None
         for time in (0.0, 2.0, 4.5):
@@ -462,8 +462,8 @@ def test_half_axes_of_a_tube_in_pixels(flight: ls.Rollout, tmp_path: Path) -> No
     tube = np.zeros((151, 3, 3))
     tube[0] = np.diag([0.3**2, 0.15**2, 0.1**2])
     run = dataclasses.replace(flight, plan=dataclasses.replace(flight.plan, states=states), tube=tube)
-    options = PictureOptions(camera="top", overlays=("tube",), size=(1280, 720))
-    with open_picture(run, options) as drawn:
+    options: dict = {"camera": "top", "overlays": ("tube",), "size": (1280, 720)}
+    with open_picture(run, **options) as drawn:
         with_it = drawn.draw(4.0).astype(int)
         camera, recorded = drawn.panes[0].camera, drawn.parts[0].recorded
         assert camera is not None
@@ -471,7 +471,7 @@ def test_half_axes_of_a_tube_in_pixels(flight: ls.Rollout, tmp_path: Path) -> No
         ends = np.array([centre + sign * 2 * std * axis for std, axis in ((0.3, np.eye(3)[0]), (0.15, np.eye(3)[1]))
                          for sign in (-1, 1)])  # fmt: skip
         places = np.array([camera.project(end, (1280, 720)) for end in ends])
-    with open_picture(dataclasses.replace(run, tube=None), options) as drawn:
+    with open_picture(dataclasses.replace(run, tube=None), **options) as drawn:
         changed = np.abs(with_it - drawn.draw(4.0)).max(axis=2) > 4
     middle = places.mean(axis=0)
     rows, columns = np.nonzero(changed)

@@ -1,10 +1,10 @@
 """Drawables as MuJoCo's geoms, in addition to the model's; and the mark by which a robot is found in a video."""
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array
@@ -19,6 +19,7 @@ NewGeom = Callable[[], mujoco.MjvGeom]
 MARK_RGB = (0.0, 1.0, 0.0)
 RIM = 1.8  # radius of the black ball, in radii of the green one: a video then blurs one colour into the whole edge
 GLOW = 0.3  # emission of what hangs in space; what lies on a floor is lit as the floor is
+UPRIGHT = np.eye(3)
 END_ON = 0.9  # cosine of the angle to the line of sight above which an arrow is not drawn
 
 
@@ -95,24 +96,10 @@ def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: flo
 
 
 def set_geom(
-    geom: mujoco.MjvGeom,
-    kind: Geom,
-    size: npt.ArrayLike,
-    place: npt.ArrayLike,
-    rgba: npt.ArrayLike,
-    rotation: Array | None = None,
-    *,
-    emission: float,
+    geom: mujoco.MjvGeom, kind: Geom, size: Any, place: Any, rgba: Any, rotation: Array = UPRIGHT, *, emission: float
 ) -> mujoco.MjvGeom:
     """Give a geom this kind, size (3,), place (3,) and colour (4,), without shadow and gloss; returns the geom."""
-    mujoco.mjv_initGeom(
-        geom,
-        kind,
-        np.asarray(size, dtype=np.float64),
-        np.asarray(place, dtype=np.float64),
-        (np.eye(3) if rotation is None else rotation).ravel(),
-        np.asarray(rgba, dtype=np.float32),
-    )
+    mujoco.mjv_initGeom(geom, kind, size, place, rotation.ravel(), rgba)
     geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
     geom.specular, geom.emission = 0, emission
     return geom

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import mujoco
@@ -140,6 +141,8 @@ LEAST_HEIGHT = 16  # pixels of height that a caption must leave
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # colours between panes, and behind captions
 
 Pixel = Annotated[int, Bounds(at_least=64, at_most=LARGEST)]
+Size = Annotated[tuple[Pixel, Pixel], Want("a tuple")]
+CameraName = Annotated[str, Want("the name of a camera")]
 Title = Annotated[str, 100]
 
 
@@ -160,73 +163,55 @@ QUALITIES: dict[Quality, QualitySettings] = {
 }
 
 
-@checked
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PictureOptions:
-    """The arguments of these names of `render`; `open_picture` checks everything that depends on the runs."""
-
-    _prefix = ""
-
-    trial: int | Sequence[int] = 0
-    camera: Annotated[str, Want("the name of a camera")] = "overview"
-    insets: Annotated[Sequence[str], Want(f"a tuple of the names of cameras, {MOST_INSETS} at most")] = ()
-    titles: Annotated[Sequence[Title], Want("a tuple of texts, one for each run")] = ()
-    overlays: Shown = OVERLAYS
-    solution: Solution | Sequence[Solution | None] | None = None
-    funnel: Funnel | Sequence[Funnel | None] | None = None
-    quality: Quality = "standard"
-    size: tuple[Pixel, Pixel] | None = None
-    speed: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_drawn(self.overlays, solution=self.solution, funnel=self.funnel, titles=self.titles)
-        width, height = self.pixels
-        if width % 2 or height % 2:
-            raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
-        if len(self.insets) > MOST_INSETS:
-            raise InputError(f"insets: got {len(self.insets)}, want {MOST_INSETS} at most")
-
-    @property
-    def settings(self) -> QualitySettings:
-        return QUALITIES[self.quality]
-
-    @property
-    def pixels(self) -> tuple[int, int]:
-        """Width and height of the picture: `size`, or the size of the quality."""
-        return self.settings.size if self.size is None else self.size
-
-
 @contextlib.contextmanager
-def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> Iterator["Picture"]:
-    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts."""
-    (width, height), camera, insets = options.pixels, options.camera, options.insets
-    distinct, shown = _runs_and_trials(runs, options.trial)
+@checked
+def open_picture(
+    runs: Rollout | Sequence[Rollout],
+    *,
+    trial: int | Sequence[int] = 0,
+    camera: CameraName = "overview",
+    insets: Annotated[Sequence[str], Want(f"a tuple of the names of cameras, {MOST_INSETS} at most")] = (),
+    titles: Annotated[Sequence[Title], Want("a tuple of texts, one for each run")] = (),
+    overlays: Shown = OVERLAYS,
+    solution: Solution | Sequence[Solution | None] | None = None,
+    funnel: Funnel | Sequence[Funnel | None] | None = None,
+    quality: Quality = "standard",
+    size: Size | None = None,
+    speed: float = 1.0,
+) -> Iterator["Picture"]:
+    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts; arguments as in `render`."""
+    check_drawn(overlays, solution=solution, funnel=funnel, titles=titles)
+    settings = QUALITIES[quality]
+    width, height = settings.size if size is None else even(size)
+    if len(insets) > MOST_INSETS:
+        raise InputError(f"insets: got {len(insets)}, want {MOST_INSETS} at most")
+    distinct, shown = _runs_and_trials(runs, trial)
     recordings = [RecordedTrial(distinct[number], row) for number, row in shown]
     scale = common_scale(recordings)
-    solutions = _one_each("solution", options.solution, recordings)
-    funnels = _one_each("funnel", options.funnel, recordings)
-    overlays = [
-        Overlays(recorded, options.overlays, scale, solution=solution, funnel=funnel)
-        for recorded, solution, funnel in zip(recordings, solutions, funnels, strict=True)
+    solutions = _one_each("solution", solution, recordings)
+    funnels = _one_each("funnel", funnel, recordings)
+    all_overlays = [
+        Overlays(recorded, overlays, scale, solution=of_run, funnel=about_run)
+        for recorded, of_run, about_run in zip(recordings, solutions, funnels, strict=True)
     ]
-    titles = _one_each("titles", options.titles or None, recordings)
+    titles = _one_each("titles", titles or None, recordings)
     gl.bind()
-    legend = Legend(overlays, (width, height)) if "caption" in options.overlays else None
+    legend = Legend(all_overlays, (width, height)) if "caption" in overlays else None
     boxes = side_by_side(len(recordings), (width, height - (0 if legend is None else legend.height)))
     captions = [None] * len(recordings)
     if legend is not None:
-        captions = [Caption(*run, options.speed) for run in zip(overlays, boxes, titles, strict=True)]
+        captions = [Caption(*run, speed) for run in zip(all_overlays, boxes, titles, strict=True)]
     strip = max(0 if caption is None else caption.height for caption in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
         raise InputError(f"size: got {width} x {height}, which captions would fill, want it larger, or no caption")
     with contextlib.ExitStack() as stack:
         parts: list[SceneRenderer] = []
         panes: list[Pane] = []
-        for recorded, drawn, box, caption, (run, row) in zip(recordings, overlays, boxes, captions, shown, strict=True):
-            quality, settings = recorded.model.vis.quality, options.settings
-            quality.shadowsize, quality.offsamples = settings.shadows, settings.samples
+        for drawn, box, caption, (run, row) in zip(all_overlays, boxes, captions, shown, strict=True):
+            recorded, visual = drawn.recorded, drawn.recorded.model.vis.quality
+            visual.shadowsize, visual.offsamples = settings.shadows, settings.samples
             # Lines are boxes under a distant sun, for which one quadrilateral per side suffices; the default is 16.
-            quality.numquads = 1
+            visual.numquads = 1
             areas = split_into_panes(Box(0, strip, box.width, box.height - strip), len(insets))
             named = zip((camera, *insets), areas, strict=True)
             views = [(area, camera_view(name, recorded, area.aspect, beside=recordings)) for name, area in named]
@@ -282,17 +267,20 @@ class LivePicture:
     The camera may be any of `render` but "chase", which needs the whole run.
     """
 
-    def __init__(self, camera: str, size: tuple[int, int]) -> None:
+    _prefix = ""
+
+    @checked
+    def __init__(self, camera: CameraName, size: Size) -> None:
         if camera == "chase":
             raise InputError("camera: got 'chase', want one that does not look ahead, such as 'overview' or 'top'")
-        self._options = PictureOptions(camera=camera, overlays=("plan",), quality="draft", size=size)
+        self._open = partial(open_picture, camera=camera, overlays=("plan",), quality="draft", size=even(size))
         self._stack = contextlib.ExitStack()
         self._picture: Picture | None = None
 
     def draw(self, so_far: Callable[[], Rollout], frame: Array, time: float) -> Pixels:
         """The picture (height, width, 3) of MuJoCo's qpos `frame` (nq,), opened with the run so far."""
         if self._picture is None:
-            self._picture = self._stack.enter_context(open_picture(so_far(), self._options))
+            self._picture = self._stack.enter_context(self._open(so_far()))
         for part in self._picture.parts:
             part.recorded.frame_times, part.recorded.frames = np.array([time]), frame[None]
         return self._picture.draw(time)
@@ -300,6 +288,13 @@ class LivePicture:
     def close(self) -> None:
         self._picture = None
         self._stack.close()
+
+
+def even(size: tuple[int, int]) -> tuple[int, int]:
+    """The width and height, which h264 needs even."""
+    if size[0] % 2 or size[1] % 2:
+        raise InputError(f"size: got {size[0]} x {size[1]}, want even numbers, which h264 needs")
+    return size
 
 
 def _runs_and_trials(

@@ -27,7 +27,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view.captions import Pixels
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
-from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, PictureOptions, open_picture
+from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, open_picture
 from lqrsim.view.video_metadata import VideoMetadata, digest
 
 QUEUE_LENGTH = 3  # largest number of frames that wait to be encoded
@@ -173,11 +173,11 @@ def render(
     if animated and size is None:
         width, height = (side // 2 for side in QUALITIES[quality].size)
         size = max(width, SMALLEST_GIF[0]), max(height, SMALLEST_GIF[1])
-    options = PictureOptions(
-        trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
+    opened = open_picture(
+        runs, trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
         funnel=funnel, quality=quality, size=size, speed=1.0 if still else speed,
     )  # fmt: skip
-    with replacing(path) as unfinished, open_picture(runs, options) as drawn:
+    with replacing(path) as unfinished, opened as drawn:
         if still:
             time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
             earlier = list[float]()
@@ -193,7 +193,7 @@ def render(
             samples = [drawn.draw(time) for time in np.linspace(0, drawn.end, min(PALETTE_SAMPLES, count))]
             writer = gif(unfinished, rate, samples)
         else:
-            settings = options.settings
+            settings = QUALITIES[quality]
             digests = tuple(digest(run) for run in drawn.runs)
             metadata = VideoMetadata(digests, drawn.markers, rate, speed, count, drawn.panes)
             writer = encoder(unfinished, drawn.size, rate, crf=settings.crf, preset=settings.preset, metadata=metadata)
