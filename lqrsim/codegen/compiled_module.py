@@ -201,9 +201,9 @@ class Call:
         kind = layout.kind
         if layout.block is not None:
             self._words[place] = _address_of(argument, layout.block, layout.dtype)
-        elif layout.parts or isinstance(kind, Group):
+        elif isinstance(kind, Group):
             if not isinstance(argument, tuple) or len(argument) != len(layout.parts):
-                raise TypeError(f"got {type(argument).__name__}, want {layout.what}")
+                raise TypeError(f"got {type(argument).__name__}, want {kind.record or 'a tuple'}")
             for part, member in zip(layout.parts, argument, strict=True):
                 self._lay(part, member, place)
                 place += part.size
@@ -233,7 +233,6 @@ class _Layout:
         if isinstance(kind, Pointer) and kind.fields:
             self.block, self.dtype = kind.block[:-1], np.dtype([(name, np.float64) for name in kind.fields])
         self.vectors = isinstance(kind, Pointers)
-        self.what = (kind.record or "a tuple") if isinstance(kind, Group) else ""
 
 
 _FLOAT64 = np.dtype(np.float64)

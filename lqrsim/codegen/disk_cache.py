@@ -12,7 +12,6 @@ import contextlib
 import json
 import logging
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,14 +20,13 @@ from typing import Any, TypeVar
 import platformdirs
 
 from lqrsim.errors import InputError
-from lqrsim.results.archive import replacing, sha256
+from lqrsim.results.archive import UNFINISHED, replacing, sha256
 
 LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about 100 kB
 _SUFFIX = ".item"
 # The items after which the cache is shrunk begin so. Names are hashes: one in 256 does, after some 25 MB of solvers.
 _SHRINKING = "00"
 _LONGEST = 100_000  # largest size in bytes of a header
-_ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
 
 Made = TypeVar("Made")
 logger = logging.getLogger("lqrsim")
@@ -103,7 +101,7 @@ def _object_of(text: bytes) -> dict[str, Any]:
 def items() -> list[Item]:
     """All items, the most recently used first."""
     cached = []
-    for used, path, size in _files(_SUFFIX):
+    for used, path, size in _files():
         with contextlib.suppress(OSError), path.open("rb") as file:
             description = _object_of(file.readline(_LONGEST)).get("what", "damaged; will be made again")
             cached.append(Item(str(description), path, size, used))
@@ -113,42 +111,28 @@ def items() -> list[Item]:
 def clear() -> int:
     """Remove all items and unfinished files; return the number of items. Raises OSError if one cannot be removed."""
     removed = items()
-    for path in [*(item.path for item in removed), *_unfinished(0.0)]:
+    for path in [*(item.path for item in removed), *folder().glob(f"{UNFINISHED}*")]:
         path.unlink(missing_ok=True)
     return len(removed)
 
 
 def _shrink() -> None:
-    """Remove the least recently used items beyond `LIMIT`, and files that killed processes left.
-
-    It opens no file: there may be tens of thousands.
-    """
-    files = _files(_SUFFIX)
+    """Remove the least recently used items beyond `LIMIT`. It opens no file: there may be tens of thousands."""
+    files = _files()
     total = sum(size for _, _, size in files)
     for _, path, size in sorted(files) if total > LIMIT else ():
         if total <= LIMIT:
             break
         path.unlink(missing_ok=True)
         total -= size
-    for path in _unfinished(_ABANDONED):
-        path.unlink(missing_ok=True)
 
 
-def _files(suffix: str = "", prefix: str = "") -> list[tuple[float, Path, int]]:
-    """Files with such a name: the times of their last use, in seconds since 1970, and their sizes in bytes.
-
-    Hidden files count only if their prefix is given. Empty for a folder that cannot be read.
-    """
+def _files() -> list[tuple[float, Path, int]]:
+    """The times of the last use of all items, in seconds since 1970, their files, and their sizes in bytes."""
     files = []
-    with contextlib.suppress(OSError), os.scandir(folder()) as entries:
-        for entry in entries:
-            if entry.name.endswith(suffix) and entry.name.startswith(prefix) and (prefix or entry.name[0] != "."):
-                with contextlib.suppress(OSError):  # another process may have removed it
-                    status = entry.stat()
-                    files.append((status.st_mtime, Path(entry.path), status.st_size))
+    with contextlib.suppress(OSError):
+        for path in folder().glob(f"[!.]*{_SUFFIX}"):
+            with contextlib.suppress(OSError):  # another process may have removed it
+                status = path.stat()
+                files.append((status.st_mtime, path, status.st_size))
     return files
-
-
-def _unfinished(age: float) -> list[Path]:
-    """Files that a killed process left unfinished at least `age` seconds ago."""
-    return [path for used, path, _ in _files(prefix=".unfinished-") if time.time() - used >= age]

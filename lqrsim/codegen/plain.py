@@ -1,6 +1,9 @@
 """Kernels as plain Python on NumPy arrays: for single evaluations, and as the reference for compiled code."""
 
+import __future__
+
 import ast
+import copy
 import ctypes
 import functools
 import math
@@ -66,15 +69,11 @@ def _run(
 @functools.lru_cache(maxsize=2048)  # a kernel is the same function in many problems, and each solve evaluates its own
 def _compiled(node: ast.FunctionDef, what: str) -> tuple[CodeType, frozenset[str]]:
     """Python's code that defines a kernel, and the names in it."""
-    module = ast.parse(ast.unparse(node))
-    (function,) = module.body
-    assert isinstance(function, ast.FunctionDef)
-    # Names in decorators and annotations are not defined.
-    function.decorator_list, function.returns = [], None
-    for argument in function.args.args:
-        argument.annotation = None
+    function = copy.copy(node)
+    function.decorator_list = []  # names in decorators are not defined, nor those in annotations, which the flag leaves
+    module = ast.Module([function], [])
     names = frozenset(name.id for name in ast.walk(module) if isinstance(name, ast.Name))
-    return compile(module, f"<{what}>", "exec"), names
+    return compile(module, f"<{what}>", "exec", __future__.annotations.compiler_flag), names
 
 
 def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:

@@ -130,10 +130,6 @@ class Program:
             self._instances[key] = name, body.result
         return self._instances[key]
 
-    def library(self, name: str, count: int) -> str:
-        """LLVM's name of an intrinsic or a C library function of this number of floats."""
-        return self.declare(name, "double", ", ".join(["double"] * count))
-
     def declare(self, name: str, returns: str, arguments: str) -> str:
         """Declare a function with LLVM's types; return LLVM's name of it."""
         self._declared.setdefault(name, f"declare {returns} @{name}({arguments}) #0")
@@ -479,7 +475,8 @@ class _Body:
 
     def _library(self, name: str, *numbers: str, fast: str = "") -> Value:
         """A call of an intrinsic or a C library function of floats."""
-        function, arguments = self.program.library(name, len(numbers)), ", ".join(f"double {n}" for n in numbers)
+        function = self.program.declare(name, "double", ", ".join(["double"] * len(numbers)))
+        arguments = ", ".join(f"double {number}" for number in numbers)
         return Value(FLOAT, self._emit(f"call{fast} double {function}({arguments})"))
 
     def _statement_Return(self, node: ast.Return) -> None:

@@ -145,10 +145,9 @@ def trace(
         raise InputError(f"{called}: got None, want expressions: is a return missing?")
     expressions = []
     for i, entry in enumerate(entries_of(returned)):
-        try:
+        expression = None
+        with contextlib.suppress(sympy.SympifyError):
             expression = sympy.sympify(entry, strict=True)
-        except sympy.SympifyError:
-            raise InputError(f"{called}: got {excerpt(entry)} as entry {i}, want an expression") from None
         if not isinstance(expression, sympy.Expr):
             raise InputError(f"{called}: got {excerpt(entry)} as entry {i}, want an expression")
         known = {*x, *u, *vars(p).values()}

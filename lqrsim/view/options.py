@@ -84,8 +84,7 @@ def split_into_panes(box: Box, insets: int) -> list[Box]:
     length, across = (box.width, box.height) if wide else (box.height, box.width)
     edge = 2 * round(length * (1 - INSETS_FRACTION) / 2) if insets else length
     cuts = [2 * round(across * number / max(insets, 1) / 2) for number in range(insets + 1)]
-    if wide:
-        first = Box(box.left, box.top, edge, box.height)
-        return [first, *(Box(edge, box.top + i, length - edge, j - i) for i, j in pairwise(cuts))]
-    first = Box(box.left, box.top, box.width, edge)
-    return [first, *(Box(i, box.top + edge, j - i, length - edge) for i, j in pairwise(cuts))]
+    parts = [(0, 0, edge, across), *((edge, i, length - edge, j - i) for i, j in pairwise(cuts))]
+    if not wide:
+        parts = [(y, x, height, width) for x, y, width, height in parts]
+    return [Box(box.left + x, box.top + y, width, height) for x, y, width, height in parts]

@@ -21,7 +21,7 @@ from lqrsim.view.cameras import CameraView, camera_view
 from lqrsim.view.captions import Caption, Legend, Pixels
 from lqrsim.view.options import OVERLAYS, Box, Quality, side_by_side, split_into_panes
 from lqrsim.view.overlays import Arrow, Overlays, Shown, check_drawn, common_scale
-from lqrsim.view.recorded_trial import RecordedTrial, rows_of
+from lqrsim.view.recorded_trial import RecordedTrial, place_of, rows_of, tracked_balls
 from lqrsim.view.video_metadata import Pane
 
 FADED_OPACITY = 0.10  # opacity of a geom that hides the robot
@@ -76,14 +76,14 @@ class SceneRenderer:
             mujoco.mjv_addGeoms(model, self.ghost, *self.visual_options, mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene)
         for drawable in self.overlays.drawables:
             geoms.draw(drawable, time, new, emission=self.emission)
-        of_all_views, place = scene.ngeom, self.recorded.place_in(data)
+        of_all_views, place = scene.ngeom, place_of(data, self.recorded.robot, tracked_balls(self.recorded.rollout))
         self.window.make_current()
         for (box, view), faded in zip(self.views, self.faded, strict=True):
             view.place(scene, data, time)
             for light in scene.lights[: scene.nlight]:  # a headlight moves with the camera
                 if light.headlight:
                     light.pos, light.dir = scene.camera[0].pos, scene.camera[0].forward
-            faded += np.clip(self._occluders() - faded, -fade, fade)
+            faded += np.clip(self._occluders(place) - faded, -fade, fade)
             with self._fade(faded, of_model):
                 for arrow in self.overlays.drawables:
                     if isinstance(arrow, Arrow):
@@ -97,12 +97,12 @@ class SceneRenderer:
         mujoco.mjr_readPixels(self.pixels, None, viewport, self.context)
         return self.pixels[::-1]
 
-    def _occluders(self) -> npt.NDArray[np.bool_]:
-        """Flags (ngeom,) of the geoms between the camera and the robot's centre or outline."""
+    def _occluders(self, centre: Array) -> npt.NDArray[np.bool_]:
+        """Flags (ngeom,) of the geoms between the camera and the robot's centre (3,) or outline."""
         view = self.scene.camera[0]
         up, forward = np.array(view.up, dtype=np.float64), np.array(view.forward, dtype=np.float64)
         right = np.cross(forward, up)
-        centre, radius = self.recorded.place_in(self.data), 0.8 * self.recorded.rollout.radius
+        radius = 0.8 * self.recorded.rollout.radius
         hidden, geom = np.zeros(self.model.ngeom, dtype=bool), np.zeros(1, np.int32)
         eye = np.array(view.pos, dtype=np.float64)
         for offset in (0 * up, up, -up, right, -right):

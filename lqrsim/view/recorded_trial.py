@@ -98,10 +98,6 @@ class RecordedTrial:
         """The radius in metres of the ball at the planned place: that of the robot, or of an arm's last ball."""
         return self.size if self.rollout.balls is None else float(self.rollout.balls.radii[-1])
 
-    def place_in(self, data: mujoco.MjData) -> Array:
-        """Place (3,) of the robot in the posed model."""
-        return place_of(data, self.robot, tracked_balls(self.rollout))
-
     def force_at(self, time: float) -> Array:
         """The recent disturbing force (3,) in N."""
         return self.force[min(self.step(time), len(self.force) - 1)]
