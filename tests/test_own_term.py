@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from huber_distance import HuberDistance
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from sampling import examples
 
@@ -176,25 +176,27 @@ def test_what_else_a_file_says_is_no_part_of_the_problem(tmp_path: Path) -> None
 
 
 OWN_KERNEL = "SCALE = {}\n\n\ndef value(x, u, t, data):\n    return {}\n"
+FORMULAS = "SCALE * x[0]", "SCALE - x[0]", ""
 
 
 @settings(max_examples=examples(5), phases=[Phase.explicit, Phase.generate])
-@given(
-    versions=st.lists(
-        st.tuples(st.integers(1, 9), st.sampled_from(["SCALE * x[0]", "SCALE - x[0]"])), min_size=2, max_size=5
-    )
-)
-def test_a_file_that_is_loaded_again_has_its_new_kernels(versions: list[tuple[int, str]]) -> None:
-    """As in a notebook, where a file is edited and loaded again."""
+@given(st.lists(st.tuples(st.integers(1, 9), st.sampled_from(FORMULAS)), min_size=2, max_size=5))
+@example([(2, FORMULAS[0]), (3, FORMULAS[1]), (4, "")])
+def test_a_file_that_changes_has_its_new_kernels_and_numbers(changes: list[tuple[int, str]]) -> None:
+    """As in a notebook, where a file is edited and loaded again; or, without a formula, its number is set."""
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         patch.setattr(sys, "dont_write_bytecode", True)  # Python tells versions of a file apart by size and second
-        own = None
-        for scale, formula_of_it in versions:
-            Path(folder, "loaded_again.py").write_text(OWN_KERNEL.format(scale, formula_of_it), encoding="utf-8")
-            own = importlib.import_module("loaded_again") if own is None else importlib.reload(own)
-            source, wanted = source_of(own), eval(formula_of_it, {"SCALE": scale, "x": [2.0]})
-            compiled = module_of(source, "a file loaded again", N=1, M=1).value
+        Path(folder, "changing.py").write_text(OWN_KERNEL.format(1, written := FORMULAS[0]), encoding="utf-8")
+        own = importlib.import_module("changing")
+        for scale, new in changes:
+            if new:
+                written = new
+                Path(folder, "changing.py").write_text(OWN_KERNEL.format(scale, new), encoding="utf-8")
+                importlib.reload(own)
+            vars(own)["SCALE"] = scale
+            source, wanted = source_of(own), eval(written, {"SCALE": scale, "x": [2.0]})
+            compiled = module_of(source, "a file that changes", N=1, M=1).value
             for value in (plain_functions(source, {"N": 1, "M": 1}, ["value"])["value"], compiled):
                 assert value(np.array([2.0]), np.zeros(1), 0, np.zeros(0)) == wanted
-        del sys.modules["loaded_again"]
+        del sys.modules["changing"]

@@ -41,7 +41,8 @@ class Source:
 
     Attributes:
       text: of a user's module, as it was loaded: it may be edited, and loaded again. Of the package's modules empty.
-      constants: (name, number or tuple of numbers), which replace the module's.
+      constants: (name, number or tuple of numbers), which replace the module's. Of a user's module, which may change
+        them, all that its functions name.
       fills: (name, source, name there) of functions that take the place of functions of the module or its imports.
     """
 
@@ -62,7 +63,10 @@ class Source:
     def digest(self) -> str:
         """A hash of everything that defines the source."""
         filled = (f"{name}={source.digest}.{inner_name}" for name, source, inner_name in self.fills)
-        return sha256(self.module, _defining(self), repr(self.constants), *filled)
+        text = self.text or _text_of(self.module)
+        if self.module and self.text:  # what else stands in a user's file changes no compiled code
+            text = _parse(text).text
+        return sha256(self.module, text, repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
         """This source with functions filled in: name -> source, or (source, name there).
@@ -97,8 +101,13 @@ def source_of(module: ModuleType | str, **constants: Constant) -> Source:
         if not (_is_constant(getattr(home, constant, None)) and _is_constant(number)):
             want = "a number or a tuple of numbers, in place of one that the file declares"
             raise InputError(f"source_of: {constant}: got {excerpt(number)}, want {want}")
-    text = "" if _is_packaged(name) else _text_of(name)
-    return Source(name, text, tuple(sorted(constants.items())), what=name)
+    if name.startswith(__name__.partition(".")[0] + "."):  # a module of the package does not change
+        return Source(name, constants=tuple(sorted(constants.items())), what=name)
+    parsed, used = _parse(_text_of(name)), dict[str, Constant]()
+    for node in (node for function in parsed.functions.values() for node in ast.walk(function)):
+        if isinstance(node, ast.Name) and node.id not in parsed.imports and _is_constant(getattr(home, node.id, None)):
+            used[node.id] = getattr(home, node.id)
+    return Source(name, _text_of(name), tuple(sorted((used | constants).items())), what=name)
 
 
 def text_source(text: str, what: str = "source") -> Source:
@@ -284,10 +293,6 @@ def _imported(module: str) -> ModuleType:
         raise InputError(f"source: module: got {excerpt(module)}, want the name of one that can be imported") from None
 
 
-def _is_packaged(module: str) -> bool:
-    return module.startswith(__name__.partition(".")[0] + ".")
-
-
 _texts: dict[str, tuple[Any, str]] = {}  # of modules, beside the specification with which each was loaded
 
 
@@ -297,18 +302,6 @@ def _text_of(module: str) -> str:
     if module not in _texts or _texts[module][0] is not spec:
         _texts[module] = spec, inspect.getsource(_imported(module))
     return _texts[module][1]
-
-
-def _defining(source: Source) -> str:
-    """What defines a source: of a user's module its functions, and the constants in them, for what else stands in the
-    file changes no compiled code. Of a module of the package it is the whole text, which need not be parsed.
-    """
-    if not source.module or _is_packaged(source.module):
-        return source.text or _text_of(source.module)
-    home, parsed = _imported(source.module), _parse(source.text or _text_of(source.module))
-    names = {node.id for tree in parsed.functions.values() for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    constants = ((name, getattr(home, name, None)) for name in sorted(names))
-    return "\n".join([parsed.text, *(f"{name} = {value!r}" for name, value in constants if _is_constant(value))])
 
 
 @functools.cache
