@@ -123,26 +123,20 @@ def _lgamma(number: float) -> float:
         return math.inf
 
 
-def _flattened(argument: Any) -> list[Any]:
-    if not isinstance(argument, tuple):
+def _in_c(argument: Any) -> list[Any]:
+    """An argument as C takes it: an array by its address, a record field by field."""
+    if isinstance(argument, tuple):
+        return [part for member in argument for part in _in_c(member)]
+    if isinstance(argument, np.ndarray):
+        return [ctypes.c_void_p(argument.ctypes.data)]
+    if isinstance(argument, ctypes.c_int32):
         return [argument]
-    return [part for member in argument for part in _flattened(member)]
+    return [ctypes.c_double(argument) if isinstance(argument, float | np.floating) else ctypes.c_int64(int(argument))]
 
 
-def _c_call(returns: Any, address: float, arguments: Sequence[Any]) -> Any:
-    """Call a C function; arrays are passed by their addresses."""
-    kinds, numbers = list[Any](), list[Any]()
-    for argument in _flattened(arguments):
-        number = argument.item() if isinstance(argument, np.generic) else argument
-        if isinstance(argument, np.ndarray):
-            kinds.append(ctypes.c_void_p)
-            number = argument.ctypes.data
-        elif isinstance(argument, ctypes.c_int32):
-            kinds.append(ctypes.c_int32)
-        else:
-            kinds.append(ctypes.c_double if isinstance(number, float) else ctypes.c_int64)
-        numbers.append(number)
-    return ctypes.CFUNCTYPE(returns, *kinds)(int(address))(*numbers)
+def _c_call(returns: Any, address: float, arguments: tuple[Any, ...]) -> Any:
+    passed = _in_c(arguments)
+    return ctypes.CFUNCTYPE(returns, *map(type, passed))(int(address))(*passed)
 
 
 def _memory(address: float, kind: Any) -> Array:

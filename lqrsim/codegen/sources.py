@@ -65,7 +65,7 @@ class Source:
         filled = (f"{name}={source.digest}.{inner_name}" for name, source, inner_name in self.fills)
         text = self.text or _text_of(self.module)
         if self.module and self.text:  # what else stands in a user's file changes no compiled code
-            text = _parse(text).text
+            text = "\n".join(map(ast.unparse, _parse(text).functions.values()))
         return sha256(self.module, text, repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
@@ -185,7 +185,6 @@ class _Parsed:
 
     functions: dict[str, ast.FunctionDef]
     imports: dict[str, tuple[str, str]]  # name here -> module, name there
-    text: str  # of the functions
 
 
 class Scope:
@@ -318,7 +317,7 @@ _WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__)
 
 @functools.lru_cache(maxsize=512)
 def _parse(text: str) -> _Parsed:
-    functions, imports, lines, texts = {}, {}, text.splitlines(), []
+    functions, imports = {}, {}
     try:
         tree = ast.parse(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # as for deep nesting or null characters
@@ -326,8 +325,6 @@ def _parse(text: str) -> _Parsed:
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             functions[node.name] = node
-            first = min(part.lineno for part in (node, *node.decorator_list))
-            texts += lines[first - 1 : node.end_lineno]
         elif isinstance(node, ast.ImportFrom):
             imports |= {alias.asname or alias.name: (str(node.module), alias.name) for alias in node.names}
-    return _Parsed(functions, imports, "\n".join(texts))
+    return _Parsed(functions, imports)
