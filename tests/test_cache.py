@@ -19,7 +19,7 @@ from lqrsim.codegen import compiled_module, disk_cache, symbolic
 from lqrsim.codegen.compiled_module import CompiledModule
 from lqrsim.codegen.fingerprint import fingerprint, identity
 from lqrsim.codegen.sources import text_source
-from lqrsim.codegen.user_functions import address_of
+from lqrsim.codegen.user_functions import UserFunction, address_of
 
 # The smallest problem there is, in a file of its own so that two processes trace the same function.
 SYSTEM = """
@@ -76,7 +76,7 @@ import numpy as np
 from lqrsim.codegen import compiled_module
 from lqrsim.codegen.compiled_module import CompiledModule
 from lqrsim.codegen.sources import text_source
-from lqrsim.codegen.user_functions import address_of
+from lqrsim.codegen.user_functions import UserFunction, address_of
 
 for factor in sys.argv[1:]:
     lines = "".join(f"    total = cos(total + {factor} * sin(x[0] * {i}))\\n" for i in range(40))
@@ -284,7 +284,12 @@ class CallingTwice(Calling):
         return x
 
 
-def test_identities_tell_callables_without_fingerprint_apart() -> None:
+def identity_in_a_problem(function: Any) -> str:
+    return UserFunction(function=function, level="plain", states=1, controls=1, parameters=(), offset=1).identity
+
+
+@pytest.mark.parametrize("identity", [identity, identity_in_a_problem])
+def test_identities_tell_callables_without_fingerprint_apart(identity: Callable[[Any], str]) -> None:
     """By class, fields, arguments, closures, defaults and code; equal ones have one identity, also when new."""
 
     def made(number: int) -> list[Any]:
@@ -311,6 +316,10 @@ def test_identities_tell_callables_without_fingerprint_apart() -> None:
     itself = Calling(1, [])
     itself.around.append(itself)
     assert identity(itself) == identity(itself)
+    deep, other = Calling(1), Calling(2)
+    for _ in range(3000):  # beyond what Python lets functions call one another
+        deep, other = Calling(1, deep), Calling(1, other)
+    assert identity(deep) != identity(other)
 
 
 def test_a_fingerprint_covers_what_a_function_refers_to(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,20 +56,21 @@ def identity(function: Any) -> str:
     arguments, closure and globals of functions, the fields of dataclasses, and digests. Two callables that differ only
     in something else, such as a file that they read, have the same identity.
     """
-    return fingerprint(function) or disk_cache.key(*_versions(), *_described(function, set()))
+    return fingerprint(function) or disk_cache.key(*_versions(), *_described(function))
 
 
-def _described(value: Any, seen: set[int]) -> Iterator[str]:
-    """The parts of any value, as far as they can be told."""
-    try:
-        parts = list(_value(value, {}))
-    except (_NoFingerprint, RecursionError):
-        parts = [f"{type(value).__qualname__} {getattr(value, '__module__', '')} {getattr(value, '__qualname__', '')}"]
-        if id(value) not in seen:
+def _described(value: Any) -> Iterator[str]:
+    """The parts of any value, as far as they can be told. A package's functions may lead a thousand deep."""
+    left, seen = [("", value)], set[int]()
+    while left:
+        name, value = left.pop()
+        yield from [name] if name else []
+        try:
+            yield from list(_value(value, {}))
+        except (_NoFingerprint, RecursionError):
+            yield f"{type(value).__qualname__} {getattr(value, '__module__', '')} {getattr(value, '__qualname__', '')}"
+            left += reversed([] if id(value) in seen else [*_parts(value)])
             seen.add(id(value))
-            for name, part in _parts(value):
-                parts += [name, *_described(part, seen)]
-    yield from parts
 
 
 def _parts(value: Any) -> Iterator[tuple[str, Any]]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.compiled_module import compilations, compiling
-from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
+from lqrsim.codegen.fingerprint import fingerprint, identity, note_helpers, stale
 from lqrsim.codegen.jitted import Jitted, JittedDerivatives
 from lqrsim.codegen.llvm import Loaded, has_symbols, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
@@ -160,9 +160,8 @@ class UserFunction:
 
     @cached_property
     def identity(self) -> str:
-        """The function's part of a problem's digest: its fingerprint, or else its byte code."""
-        code = getattr(getattr(self.function, "py_func", self.function), "__code__", None)
-        return fingerprint(self.function) or f"{name_of(self.function)} {getattr(code, 'co_code', b'').hex()}"
+        """The function's part of a problem's digest."""
+        return identity(self.function)
 
     def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
         """Call the function in plain Python: the returned values as one vector, or the arrays that it wrote.
