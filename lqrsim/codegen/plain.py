@@ -131,7 +131,9 @@ def _in_c(argument: Any) -> list[Any]:
         return [ctypes.c_void_p(argument.ctypes.data)]
     if isinstance(argument, ctypes.c_int32):
         return [argument]
-    return [ctypes.c_double(argument) if isinstance(argument, float | np.floating) else ctypes.c_int64(int(argument))]
+    if isinstance(argument, float | np.floating):
+        return [ctypes.c_double(float(argument))]
+    return [ctypes.c_int64(int(argument))]
 
 
 def _c_call(returns: Any, address: float, arguments: tuple[Any, ...]) -> Any:
