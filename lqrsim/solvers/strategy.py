@@ -99,21 +99,29 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
 
 def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
     """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
-    original, log = settings, tuple[Iteration, ...]()
+    stated, original, log = problem, settings, tuple[Iteration, ...]()
     if any(constraint._rough for constraint in problem.constraints):
         problem, settings, log = outlined(problem, settings, stop)
-    refinements, preliminary = REFINEMENTS, settings is not original
+    refinements, preliminary, by_outline = REFINEMENTS, settings is not original, problem is not stated
     while True:
         solution = _search(problem, settings, stop, trees=trees)
         refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
         if log:
             solution = replace(solution, iterations=(*log, *solution.iterations))
+        log = solution.iterations
+        failed = (
+            solution.status in (Status.INFEASIBLE, Status.STALLED) and np.isfinite(solution.trajectory.states).all()
+        )
+        if failed and by_outline and not stop.due:  # no plan may keep the constraints as they are along the outline
+            problem, settings, _ = outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
+            by_outline = False
+            continue
         allowed = original.violation_tolerance(problem)
         settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
         if refined is None and not (preliminary and solution.success and not settled and not stop.due):
             return stop.finish(solution)
-        problem, settings, log = refined or problem, replace(original, start=solution, starts=None), solution.iterations
-        refinements, preliminary = refinements - 1, False
+        problem, settings = refined or problem, replace(original, start=solution, starts=None)
+        refinements, preliminary, by_outline = refinements - 1, False, False
 
 
 def _search(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool) -> Solution:
