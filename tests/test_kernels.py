@@ -45,32 +45,26 @@ from lqrsim.kernels import (
     active_set,
     augmented_lagrangian,
     certificate,
-    cost_to_come_dual,
-    cost_to_come_primal,
+    collisions,
+    cost_to_come,
     declarations,
-    descent,
     entry_points,
-    estimation,
-    exponential,
+    feedback,
     hull_distance,
     interior_point,
     iterations,
     linear_algebra,
-    mjcf_distances,
     mjcf_dynamics,
     model_functions,
-    obstacle_distances,
-    policy_evaluation,
+    passes,
     projection,
     restoration,
-    rollouts,
     rotation_ratios,
     secants,
     signed_distance,
-    sphere_centers,
 )
 from lqrsim.kernels import stages as stage_kernels
-from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
+from lqrsim.kernels.iterations import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
@@ -83,7 +77,6 @@ from lqrsim.kernels.records import (
     Descent,
     Limits,
     LinearStep,
-    Measurements,
     Motion,
     PlanBeginning,
     Policy,
@@ -397,9 +390,9 @@ def settings_of(**changed: Any) -> SmootherSettings:
     return SmootherSettings(**{**stated, **changed})
 
 
-def sizes_of(one: ls.Problem) -> dict[str, int]:
+def sizes_of(one: ls.Problem, form: str = "dual") -> dict[str, int]:
     n, m = len(one.dynamics.state_coordinates), len(one.dynamics.control_coordinates)
-    return {"N": n, "M": m, "W": n + m, "NOISY": int(one.noise_term is not None)}
+    return {"N": n, "M": m, "W": n + m, "NOISY": int(one.noise_term is not None), "PRIMAL": int(form == "primal")}
 
 
 def with_rows(value: Any) -> Any:
@@ -420,7 +413,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     work, log = run.work, np.zeros(3, LOG)
     for own in work.multipliers:
         own.penalty, own.values[...] = penalty, 0.5
-    source, sizes = compiled.with_form(form), sizes_of(one)
+    source, sizes = source_of(entry_points), sizes_of(one, form)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     if task == "opening":
         model = work.model
@@ -521,7 +514,7 @@ class TestSolvers:
                 weight,
                 2.0,
             )
-            replay(source_of(descent), SIZES, "tighten", DAMPED_STEPS, memory[0])
+            replay(source_of(iterations), SIZES, "tighten", DAMPED_STEPS, memory[0])
         model = compiled.arguments(problem(noise=ls.Noise(0.1 * np.eye(3))))
         for good, risk in ((True, 0.0), (False, 0.0), (True, 1.0)):
             model.noise.risk[1] = risk
@@ -543,9 +536,8 @@ class TestSolvers:
             SmootherGains(np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))),
             np.zeros((steps + 1, n)),
         )  # fmt: skip
-        source = compiled.with_form(form)
-        sizes = {"N": n, "M": m, "W": n + m, "NOISY": 0}
-        replay(source, sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
+        sizes = {"N": n, "M": m, "W": n + m, "NOISY": 0, "PRIMAL": int(form == "primal")}
+        replay(source_of(entry_points), sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
 
 
 class Begun:
@@ -556,7 +548,7 @@ class Begun:
         settings = settings_of(form=form, **changed)
         self.run = SolveRun(one, settings, resolve(start, one), begin, Budget(settings.max_iterations))
         self.work, self.log = self.run.work, np.zeros(20, LOG)
-        self.source, self.sizes = compiled.with_form(form), sizes_of(one)
+        self.source, self.sizes = source_of(entry_points), sizes_of(one, form)
 
     def iterate(self, first: int, last: int, **changed: Any) -> tuple[Any, ...]:
         given = list(self.run._arguments(first, last, self.log))
@@ -605,7 +597,7 @@ def descended(
     stage = work.model.stage
     if factor != 1:
         work.model = work.model._replace(stage=with_numbers(stage, 1, 2, lambda weight: factor * weight))
-    source, sizes = compiled.with_form(form), sizes_of(one)
+    source, sizes = source_of(entry_points), sizes_of(one, form)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
@@ -712,7 +704,7 @@ class TestRareEnds:
         for weight in (1e-2, 1e-7):
             one.descend(DAMPED_STEPS, 0, 1, merit=1e9, reach=0.0, weight=weight)
             assert one.work.memory["weight"] == 0.1 * weight * (weight > 1e-6)
-        one.descend(DAMPED_STEPS, 0, 1, merit=1e9, since_ilqr=float(descent.PATIENCE))
+        one.descend(DAMPED_STEPS, 0, 1, merit=1e9, since_ilqr=float(iterations.PATIENCE))
         assert one.work.memory["reach"] == 0.0
         # Only policy and value functions; of a plan that is no number there are none.
         assert one.linearize()[2:] == (False, -1)
@@ -773,7 +765,7 @@ class TestRareEnds:
 
     def test_matrices_without_what_is_wanted(self) -> None:
         zero, eye = np.zeros((3, 3)), np.eye(3)
-        of_certificate, dual = source_of(certificate), source_of(cost_to_come_dual)
+        of_certificate, of_come = source_of(certificate), source_of(cost_to_come)
         box = np.array([1.0, -2.0]), np.full(2, -1.0), np.full(2, 1.0), np.zeros(2)
         assert np.isnan(replay(of_certificate, SIZES, "box_decrease", -np.eye(2), *box))
         stage = QuadraticStage(np.zeros((5, 5)), np.zeros(5))
@@ -785,17 +777,19 @@ class TestRareEnds:
             (eye, np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.ones(3), False),
             (eye, -2 * eye, np.ones(3), False), (zero, eye, np.ones(3), True),
         ):  # fmt: skip
-            assert replay(dual, SIZES, "update", V.copy(), Q.copy(), size) == good
+            assert replay(of_come, SIZES, "update", V.copy(), Q.copy(), size) == good
         for S, V in ((eye, eye), (-eye, eye), (np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), -eye)):
             to_go = CostToGo(S[None].copy(), np.ones((1, 3)), np.zeros(1))
             to_come = CostToCome(V[None].copy(), np.ones((1, 3)), np.zeros(1))
-            for form in (dual, source_of(cost_to_come_primal)):
-                replay(form, SIZES, "smoothed_state", 0, to_go, to_come, np.zeros(3), np.zeros(3))
+            for primal in (0, 1):
+                replay(
+                    of_come, SIZES | {"PRIMAL": primal}, "smoothed_state", 0, to_go, to_come, np.zeros(3), np.zeros(3)
+                )
         for Q, S in ((eye, zero), (zero, zero), (np.diag([1.0, 0.0, 0.0]), eye), (-eye, zero)):
             to_go = CostToGo(S[None].copy(), np.ones((1, 3)), np.zeros(1))
             to_come = CostToCome(zero[None].copy(), np.zeros((1, 3)), np.zeros(1))
             given = Q.copy(), np.array([0.1, 0.2, 0.3]), 1.5, X.copy(), to_go, to_come
-            _, good = replay(dual, SIZES, "initial_cost_to_come", *given)
+            _, good = replay(of_come, SIZES, "initial_cost_to_come", *given)
             assert good == (Q.min() >= 0)
 
     @pytest.mark.parametrize("knot", [1, 2, 4])
@@ -809,7 +803,7 @@ class TestRareEnds:
         out = np.zeros(1, CERTIFICATE)
         arguments = run._check_arguments(declarations.EVALUATE, found, no_value(found.states), out)
         found.plan.states[knot, state] = np.nan
-        replay(compiled.with_form("dual"), sizes_of(one), "smoother", *with_rows(arguments))
+        replay(source_of(entry_points), sizes_of(one), "smoother", *with_rows(arguments))
         assert np.isnan(out[0]["dynamics_residual"])
         assert np.isnan(out[0]["policy_residual"])
 
@@ -835,14 +829,15 @@ class TestRareEnds:
                 SmootherGains(np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2))),
                 np.zeros((4, 3)),
             )  # fmt: skip
-            source = compiled.with_form(form)
-            sizes = SIZES | {"NOISY": 0}
-            assert replay(source, sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work) == wanted
+            sizes = SIZES | {"NOISY": 0, "PRIMAL": int(form == "primal")}
+            assert (
+                replay(source_of(entry_points), sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work)
+                == wanted
+            )
 
     def test_parts_of_steps_that_are_taken_back(self) -> None:
-        plan, x_hats = Motion(np.ones((4, 3)), np.ones((3, 2))), np.arange(12.0).reshape(4, 3)
-        for fraction in (1.0, 0.25):
-            replay(source_of(rollouts), SIZES | {"NOISY": 0}, "shorten_step", 3, fraction, plan, x_hats)
+        for fraction in (0.0, 0.25):
+            replay(source_of(passes), SIZES | {"NOISY": 0}, "towards", np.arange(3.0), fraction, np.ones(3), 3)
 
     def test_where_mujoco_can_not_go(self) -> None:
         """From no number, backwards in time, and beyond all numbers; and rotations that are whole turns."""
@@ -944,7 +939,7 @@ class TestParts:
         flat.reshape(2, 4, 3)[..., :2] = square(X, None)
         out, slopes = np.zeros(2 * count), np.zeros((2 * count, 12))
         given = count, 2, 1, world.upright().table, parts, 1, flat, np.zeros((2 * count, 3)), out, slopes
-        replay(source_of(obstacle_distances), {}, "hull_distances", *given)
+        replay(source_of(collisions), {}, "hull_distances", *given)
 
     @pytest.mark.usefixtures("hardly_optimised")
     @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])
@@ -977,7 +972,7 @@ class TestParts:
         rock = np.array(ls.World([ls.Obstacle.of_corners("rock", points[:4])]).table)
         for number, table in ((count, data), (1, rock)):
             given = number, 6, 3, table, points, np.zeros((2 * number, 3)), np.zeros(6)
-            replay(source_of(obstacle_distances), {}, "nearest", *given)
+            replay(source_of(collisions), {}, "nearest", *given)
         source = source_of(signed_distance)
         at = np.zeros(3), np.zeros((3, 3))
         for i in range(count):  # at the rim of the cylinder, in the box and about it
@@ -1021,7 +1016,7 @@ class TestParts:
 
     @staticmethod
     def places(places: SphereCenters, coordinates: int, x: Array) -> None:
-        source = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
+        source = source_of(collisions).filled(places=places.code, places_jacobian=places.code)
         data, n = numbers_of(places), len(x)  # pyright: ignore[reportArgumentType]
         states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}
         replay(source, sizes, "centres_of", 2, states, data, np.zeros((2, coordinates)))
@@ -1165,7 +1160,7 @@ class TestParts:
         self.steps(ls.Quadrotor().dynamics, x, np.full(4, 1.2), 0.05)
         for name in [one for one in vars(rotation_ratios) if "ratio" in one]:
             replay(source_of(rotation_ratios), {}, name, size**2)
-        replay(source_of(exponential), {}, "exponential", -size)
+        replay(source_of("lqrsim.problem.obstacle_cost"), {}, "exponential", -size)
 
     @pytest.mark.parametrize("kind", ["box", "arm", *rarely("cart", "wheel")])
     def test_mujoco(self, kind: str) -> None:
@@ -1195,7 +1190,7 @@ class TestParts:
             of_term(ls.SiteCost("tip", **wanted).bind(robot.dynamics), x, u)
             of_constraint(ls.SiteConstraint("tip", **wanted).bind(robot.dynamics), 1, x, u)
         _, data = robot.geoms.in_world(robot.dynamics, world)._to_each()
-        source, sizes, states = source_of(mjcf_distances), {"N": n, "M": m, "W": n + m}, np.stack([x, 1.1 * x])
+        source, sizes, states = source_of(mjcf_dynamics), {"N": n, "M": m, "W": n + m}, np.stack([x, 1.1 * x])
         scratch = np.zeros(3), np.zeros((3, 6))
         replay(source, sizes, "distances_of", 2, states, 1, np.linspace(0.0, 0.2, 12), data, np.zeros(4), *scratch)
         replay(source, sizes, "slopes_of", 2, states, data, np.zeros(4), np.zeros((4, n)), *scratch)
@@ -1250,7 +1245,7 @@ class TestControl:
             lambda x, u, p: [u[0]] * 4, states=dict.fromkeys("abcd", ""), controls={"u": ""}, **turns
         )
         space = dynamics.state_coordinates
-        rng, sizes, source = np.random.default_rng(0), {"N": 4, "M": 2, "W": 6}, source_of(policy_evaluation)
+        rng, sizes, source = np.random.default_rng(0), {"N": 4, "M": 2, "W": 6}, source_of(feedback)
         near, law = 5 * rng.normal(size=(3, 4)), Policy(rng.normal(size=(2, 4)), rng.normal(size=2))
         near[0, 1:] = 0.0
         limits, turning = Limits(np.full(2, -1.0), np.full(2, 1.0)), turning_of(space)
@@ -1267,17 +1262,17 @@ class TestControl:
         measure, slope = module.addresses("measure", "measure_slope")
         sensor, dynamics = SensorModel(measure, slope, np.array([1.5])), compiled.dynamics_model(CART)
         z, d, p = 3 + lag + 2, 2, 1
-        source = source_of(estimation, LAG=lag, D=d, Y=2, P=p, Z=z, V=p + 4, NUMBERS=2, HELD=d)
+        source = source_of(feedback, LAG=lag, D=d, Y=2, P=p, Z=z, V=p + 4, NUMBERS=2, HELD=d)
         rng, k = np.random.default_rng(1), 3
         estimates, turning = rng.normal(size=(k, z)), turning_of(CART.state_coordinates)
         states, controls = rng.normal(size=(k, 3)), rng.normal(size=(k, 2))
-        measured = Measurements(states, np.array([0.0, 1.0, 0.0]))
         replay(
             source,
             SIZES,
             "correct",
             k,
-            measured,
+            states,
+            np.array([0.0, 1.0, 0.0]),
             X,
             rng.normal(size=(z, 2)),
             np.array([0.1, 5.0]),
@@ -1491,7 +1486,7 @@ class TestPlanMethods:
         costates, rows = rng.normal(size=(4, 3)), stages.live.size
         assert replay(source, SIZES, "determine_scales", stages.about, plan) > 0
         stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)
-        replay(source, SIZES, "write_models", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "write_models", True, stages.about, plan, costates, 0.0)
         replay(source, SIZES, "adjoint", stages.about, costates, np.zeros((3, 2)))
         replay(source, SIZES, "evaluate_plan", stages.about, plan, np.zeros((3, 3)))
         replay(source, SIZES, "read_rows", stages.about, plan, np.zeros(rows))
@@ -1522,7 +1517,7 @@ class TestPlanMethods:
         bent = convex.copy()
         bent[2, 2, 2] -= 1e6
         assert direction(bent) == 2  # a jump without a least
-        replay(source, SIZES, "write_models", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "write_models", True, stages.about, plan, costates, 0.0)
         replay(source, SIZES, "evaluate_plan", stages.about, plan, np.zeros((3, 3)))
 
 

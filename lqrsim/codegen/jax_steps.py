@@ -1,4 +1,4 @@
-"""The function that `kernels/jax_steps.py` calls: Runge-Kutta steps of a function of JAX, one or all of a plan."""
+"""The function that `kernels/user_functions.py` calls: Runge-Kutta steps of a function of JAX, one or all of a plan."""
 
 import ctypes
 from collections.abc import Callable, Mapping

@@ -16,7 +16,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.fingerprint import identity
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_function, check_kind, shaped
-from lqrsim.kernels import policy_evaluation
+from lqrsim.kernels import feedback
 from lqrsim.kernels.records import AngularStates, Limits, Policy
 from lqrsim.problem.belief import Belief
 from lqrsim.problem.dynamics import Dynamics
@@ -49,11 +49,11 @@ def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
 
 
 def _laws(n: int, m: int) -> CompiledModule:
-    return module_of(source_of(policy_evaluation), f"policies of {n} states and {m} controls", N=n, M=m, W=n + m)
+    return module_of(source_of(feedback), f"policies of {n} states and {m} controls", N=n, M=m, W=n + m)
 
 
 def turning_of(space: Coordinates) -> AngularStates:
-    """The states that are to be turned to the nearest, in the form that `kernels/policy_evaluation.py` takes."""
+    """The states that are to be turned to the nearest, in the form that `kernels/feedback.py` takes."""
     angles, rotations = np.array(space.angles, dtype=np.float64), np.array([space.rotation_vectors, space.turns]).T
     return AngularStates(angles, len(angles), in_c_order(rotations), len(rotations))
 

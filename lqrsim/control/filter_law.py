@@ -15,8 +15,8 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replanner import ReplanLog, ReplanRule, SolveRequest
 from lqrsim.control.tracking_laws import Laws, Weights, tracking_laws
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels.estimation import FAR
-from lqrsim.kernels.records import Limits, Measurements, Policy
+from lqrsim.kernels.feedback import FAR
+from lqrsim.kernels.records import Limits, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.plan import Plan
@@ -86,7 +86,7 @@ class FilterRun(ControllerRun):
         self._last_measured = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._innovation = np.empty((trials, law.model.sensor.size))
-        self._limit_factors = np.ones(trials)  # factors on the limits of corrections; see `kernels/estimation.py`
+        self._limit_factors = np.ones(trials)  # factors on the limits of corrections; see `kernels/feedback.py`
         shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
         self.estimates, self.innovations = (np.full((*shape, size), np.nan) if record else None for size in sizes)
         self._limits = Limits(*law.plan.policy.control_coordinates.limits)
@@ -114,7 +114,7 @@ class FilterRun(ControllerRun):
         lost = (measured == self._last_measured).all(axis=1).astype(np.float64)
         self._last_measured[:] = measured
         model.compiled.correct(
-            self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
+            self._trials, in_c_order(measured), lost, in_c_order(law.model.plan.states[knot]),
             law.filter.gain[knot], law.filter.limit[knot], self._limit_factors, model.compiled_sensor, model.turning,
             self.z, self._innovation,
         )  # fmt: skip

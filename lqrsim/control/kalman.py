@@ -14,7 +14,7 @@ from lqrsim.codegen.compiled_module import module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels import square_root_filter
+from lqrsim.kernels import recursions
 from lqrsim.kernels.records import FilterModel, FilterRoots, FilterSizes, zeros_of
 
 # The least standard deviation of a measured number's noise, relative to that of its prediction. It makes the innovation
@@ -56,7 +56,7 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     arrays = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
     roots = zeros_of(FilterRoots, arrays, T=model.plan.steps, Z=size, Y=measured)
     system = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
-    filter_along = module_of(source_of(square_root_filter), "Kalman filters").filter_along
+    filter_along = module_of(source_of(recursions), "Kalman filters").filter_along
     filter_along(sizes, system, FilterRoots(*map(np.ravel, roots)))
     _, before, after, innovation_root, correction_root, _ = roots
     limit = PLAUSIBLE * np.sqrt((correction_root[:, n + model.lagging :] ** 2).sum(axis=2))

@@ -18,7 +18,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
-from lqrsim.kernels import loop_moments
+from lqrsim.kernels import recursions
 from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork, zeros_of
 
 
@@ -49,8 +49,8 @@ def moments_of(loops: LoopArrays, stated: int, count: int | None, lost: float = 
 
 
 def kernels() -> CompiledModule:
-    """`kernels/loop_moments.py`, which is compiled once for all sizes."""
-    return module_of(source_of(loop_moments), "moments of closed loops")
+    """`kernels/recursions.py`, which is compiled once for all sizes."""
+    return module_of(source_of(recursions), "moments of closed loops")
 
 
 @dataclass(eq=False)

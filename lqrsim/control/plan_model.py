@@ -27,7 +27,7 @@ from lqrsim.codegen.user_functions import check_signature, name_of
 from lqrsim.control.controllers import turning_of
 from lqrsim.control.uncertainty import GAIN, OFFSET, ShapingFilter, Uncertainty, Unknown, per_entry, shaping_filter
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
-from lqrsim.kernels import estimation
+from lqrsim.kernels import feedback
 from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
@@ -251,10 +251,10 @@ class PlanModel:
 
     @cached_property
     def compiled(self) -> CompiledModule:
-        """`kernels/estimation.py`, for these sizes."""
+        """`kernels/feedback.py`, for these sizes."""
         unknown = len(self.parameters)
         source = source_of(
-            estimation, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
+            feedback, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
             V=unknown + 2 * self.m, NUMBERS=len(self.compiled_dynamics.parameters), HELD=max(len(self.transition), 1),
         )  # fmt: skip
         label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"

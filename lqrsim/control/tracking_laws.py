@@ -25,7 +25,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_kind
-from lqrsim.kernels import tracking_law
+from lqrsim.kernels import recursions
 from lqrsim.kernels.records import PassArrays, PassSizes, PassWork
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
@@ -130,7 +130,7 @@ def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None
     sizes, laws = PassSizes(len(state), movable, model.size, m, lost), np.empty(compensation.shape)
     arrays = PassArrays(weights.control, stage.ravel(), compensation.ravel(), held.ravel(), laws.ravel())
     work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
-    improve = module_of(source_of(tracking_law), "tracking laws").lay_out("improve", 0, sizes, arrays, work)
+    improve = module_of(source_of(recursions), "tracking laws").lay_out("improve", 0, sizes, arrays, work)
     for t in range(steps - 1, -1, -1):
         if noise is not None:  # under the worst of it, the Hessian is S + S Y S, and the gradient s + S Y s
             S, M = cost[0, :, :movable], np.zeros((movable, noise.shape[2]))

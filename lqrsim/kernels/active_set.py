@@ -17,7 +17,7 @@ from math import copysign, inf, isfinite, nan
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
-from lqrsim.kernels.rollouts import larger
+from lqrsim.kernels.passes import larger
 from lqrsim.kernels.stages import (
     CONTROL,
     EQUALITY,
@@ -32,7 +32,6 @@ from lqrsim.kernels.stages import (
     row_change,
     typical_sizes,
     write_models,
-    write_models_and_costates,
 )
 
 # What rows do: nothing, stay at their targets, or, at a price, stay violated.
@@ -82,7 +81,7 @@ def begin_active_set(violation, stages, work, mem):
     copy(rows.acts, rows.size * (stages.steps + 1), rows.live)
     read_rows(stages, work.plan, rows.numbers)
     leave(stages)
-    mem.cost = write_models_and_costates(stages, work.plan, work.costates)
+    mem.cost = write_models(False, stages, work.plan, work.costates, 0.0)
     mem.typical = typical_sizes(stages, work.plan, stages.models.hessian)
     for at in range(rows.size * (stages.steps + 1)):
         at_limit = rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * rows.sizes[at]
@@ -245,7 +244,7 @@ def apply_step(violation, stages, work, mem):
                 work.plan.controls[t, i] += changes.controls[t, i]
     read_rows(stages, work.plan, rows.numbers)
     leave(stages)
-    mem.cost = write_models(stages, work.plan, work.costates, 0.0)
+    mem.cost = write_models(True, stages, work.plan, work.costates, 0.0)
     measure_plan(violation, stages, work, mem)
 
 

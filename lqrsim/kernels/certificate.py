@@ -7,9 +7,8 @@ line searches that found the plan. The cost is the value that comes with the der
 
 from math import inf, isnan, nan
 
-from lqrsim.kernels.cost_to_go import minimize_control
 from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
-from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, congruence, copy, copy_matrix, fill
+from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, congruence, copy, copy_matrix, copy_part, fill
 from lqrsim.kernels.model_functions import (
     augment_cost,
     cost_alone,
@@ -19,8 +18,9 @@ from lqrsim.kernels.model_functions import (
     step_jacobian,
     step_second_order,
 )
+from lqrsim.kernels.passes import larger
 from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
-from lqrsim.kernels.rollouts import larger
+from lqrsim.kernels.riccati import minimize_control
 
 # A predicted decrease below this, relative to the terms that cancel in it, consists of squares of rounding errors: all
 # that an optimal cost of zero leaves.
@@ -370,8 +370,7 @@ def reduce_stage(hessian, least, S):
     """
     block, gain, offset, none, unused = stack(M, M), stack(M, N), stack(M), zeros(W), stack(N)
     for i in range(M):
-        for j in range(M):
-            block[i, j] = hessian[N + i, N + j]
+        copy_part(hessian[N + i], N, block[i], 0, M)
     for k in range(M):
         if block[k, k] == inf:
             hessian[N + k, N + k] = 1.0

@@ -12,6 +12,7 @@ N = 0  # states
 M = 0  # controls
 W = N + M  # states and controls, joined
 NOISY = 0  # 1 for a problem with noise; `if NOISY` is not compiled for others
+PRIMAL = 0  # 1 for the primal form of the cost-to-come, 0 for the dual form
 EQUALITY = 0  # 1 for a constraint whose values must be zero
 
 # Outcomes of iterations; see `Status`. Some have no status of the same name: NO_START (the first trajectory is not
@@ -187,8 +188,8 @@ def constraint_slope(x, u, t, row, data, gradient) -> None:
 def places(x, data, out) -> None:
     """Write the centres of a robot's balls, three coordinates each, ball by ball.
 
-    `user_functions.py`, `mjcf_distances.py`; for costs and constraints of a residual, its rows: `residual` of
-    `mjcf_distances.py`, and of the files of costs and constraints.
+    `user_functions.py`, `mjcf_dynamics.py`; for costs and constraints of a residual, its rows: `residual` of
+    `mjcf_dynamics.py`, and of the files of costs and constraints.
     """
 
 
@@ -216,37 +217,3 @@ def measure(x, data, out) -> None:
 
 def measure_slope(x, data, out) -> None:
     """Write the structurally nonzero entries of the measurement's Jacobian (Y, N)."""
-
-
-# Open functions of the form of the cost-to-come: `cost_to_come_dual.py`, `cost_to_come_primal.py`.
-FORM = (
-    "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "smoothed_state", "previous_state",
-)  # fmt: skip
-
-
-def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool]:
-    """Write the cost-to-come at 0."""
-    return 0.0, True
-
-
-def linearize(x, u, model, arrived, step) -> None:
-    """Write the next state, and the linear step that `riccati_forward` takes."""
-
-
-def forward_jacobian(x, u, model, arrived, step, spare):
-    """The Jacobian (N, W) of the step forwards, after `linearize`; may use the work array `spare`."""
-    return step.jacobian
-
-
-def riccati_forward(t, step, stage, constant, to_come, smoothing) -> bool:
-    """Write the cost-to-come at t + 1, given the cost-to-come at t; return whether it exists."""
-    return True
-
-
-def smoothed_state(t, to_go, to_come, costate, x) -> bool:
-    """Write the minimiser of the total cost at t, and the costate there; return whether it exists."""
-    return True
-
-
-def previous_state(t, x_hat, costate, smoothing, model, x, u) -> None:
-    """Write the state and control at t, given the smoothed state and costate at t + 1."""

@@ -8,7 +8,7 @@ from math import inf
 
 from lqrsim.kernels.active_set import active_set as active_set
 from lqrsim.kernels.certificate import certify, reduced_curvature
-from lqrsim.kernels.control_limits import riccati_backward
+from lqrsim.kernels.cost_to_come import riccati_forward, smoothed_state
 from lqrsim.kernels.declarations import (
     CERTIFY,
     CURVE,
@@ -19,20 +19,24 @@ from lqrsim.kernels.declarations import (
     M,
     N,
     W,
-    riccati_forward,
-    smoothed_state,
     stack,
     zeros,
 )
-from lqrsim.kernels.descent import descend, measure_optimality
 from lqrsim.kernels.interior_point import interior_point as interior_point
-from lqrsim.kernels.iterations import ilqr_iterations, relative_optimality, smoother_iterations
+from lqrsim.kernels.iterations import (
+    descend,
+    ilqr_iterations,
+    measure_optimality,
+    relative_optimality,
+    smoother_iterations,
+)
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
+from lqrsim.kernels.passes import ilqr_pass
 from lqrsim.kernels.passes import opening_pass as opening_pass
+from lqrsim.kernels.passes import rollout as rollout
 from lqrsim.kernels.records import Limits, LinearStep, QuadraticStage
 from lqrsim.kernels.restoration import restoration as restoration
-from lqrsim.kernels.rollouts import ilqr_pass
-from lqrsim.kernels.rollouts import rollout as rollout
+from lqrsim.kernels.riccati import riccati_backward
 from lqrsim.kernels.stages import adjoint as adjoint
 from lqrsim.kernels.stages import determine_scales as determine_scales
 from lqrsim.kernels.stages import evaluate_plan as evaluate_plan

@@ -34,7 +34,7 @@ from lqrsim.kernels.active_set import (
 )
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix
-from lqrsim.kernels.rollouts import copy_plan, larger
+from lqrsim.kernels.passes import copy_plan, larger
 from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
     EQUALITY,
@@ -49,7 +49,6 @@ from lqrsim.kernels.stages import (
     regularised_direction,
     row_change,
     write_models,
-    write_models_and_costates,
 )
 
 # Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
@@ -516,7 +515,7 @@ def predict(least, stages, work, mem):
     mem.parameter = 0.0
     solve(False, corrections, work.gaps, stages, work, mem)
     complete(False, corrections, step, stages, work, mem)
-    primal, dual = longest(1.0, slacks, step.slacks, stages), longest_dual(1.0, step.force, stages)
+    primal, dual = longest(1.0, slacks, step, stages)
     average, after = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         for side in range(2):
@@ -542,7 +541,7 @@ def centre(stages, work, mem):
     """
     rows, slacks, step, corrections = stages.rows, work.now.slacks, work.step, work.corrections
     tau = boundary(mem)
-    fraction, dual = longest(tau, slacks, step.slacks, stages), longest_dual(tau, step.force, stages)
+    fraction, dual = longest(tau, slacks, step, stages)
     if fraction >= LONG:
         return
     longer, dual_longer = min(1.0, fraction + REACH), min(1.0, dual + REACH)
@@ -555,7 +554,8 @@ def centre(stages, work, mem):
     if not solve(False, work.others, work.gaps, stages, work, mem):
         return
     complete(False, work.others, work.other, stages, work, mem)
-    if longest(tau, slacks, work.other.slacks, stages) >= fraction + FURTHER * REACH:
+    other_fraction, _ = longest(tau, slacks, work.other, stages)
+    if other_fraction >= fraction + FURTHER * REACH:
         count = rows.size * (stages.steps + 1)
         copy_matrix(work.others, count, 2, corrections)
         copy_matrix(work.other.slacks, count, 2, step.slacks)
@@ -576,26 +576,21 @@ def boundary(mem):
 
 
 @compact
-def longest(tau, slacks, changes, stages):
-    """The largest fraction of the changes of slacks, at most 1, by the fraction-to-the-boundary rule with `tau`."""
-    rows, fraction = stages.rows, 1.0
+def longest(tau, slacks, step, stages):
+    """The largest fractions of a PlanStep by the fraction-to-the-boundary rule with `tau`, at most 1.
+
+    Returns that of the changes of these slacks, and that of the changes of the multipliers.
+    """
+    rows, primal, dual = stages.rows, 1.0, 1.0
     for at in range(rows.size * (stages.steps + 1)):
         for side in range(2):
-            if rows.live[at] != 0 and has_slack(at, side, rows) and changes[at, side] < 0:
-                fraction = min(fraction, -tau * slacks[at, side] / changes[at, side])
-    return fraction
-
-
-@compact
-def longest_dual(tau, changes, stages):
-    """The same for changes of the multipliers, and their bounds."""
-    rows, fraction = stages.rows, 1.0
-    for at in range(rows.size * (stages.steps + 1)):
-        for side in range(2):
-            change = SIGNS[side] * changes[at]
-            if rows.live[at] != 0 and has_slack(at, side, rows) and change < 0:
-                fraction = min(fraction, -tau * from_bound(at, side, rows) / change)
-    return fraction
+            if rows.live[at] != 0 and has_slack(at, side, rows):
+                if step.slacks[at, side] < 0:
+                    primal = min(primal, -tau * slacks[at, side] / step.slacks[at, side])
+                change = SIGNS[side] * step.force[at]
+                if change < 0:
+                    dual = min(dual, -tau * from_bound(at, side, rows) / change)
+    return primal, dual
 
 
 # The line search.
@@ -615,8 +610,8 @@ def search(corrected, stages, work, mem):
     step, now = work.step, work.now
     mem.slope, mem.violated = slope_of_merit(stages, work, mem), off(now, stages)
     mem.merit = merit_of(now, mem.cost, stages, mem)
-    fraction, first = longest(boundary(mem), now.slacks, step.slacks, stages), True
-    mem.whole = fraction
+    fraction, _ = longest(boundary(mem), now.slacks, step, stages)
+    mem.whole, first = fraction, True
     while fraction > SHORTEST:
         mem.tried = go(fraction, now, step.changes, step.slacks, work.tried, stages)
         if isfinite(mem.tried) and acceptable(fraction, work.tried, mem.tried, stages, work, mem):
@@ -650,7 +645,7 @@ def correct(fraction, stages, work, mem):
     if not solve(True, work.corrections, work.extra_gaps, stages, work, mem):
         return False
     complete(True, work.corrections, work.other, stages, work, mem)
-    longest_fraction = longest(boundary(mem), now.slacks, work.other.slacks, stages)
+    longest_fraction, _ = longest(boundary(mem), now.slacks, work.other, stages)
     cost = go(longest_fraction, now, work.other.changes, work.other.slacks, work.closer, stages)
     if not isfinite(cost) or not acceptable(fraction, work.closer, cost, stages, work, mem):
         return False
@@ -683,7 +678,7 @@ def close_residuals(fraction, stages, work, mem):
                 for side in range(2):
                     dual = from_bound(at, side, rows)
                     other.slacks[at, side] = -SIGNS[side] * slacks[at, side] / dual * change
-        longest_fraction = longest(boundary(mem), tried.slacks, other.slacks, stages)
+        longest_fraction, _ = longest(boundary(mem), tried.slacks, other, stages)
         cost = go(longest_fraction, tried, stages.changes, other.slacks, work.closer, stages)
         if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:
             return
@@ -709,7 +704,8 @@ def force_step(stages, work, mem):
     fraction = search(False, stages, work, mem)
     if fraction >= 0:
         return fraction
-    fraction = SOME * longest(boundary(mem), work.now.slacks, work.step.slacks, stages)
+    fraction, _ = longest(boundary(mem), work.now.slacks, work.step, stages)
+    fraction *= SOME
     mem.tried = go(fraction, work.now, work.step.changes, work.step.slacks, work.tried, stages)
     return fraction if isfinite(mem.tried) else -1.0
 
@@ -724,7 +720,7 @@ def accept_step(fraction, stages, work, mem):
     mem.fraction = fraction
     if fraction >= LONG:
         mem.soft = max(1.0, mem.soft / SOFTER)
-    dual = longest_dual(boundary(mem), step.force, stages)
+    _, dual = longest(boundary(mem), work.now.slacks, step, stages)
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
             rows.force[at] += (fraction if regularised(at, rows) else dual) * step.force[at]
@@ -867,7 +863,7 @@ def go_to(point, cost, least, stages, work, mem):
     copy_point(point, work.now, stages)
     mem.cost = cost
     copy_matrix(point.arrived, stages.steps, N, stages.models.arrived)
-    write_models(stages, work.now.plan, work.costates, least)
+    write_models(True, stages, work.now.plan, work.costates, least)
     measure_iterate(stages, work, mem)
 
 
@@ -875,7 +871,7 @@ def go_to(point, cost, least, stages, work, mem):
 def renew(stages, work, mem):
     """Compute the derivatives of the dynamics anew, about the iterate."""
     stages.reuses_derivatives[0], mem.age = 0.0, 0.0
-    write_models(stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
+    write_models(True, stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
     measure_iterate(stages, work, mem)
 
 
@@ -935,12 +931,11 @@ def polish(tolerance, violation, begun, stages, work, mem):
             rows.force[at] = min(max(begun.multipliers[at], -price), price)
             if rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * size:
                 rows.force[at] = AT_LIMIT * mem.scale / size
-    if isfinite(cost):
-        write_models_and_costates(stages, plan, work.active.costates)
-        if polish_rows(tolerance, violation, stages, work, mem):
-            return True
-    go_back(stages, work, mem)
-    return False
+    if not isfinite(cost):
+        go_back(stages, work, mem)
+        return False
+    write_models(False, stages, plan, work.active.costates, 0.0)
+    return polish_rows(tolerance, violation, stages, work, mem)
 
 
 @compact
@@ -954,15 +949,15 @@ def cross(tolerance, violation, stages, work, mem):
     copy_plan(stages.steps, work.now.plan, work.active.plan)
     copy(work.now.numbers, stages.rows.size * (stages.steps + 1), stages.rows.numbers)
     copy_matrix(work.costates, stages.steps + 1, N, work.active.costates)
-    if polish_rows(tolerance, violation, stages, work, mem):
-        return True
-    go_back(stages, work, mem)
-    return False
+    return polish_rows(tolerance, violation, stages, work, mem)
 
 
 @compact
 def polish_rows(tolerance, violation, stages, work, mem):
-    """Take steps with the rows that press held at their targets, and go where they converge; return whether they do."""
+    """Take steps with the rows that press held at their targets, and go where they converge, or else back.
+
+    Returns whether they converge.
+    """
     rows, active, memory = stages.rows, work.active, work.active_memory[0]
     for at in range(rows.size * (stages.steps + 1)):
         rows.held[at] = first_state(at, rows, mem) if rows.live[at] != 0 else FREE
@@ -971,7 +966,7 @@ def polish_rows(tolerance, violation, stages, work, mem):
         elif rows.held[at] == PAID:
             rows.force[at] = copysign(rows.prices[at], rows.force[at])
     memory.typical = mem.typical
-    memory.cost = write_models(stages, active.plan, active.costates, 0.0)
+    memory.cost = write_models(True, stages, active.plan, active.costates, 0.0)
     measure_plan(violation, stages, active, memory)
     for k in range(CROSSINGS):
         # The first step may be long; with a weight as large as in the other steps, rounding would spoil it.
@@ -983,12 +978,13 @@ def polish_rows(tolerance, violation, stages, work, mem):
             break
         apply_step(violation, stages, active, memory)
         if not isfinite(memory.cost):
-            return False
+            break
         farthest = farthest_from_target(rows, stages.steps)
         if max(memory.stationarity, memory.gap) < POLISHED * tolerance and farthest < POLISHED * violation:
             break
     kept = mem.elastic != 0 or memory.violation <= violation
-    if not kept or not max(memory.stationarity, memory.gap) < tolerance:
+    if not isfinite(memory.cost) or not kept or not max(memory.stationarity, memory.gap) < tolerance:
+        go_back(stages, work, mem)
         return False
     copy_plan(stages.steps, active.plan, work.now.plan)
     copy(rows.numbers, rows.size * (stages.steps + 1), work.now.numbers)

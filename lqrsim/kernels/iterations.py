@@ -1,9 +1,27 @@
-"""Iterations of LQR smoothing and of iLQR, all in compiled code.
+"""Iterations of LQR smoothing and of iLQR, and a descent, all in compiled code.
 
-Each function, as `descend` of `descent.py`, runs the iterations `first` to `last` - 1, and can be called again to
-continue, because its state is in its arrays. The log gets a row per iteration. All return four values: the number of
-iterations so far, the outcome (a name in `declarations.py`), whether a failed pass was the backward one, and
+`smoother_iterations`, `ilqr_iterations` and `descend` run the iterations `first` to `last` - 1, and can be called again
+to continue, because their state is in their arrays. The log gets a row per iteration. They return four values: the
+number of iterations so far, the outcome (a name in `declarations.py`), whether a failed pass was the backward one, and
 the step at which it failed, or -1.
+
+A descent takes steps from a plan that lower its merit: the cost plus the augmented Lagrangian. Newton's method and
+damped smoothing are one loop, `descend`; a `Descent` says which.
+
+Newton's steps are from the backward pass of differential dynamic programming about the plan. It does not project the
+Hessians of the costs, and adds the Hessians of the dynamics times the costate. If such a model has no minimum, the pass
+is repeated with less of these second-order terms, down to none, which is iLQR's pass, and then with growing weights
+on changes of the controls. Near an optimum with enough curvature, convergence is quadratic.
+
+Damped smoothing is the safeguard, for when undamped smoothing fails. Rollouts on the way to an optimum can cost any
+multiple of the first, so a rising cost does not mean that the method will fail: it runs undamped until a pass fails or
+the lowest cost no longer falls; see `no_progress`. Damped iterations are to LQR smoothing what Levenberg-Marquardt is
+to Gauss-Newton. The forward pass linearises about the plan, the backward pass a fraction `reach` of the way from the
+plan to the smoothed states. If a tenth of the step does not lower the merit, the next iteration reaches less far. At
+reach 0 both passes linearise about the plan, and the step is iLQR's: a descent direction, unless the plan is stationary
+or rounding spoils the matrices. If it fails, changes of the controls (and of a soft start) get a weight in both passes,
+relative to the cost's own curvature, which grows tenfold until it helps. After many iterations without convergence,
+reach 0 is also used, each time for twice as long.
 """
 
 from math import inf, isnan, nan
@@ -12,18 +30,22 @@ from lqrsim.kernels.declarations import (
     CONVERGED,
     COST_CONVERGED,
     CYCLING,
+    DAMPED,
     DIVERGED,
     ILQR,
     IN_VALLEY,
     LINGER,
     LONGEST_CYCLE,
     MAX_ITERATIONS,
+    MIXES,
+    NEWTON,
     NO_FALL,
     NO_PROGRESS,
     NO_START,
     NOISY,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
+    REJECTED,
     RISK_TOO_HIGH,
     RUNNING,
     SLOW_FALL,
@@ -34,22 +56,45 @@ from lqrsim.kernels.declarations import (
     stack,
     zeros,
 )
-from lqrsim.kernels.linear_algebra import copy
-from lqrsim.kernels.passes import backward_pass, forward_pass
-from lqrsim.kernels.records import CostToGo, Linearization, ModelOrder, Policy, Prior, ProblemModel
-from lqrsim.kernels.rollouts import (
+from lqrsim.kernels.linear_algebra import copy, fill
+from lqrsim.kernels.passes import (
+    backward_pass,
     copy_plan,
     copy_policy,
     ddp_pass,
     dynamics_residual,
+    forward_pass,
     ilqr_pass,
     initial_step,
     largest_gap,
     line_search,
     noise_cost,
     plan_cost,
+    policy_about_plan,
     rollout,
+    smoothed_states,
+    towards,
 )
+from lqrsim.kernels.records import CostToGo, Descent, Linearization, ModelOrder, Policy, Prior, ProblemModel
+
+# A small change of cost can come from a short step, so two in a row are required. At a kink of the dynamics damped
+# steps may lower the merit by rounding for ever.
+DAMPED_STEPS = Descent(DAMPED, changes=2, idle=12.0, reach=1.0, smallest=0.1, lightest=1e-3, factor=10.0, heaviest=1e12)
+# Weights are rarely needed, but then by unknown orders of magnitude: 8 span 21 of them.
+NEWTON_STEPS = Descent(
+    NEWTON, changes=0, second_order=1.0, smallest=1e-3, armijo=1e-4, weights=8, lightest=1e-10, factor=1e3,
+    patient=False,
+)  # fmt: skip
+# Smallest fraction of a step of a convex model about the plan. Such a model knows nothing of where a cost saturates, so
+# its steps may be too long by orders of magnitude.
+SHORTEST = 1e-8
+RISE = 1e-12  # rise of the merit, relative to it, that counts as rounding
+NEAR = 0.25  # least reach above 0
+# Part of a weight on changes of the controls that helped which is tried next; the weight that can be left out.
+FADE, FORGOTTEN = 0.1, 1e-6
+PATIENCE = 50  # number of steps at a reach above 0 after which iLQR's are tried
+ROUNDING = 1e-11  # relative improvement that may be rounding
+MORE = 3  # largest number of further steps of Newton's method while the smoothed states are not at the plan
 
 
 def relative_improvement(old, cost, negligible):
@@ -292,3 +337,268 @@ def ilqr_iterations(first, last, settings, model, work, memory, log):
                 failed, _, _ = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1
+
+
+# A descent.
+
+
+def descend(first, last, settings, model, work, memory, log):
+    """Iterations from the plan: a step, a line search and, once the cost has settled, a pass that judges the plan.
+
+    They end where the plan is optimal, CONVERGED or COST_CONVERGED; where nothing is left to try, or the merit falls by
+    rounding alone, STALLED; where there were `settings.max_iterations`; or, unless the steps are damped, where a pass
+    fails.
+
+    Args:
+      settings: IterationSettings, with the Descent. model: ProblemModel. log: rows of LOG.
+      work: SmootherArrays, with the plan, `best`.
+      memory: row of MEMORY, after `Workspace.begin_descent`.
+    """
+    how, damped, plan = settings.descent, settings.descent.method == DAMPED, work.best
+    for done in range(first, last):
+        reach, known = memory.reach, memory.known > 0
+        if damped:
+            good = smoothing_step(settings, model, work, memory)
+        else:
+            good = known or newton_step(settings, model, work, memory)
+        if memory.failed >= 0 and not damped:
+            return done, failure(good, model), True, int(memory.failed)
+        if not damped and not known and memory.relative_decrease < settings.tolerance:  # there is nothing to do
+            write_row(log[done], memory.plan_cost, 0.0, 0.0, nan, nan, NEWTON)
+            if measure_optimality(settings, True, False, model, work, memory, log[done]) != RUNNING:
+                return done + 1, CONVERGED, False, -1
+        merit, cost, fraction = memory.merit, memory.plan_cost, 0.0
+        if memory.failed < 0:
+            merit, cost, fraction = follow_step(settings, model, work, memory)
+        improvement, gap, method = 0.0, 0.0, how.method
+        cost_converged, exhausted, full = how.changes == 0, False, done + 1 == settings.max_iterations
+        if fraction > 0:
+            improvement = relative_improvement(memory.merit, merit, memory.negligible)
+            if reach > 0:
+                for t in range(settings.steps + 1 if fraction < 1 else 0):
+                    towards(work.x_hats[t], fraction, plan.states[t], N)
+                gap = largest_gap(settings.steps, work.x_hats, work.last.states)
+            elif damped:  # the models are about a rollout, which has no gap
+                method = ILQR
+            copy_plan(settings.steps, work.last, plan)
+            memory.plan_cost, memory.merit = cost, merit
+            small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
+            memory.small_changes = memory.small_changes + 1 if small else 0.0
+            memory.idle = memory.idle + 1 if improvement < ROUNDING else 0.0
+            cost_converged, exhausted = memory.small_changes >= how.changes, memory.idle >= how.idle
+            relax(how, memory, fraction)
+        else:
+            exhausted, method = tighten(how, memory), REJECTED
+            gap = nan if damped else 0.0
+        write_row(log[done], memory.plan_cost, improvement, gap, nan, nan, method)
+        if cost_converged or exhausted or full:
+            settled, ending = cost_converged or exhausted, exhausted or full
+            outcome = measure_optimality(settings, settled, ending, model, work, memory, log[done])
+            if outcome == RUNNING and ending:
+                outcome = STALLED if exhausted else MAX_ITERATIONS
+            if outcome != RUNNING:
+                return done + 1, outcome, memory.failed >= 0, int(memory.failed)
+    return last, RUNNING, False, -1
+
+
+def smoothing_step(settings, model, work, memory):
+    """Find a step by both passes of smoothing: write its policy, relative to the plan, and where it begins to `x_hat`.
+
+    If a pass fails, `memory.failed` is the step at which it did, else -1. Returns whether all numbers there were
+    finite.
+    """
+    copy(work.start if settings.fixed else work.best.states[0], N, work.x_hat)
+    about, negligible = Linearization(work.best, True, memory.reach, memory.weight, work.prior), 0.0
+    failed, good = forward_pass(settings, model, about, work)
+    if failed < 0:
+        failed, good, negligible = backward_pass(settings, model, about, work)
+    if failed < 0:
+        policy_about_plan(settings.steps, work.best, work.policy)
+        if NOISY:  # with the new policy's cost-to-go
+            update_plan_cost(settings.steps, model, work, memory)
+    memory.failed, memory.negligible = failed, negligible
+    return good
+
+
+def newton_step(settings, model, work, memory):
+    """The same by a pass about the plan: the first on the ladder of regularisation that has a minimum.
+
+    The ladder has the shares of second-order terms, from the memory's down to none, and then the weights on changes of
+    the controls. The second-order cost-to-go takes the place of the cost-to-come.
+    """
+    how, failed, good, left, second_order, size = settings.descent, -1, True, nan, 0.0, 0.0
+    second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
+    if NOISY:  # the cost of noise is weighed with the cost-to-go of smoothing
+        order = ModelOrder(0.0, 0.0, work.to_go)
+        failed, good, _ = pass_about_plan(settings, order, model, work, work.last_policy, work.to_go)
+        memory.failed = failed
+        if failed >= 0:
+            return good
+        update_plan_cost(settings.steps, model, work, memory)
+    damping, lightest = 0.0, how.lightest * max(abs(memory.merit), how.lightest)
+    for k in range(len(MIXES) + how.weights):
+        if k < len(MIXES):
+            second_order = 1 - MIXES[k]
+        else:
+            damping = max(how.factor * damping, lightest)
+        if second_order <= memory.second_order:
+            order = ModelOrder(damping, second_order, work.to_go)
+            failed, good, left = pass_about_plan(settings, order, model, work, work.policy, second)
+            if failed < 0 and isnan(left) and not settings.fixed:  # the start has no minimum
+                failed = 0
+            if failed < 0 or not good:
+                break
+    memory.failed, memory.known = failed, 1.0 if failed < 0 else 0.0
+    memory.second_order, memory.damping = second_order, damping
+    for t in range(settings.steps + 1):
+        size = max(size, abs(second.constant[t]))
+    memory.negligible, memory.decrease = settings.rounding * size, 2 * left
+    memory.relative_decrease = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
+    return good
+
+
+def pass_about_plan(settings, order, model, work, policy, to_go):
+    """`ddp_pass` about the plan, and the step of a soft start, which is written to `x_hat`.
+
+    Returns:
+      The step at which it failed, or -1; whether all numbers were finite; and the decrease of cost that it predicts,
+      NaN if the start has no minimum.
+    """
+    plan, shift = work.best, stack(N)
+    failed, good, left = ddp_pass(settings.steps, plan, model, order, 1, policy, to_go)
+    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+    if failed < 0 and not settings.fixed:
+        left += initial_step(plan.states[0], model, order.second_order, to_go, shift)
+        for i in range(N):
+            work.x_hat[i] += shift[i]
+    return failed, good, left
+
+
+def update_plan_cost(steps, model, work, memory):
+    """Evaluate the plan's expected cost and merit with the latest cost-to-go."""
+    cost, added = plan_cost(steps, work.best, model, work.to_go)
+    memory.plan_cost, memory.merit = cost, cost + added
+
+
+def follow_step(settings, model, work, memory):
+    """Follow the step as far as it lowers the merit; return the new merit and cost, and the fraction, 0 for none."""
+    how, shift, bound = settings.descent, stack(N), memory.merit + RISE * abs(memory.merit)
+    for i in range(N):
+        shift[i] = work.x_hat[i] - work.best.states[0, i]
+    if memory.reach == 0 and memory.second_order == 0 and how.patient:
+        return line_search(settings.steps, shift, work, model, bound, 0.0, SHORTEST, work.last)
+    slope = how.armijo * memory.decrease
+    return line_search(settings.steps, shift, work, model, bound, slope, how.smallest, work.last)
+
+
+def relax(how, memory, fraction):
+    """Regularise less after an iteration that lowered the merit with that fraction of its step."""
+    memory.second_order, memory.known = how.second_order, 0.0
+    if memory.weight > 0:
+        memory.weight = FADE * memory.weight if memory.weight > FORGOTTEN else 0.0
+    elif memory.reach > 0:
+        if fraction == 1:
+            memory.reach = min(2 * memory.reach, 1.0)
+        memory.since_ilqr += 1
+        if memory.since_ilqr > PATIENCE:
+            turn_to_ilqr(memory)
+    elif how.method == DAMPED:
+        memory.ilqr_left -= 1
+        memory.reach = NEAR if memory.ilqr_left <= 0 else 0.0
+
+
+def tighten(how, memory):
+    """Regularise more after an iteration that did not lower the merit; return whether there is nothing left to try."""
+    memory.known = 0.0
+    if memory.second_order > 0:
+        memory.second_order = 0.0
+    elif memory.reach > NEAR:
+        memory.reach = NEAR
+    elif memory.reach > 0:
+        turn_to_ilqr(memory)
+    else:
+        memory.weight = max(how.factor * memory.weight, how.lightest)
+    return memory.weight > how.heaviest
+
+
+def turn_to_ilqr(memory):
+    """Set reach to 0 for a while, each time for twice as long."""
+    memory.reach, memory.since_ilqr = 0.0, 0.0
+    memory.ilqr_left = memory.ilqr_next
+    memory.ilqr_next *= 2
+
+
+def measure_optimality(settings, cost_converged, ending, model, work, memory, row):
+    """Measure the plan's optimality; compute policy and value functions about it. CONVERGED if optimal, else RUNNING.
+
+    Newton's pass that measures it is the next step's, and value functions are computed at its end alone: as in
+    smoothing, without second-order terms. They are convex, so that the minimum of their sum is at the plan. If it is
+    not, up to MORE further steps follow: in flat directions a plan may be far off although the predicted decrease is
+    small.
+    """
+    how = settings.descent
+    if how.method == DAMPED:
+        order = ModelOrder(0.0, 0.0, work.to_go)
+        failed, _, left = pass_about_plan(settings, order, model, work, work.policy, work.to_go)
+        if NOISY and failed < 0:
+            update_plan_cost(settings.steps, model, work, memory)
+        memory.failed = failed
+        memory.relative_decrease = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
+    elif memory.known == 0:
+        newton_step(settings, model, work, memory)
+    if memory.failed >= 0:
+        return RUNNING
+    row.cost, row.optimality = memory.plan_cost, memory.relative_decrease
+    optimal = cost_converged and memory.relative_decrease < settings.tolerance
+    if how.method == DAMPED:
+        value_functions_at_plan(settings, model, work, memory, row)
+    elif optimal or ending:
+        convex_value_functions(settings, model, work, memory, row)
+        if not ending and not memory.final_gap < settings.gap_tolerance and memory.more < MORE:
+            memory.more += 1
+            newton_step(settings, model, work, memory)
+            optimal = False
+    if not optimal:
+        return RUNNING
+    return CONVERGED if settings.optimal else COST_CONVERGED
+
+
+def value_functions_at_plan(settings, model, work, memory, row):
+    """Complete a backward pass about the plan: a policy that reproduces the plan, and the cost-to-come.
+
+    Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: if the dynamics
+    are unstable, rounding can spoil the cost-to-come while the rest is right.
+    """
+    steps, plan, policy = settings.steps, work.best, work.policy
+    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+    failed, _ = forward_pass(settings, model, Linearization(plan, True, 1.0, 0.0, work.prior), work)
+    memory.final_gap = inf
+    if failed < 0 and smoothed_states(steps, work.to_go, work.to_come, work.x_hats):
+        memory.final_gap = largest_gap(steps, work.x_hats, plan.states)
+    # The forward pass left x_hat at T; the next iteration begins at the start.
+    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+    for t in range(steps):
+        for i in range(M):
+            policy.offset[t, i] = plan.controls[t, i]
+            for j in range(N):
+                policy.offset[t, i] -= policy.gain[t, i, j] * plan.states[t, j]
+    row.residual = dynamics_residual(steps, work.x_hats, policy, model, plan.states)
+    if isnan(row.gap):  # the iteration was rejected
+        row.gap = 0.0
+
+
+def convex_value_functions(settings, model, work, memory, row):
+    """Compute the value functions about the plan without second-order terms, and a policy that reproduces the plan.
+
+    A control at a limit gets no gain, even if the next step would move it off the limit by less than the tolerance.
+    """
+    policy, controls = work.policy, work.best.controls
+    if not NOISY:
+        order = ModelOrder(memory.damping, 0.0, work.to_go)
+        ddp_pass(settings.steps, work.best, model, order, 1, work.last_policy, work.to_go)
+    value_functions_at_plan(settings, model, work, memory, row)
+    for t in range(settings.steps):
+        for i in range(M):
+            if controls[t, i] == model.limits.low[i] or controls[t, i] == model.limits.high[i]:
+                policy.offset[t, i] = controls[t, i]
+                fill(policy.gain[t, i], N, 0.0)

@@ -23,10 +23,10 @@ PADDED_COUNT), S (COUNT, COUNT).
 
 from math import inf, log1p, sqrt
 
-from lqrsim.kernels.control_limits import limited_control
 from lqrsim.kernels.declarations import M, N, W, noise_slopes, noise_values, outline, stack, zeros
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.model_functions import advance, cost_value
+from lqrsim.kernels.riccati import limited_control
 
 ROWS = (0,)  # the states that noise acts on directly
 COUNT = 1  # their number
@@ -144,8 +144,7 @@ def noisy_block(S, compact):
 def times_hessian(S, values, weighed):
     """Write S M."""
     for i in range(COUNT):
-        for k in range(SIZE):
-            weighed[i, k] = 0.0
+        fill(weighed[i], SIZE, 0.0)
         for j in range(COUNT):
             for k in range(SIZE):
                 weighed[i, k] += S[i, j] * values[j, k]

@@ -242,7 +242,7 @@ class PlanStages(NamedTuple):
     steps: int  # T
     soft: int  # 1 if there is an initial cost
     free: Annotated[Arrays, "N"]  # 0 for the states that the start fixes, else 1
-    jumps: Annotated[Arrays, "T+1"]  # 1 where the last state is free, and may jump; at the start, if there are any
+    jumps: Annotated[Arrays, "T+1"]  # 1 where the last state is free, and may jump
     reset: Annotated[Arrays, "T+1 N+1"]  # the law of its change there
     reach: Annotated[Arrays, "N"]  # distances from the start to the goal
     unit: Annotated[Arrays, "N"]  # a number for each unit; states without one have numbers of their own
@@ -349,21 +349,8 @@ class RestorationArrays(NamedTuple):
     relative_multipliers: Annotated[Arrays, "K"]  # to the price
 
 
-class EliminatedControl(NamedTuple):
-    """A step and its stage with the control eliminated by u = w - F x - h, for the dual form."""
-
-    factor: Arrays  # (M, M) Cholesky factor of R
-    F: Arrays
-    h: Arrays
-    AT: Arrays  # (N, N) and (M, N), the step's matrices transposed
-    BT: Arrays
-    Q: Arrays  # (N, N) and (N,), the cost of the state
-    q: Arrays
-    size: Arrays  # (N,) the diagonal of its Hessian before
-
-
 class Descent(NamedTuple):
-    """How steps from a plan are made, accepted and regularised; see `descent.py`."""
+    """How steps from a plan are made, accepted and regularised; see `iterations.py`."""
 
     method: int  # DAMPED or NEWTON
     changes: int  # number of small changes of cost in a row after which the plan is judged; 0 to judge each plan
@@ -422,7 +409,7 @@ class SmootherArrays(NamedTuple):
 
 
 class FilterSizes(NamedTuple):
-    """Sizes of a Kalman filter; see `square_root_filter.py`."""
+    """Sizes of a Kalman filter; see `recursions.py`."""
 
     knots: int  # T+1
     entries: int  # Z
@@ -455,7 +442,7 @@ class FilterRoots(NamedTuple):
 
 
 class LoopSizes(NamedTuple):
-    """Sizes of C laws in L systems; see `loop_moments.py`."""
+    """Sizes of C laws in L systems; see `recursions.py`."""
 
     steps: int  # T
     systems: int  # L
@@ -525,7 +512,7 @@ class LoopMoments(NamedTuple):
 
 
 class PassSizes(NamedTuple):
-    """Sizes of the backward pass of C tracking laws; see `tracking_law.py`."""
+    """Sizes of the backward pass of C tracking laws; see `recursions.py`."""
 
     laws: int  # C
     driven: int  # Y, the states that controls move
@@ -564,7 +551,7 @@ class RiccatiArrays(NamedTuple):
 
 
 class Predictor(NamedTuple):
-    """The model that predicts estimates over a control period; see `estimation.py`."""
+    """The model that predicts estimates over a control period; see `feedback.py`."""
 
     dynamics: DynamicsModel
     dt: float
@@ -580,13 +567,6 @@ class SensorModel(NamedTuple):
     measure: float
     slope: float
     data: Arrays
-
-
-class Measurements(NamedTuple):
-    """Measured states (count, N), and (count,) 1 where a measurement was lost, else 0."""
-
-    shown: Arrays
-    lost: Arrays
 
 
 class AngularStates(NamedTuple):

@@ -15,7 +15,7 @@ from math import hypot, inf, isfinite, log
 
 from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy_matrix, fill, finite
-from lqrsim.kernels.rollouts import copy_plan, larger
+from lqrsim.kernels.passes import copy_plan, larger
 from lqrsim.kernels.stages import (
     EQUALITY,
     LIMIT,
@@ -27,11 +27,8 @@ from lqrsim.kernels.stages import (
     write_models,
 )
 
-FIRST, LEAST, FALL = (
-    1e-1,
-    1e-6,
-    0.2,
-)  # first and least barrier parameter, relative to the price; factor by which it falls
+# First and least barrier parameter, relative to the price; factor by which it falls.
+FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2
 LEAST_DECREASE = 0.1  # predicted decrease per row, relative to the parameter, below which the parameter falls
 LAST = 1e-6  # predicted decrease over all rows at the end: multipliers are accurate to its square root
 ARMIJO, SHORTEST = 1e-4, 1e-6  # least part of the predicted decrease that a step must have; smallest step
@@ -135,7 +132,7 @@ def descend(price, stages, work, mem):
         good = good and (rows.live[at] == 0 or isfinite(rows.numbers[at]))
     if not good:
         return False
-    write_models(stages, work.plan, work.costates, 0.0)
+    write_models(True, stages, work.plan, work.costates, 0.0)
     for t in range(steps):
         fill(work.gaps[t], N, 0.0)
     while True:

@@ -1,17 +1,30 @@
 """One Runge-Kutta step with the control held, its Jacobian and its curvature.
 
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
+
+Of dynamics that are stated as a map, `rate` is the next state F(x, u), and the map knows by itself how long a step is.
+It has no inverse: backwards in time the result is NaN, as by MuJoCo's steps.
 """
 
+from math import nan
+
 from lqrsim.kernels.declarations import M, N, W, compact, rate, rate_curvature, rate_jacobian, stack, zeros
+from lqrsim.kernels.linear_algebra import copy, copy_part, fill
 
 SUPPORT = (0,)  # entries of (x, u) in which the rates are nonlinear, states first
 K = 1  # their number
 STATES = 1  # the number of states among them
+MAP = 0  # 1 for a map
 
 
 def advance(x, u, p, h, out):
     """Write the state (N,) after `h` seconds."""
+    if MAP:
+        if h > 0:
+            rate(x, u, p, out)
+        else:
+            fill(out, N, nan)
+        return
     z, k = stack(N), stack(N)
     for i in range(N):
         out[i] = z[i] = x[i]
@@ -31,17 +44,14 @@ def chain(fx, fu, previous, a, out):
     """
     row = stack(W)  # a local array instead of out[i] stays in registers
     for i in range(N):
-        for j in range(N):
-            row[j] = fx[i, j]
-        for j in range(M):
-            row[N + j] = fu[i, j]
+        copy(fx[i], N, row)
+        copy_part(fu[i], 0, row, N, M)
         for k in range(N):
             if fx[i, k] != 0:  # most systems couple few states
                 factor = a * fx[i, k]
                 for j in range(W):
                     row[j] += factor * previous[k, j]
-        for j in range(W):
-            out[i, j] = row[j]
+        copy(row, W, out[i])
 
 
 def step_jacobian(x, u, p, h, out, jacobian):
@@ -49,18 +59,21 @@ def step_jacobian(x, u, p, h, out, jacobian):
 
     The four stages are written out, because a loop over them is slower.
     """
-    k, z = stack(N), stack(N)
-    fx, fu, first, second = zeros(N, N), zeros(N, M), stack(N, W), stack(N, W)
+    fx, fu = zeros(N, N), zeros(N, M)
+    if MAP:
+        rate_jacobian(x, u, p, out, fx, fu)
+        for i in range(N):
+            copy(fx[i], N, jacobian[i])
+            copy_part(fu[i], 0, jacobian[i], N, M)
+        return
+    k, z, first, second = stack(N), stack(N), stack(N, W), stack(N, W)
     rate_jacobian(x, u, p, k, fx, fu)
     for i in range(N):
         out[i] = k[i]
         z[i] = x[i] + 0.5 * h * k[i]
-        for j in range(N):
-            first[i, j] = fx[i, j]
-        for j in range(M):
-            first[i, N + j] = fu[i, j]
-        for j in range(W):
-            jacobian[i, j] = first[i, j]
+        copy(fx[i], N, first[i])
+        copy_part(fu[i], 0, first[i], N, M)
+        copy(first[i], W, jacobian[i])
     rate_jacobian(z, u, p, k, fx, fu)
     chain(fx, fu, first, 0.5 * h, second)
     for i in range(N):
@@ -99,7 +112,15 @@ def state_jacobians(count, states, controls, p, slopes):
 
 def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
     """Write a step and its Jacobian as above; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W)."""
-    k, z2, z3, z4, curve = stack(N), stack(N), stack(N), stack(N), zeros(K, K)
+    curve = zeros(K, K)
+    if MAP:
+        step_jacobian(x, u, p, h, out, jacobian)
+        full_curvature(x, u, p, weights, curve)
+        for a in range(K):
+            for b in range(K):
+                hessian[SUPPORT[a], SUPPORT[b]] += curve[a, b]
+        return
+    k, z2, z3, z4 = stack(N), stack(N), stack(N), stack(N)
     fu, fx1, fx2, fx3, fx4 = zeros(N, M), zeros(N, N), zeros(N, N), zeros(N, N), zeros(N, N)
     slope1, slope2, slope3, slope4 = stack(N, W), stack(N, W), stack(N, W), stack(N, W)
     w1, w2, w3, w4 = stack(N), stack(N), stack(N), stack(N)
@@ -107,10 +128,8 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
     for i in range(N):
         out[i] = k[i]
         z2[i] = x[i] + 0.5 * h * k[i]
-        for j in range(N):
-            slope1[i, j] = fx1[i, j]
-        for j in range(M):
-            slope1[i, N + j] = fu[i, j]
+        copy(fx1[i], N, slope1[i])
+        copy_part(fu[i], 0, slope1[i], N, M)
     rate_jacobian(z2, u, p, k, fx2, fu)
     chain(fx2, fu, slope1, 0.5 * h, slope2)
     for i in range(N):
@@ -168,23 +187,19 @@ def add_curvature(z, u, p, weights, delta, slope, total):
             rows[a, j] = delta * slope[SUPPORT[a], j]
         rows[a, SUPPORT[a]] += 1
     for a in range(K):
-        for j in range(W):
-            line[j] = 0.0
+        fill(line, W, 0.0)
         for b in range(STATES):
             for j in range(W):
                 line[j] += curve[a, b] * rows[b, j]
         for b in range(STATES, K):  # controls are held: their rows are the identity's
             line[SUPPORT[b]] += curve[a, b]
-        for j in range(W):
-            product[a, j] = line[j]
+        copy(line, W, product[a])
     for i in range(W):
-        for j in range(W):
-            line[j] = total[i, j]
+        copy(total[i], W, line)
         for a in range(STATES):
             for j in range(W):
                 line[j] += rows[a, i] * product[a, j]
-        for j in range(W):
-            total[i, j] = line[j]
+        copy(line, W, total[i])
     for a in range(STATES, K):
         for j in range(W):
             total[SUPPORT[a], j] += product[a, j]

@@ -8,7 +8,6 @@ curves and forces: see `interior_point.py`, `active_set.py` and `solvers/restora
 from math import inf, sin, sqrt
 
 from lqrsim.kernels.certificate import reduce_stage
-from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
 from lqrsim.kernels.declarations import FIRST, MIXES, ROWS, M, N, W, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     affine,
@@ -34,14 +33,13 @@ from lqrsim.kernels.model_functions import (
     slope_of_constraint,
     step_second_order,
 )
+from lqrsim.kernels.passes import larger
 from lqrsim.kernels.records import LinearStep, QuadraticStage
-from lqrsim.kernels.rollouts import larger
+from lqrsim.kernels.riccati import add_cost_to_go, minimize_control
 
 TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
 STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: the cube root of the precision
-PROBE_DISTANCE = (
-    1e-3  # distance from a plan at which gradients are evaluated, too: at the plan itself entries may vanish
-)
+PROBE_DISTANCE = 1e-3  # distance from a plan where gradients are evaluated, too: at the plan entries may vanish
 # The size of a state that hardly moves is 1, or that of another in its unit if all move little or that moves far.
 SMALLEST = 1e-3  # a state that moves less hardly moves; where none moves more, relative to what moves most
 REST = 1e-12  # where none moves more, all motions are rounding errors
@@ -57,39 +55,28 @@ CONTROL, SIGN, SIDE, RANGE, LINEAR = 0, 1, 2, 3, 4  # columns of `StageRows.limi
 INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
-def write_models(stages, plan, costates, least):
+def write_models(known, stages, plan, costates, least):
     """Write the models of all stages at a plan, with costates (T+1, N), and return its cost.
 
-    Multipliers up to `least`, times the sizes of their rows, count as zero in the Hessians.
+    Multipliers up to `least`, times the sizes of their rows, count as zero in the Hessians. Unless the costates are
+    `known`, they are computed from this plan and the multipliers of its rows.
     """
-    constraint_slopes(stages, plan)
-    stages.projected[0] = 0.0
-    total, out = 0.0, stages.models
-    for t in range(stages.steps, -1, -1):
-        total += cost_model(t, stages, plan)
-    if stages.reuses_derivatives[0] == 0:
-        all_steps_second_order(stages.steps, plan, stages.model, costates, out.arrived, out.jacobian, out.hessian)
-        cut_at_jumps(stages, plan, out.arrived, out.jacobian)
-    for t in range(stages.steps, -1, -1):
-        add_curvatures(t, stages, plan, least)
-    if stages.soft == 1:
-        total += add_initial(plan.states[0], stages)
-    return total
-
-
-def write_models_and_costates(stages, plan, costates):
-    """As `write_models`, and compute the costates from this plan and the multipliers of its rows."""
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
     total, slope, out = 0.0, stack(W), stages.models
     for t in range(stages.steps, -1, -1):
         total += cost_model(t, stages, plan)
-        if t < stages.steps and stages.reuses_derivatives[0] == 0:
-            x, u = plan.states[t], plan.controls[t]
-            step_second_order(x, u, stages.model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+    anew = stages.reuses_derivatives[0] == 0
+    if known and anew:
+        all_steps_second_order(stages.steps, plan, stages.model, costates, out.arrived, out.jacobian, out.hessian)
+    for t in range(stages.steps, -1, -1):
+        if anew and t < stages.steps:
+            if not known:
+                x, u = plan.states[t], plan.controls[t]
+                step_second_order(x, u, stages.model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
             cut_at_jump(t, stages, plan, out.arrived, out.jacobian[t])
-        add_curvatures(t, stages, plan, 0.0)
-        if t > 0:
+        add_curvatures(t, stages, plan, least)
+        if not known and t > 0:
             lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
             copy(slope, N, costates[t])
     if stages.soft == 1:
@@ -208,15 +195,9 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
 def evaluate_plan(stages, plan, arrived):
     """Write the state after each step of a plan, (T, N), and return the plan's cost."""
     advance_all(stages.steps, plan, stages.model, arrived)
-    cut_at_jumps(stages, plan, arrived, stages.models.jacobian)
+    for t in range(stages.steps):
+        cut_at_jump(t, stages, plan, arrived, stages.models.jacobian[t])
     return cost_of_plan(stages, plan)
-
-
-def cut_at_jumps(stages, plan, arrived, jacobian):
-    """As `cut_at_jump`, at all knots."""
-    if stages.jumps[0] != 0:
-        for t in range(stages.steps):
-            cut_at_jump(t, stages, plan, arrived, jacobian[t])
 
 
 def cut_at_jump(t, stages, plan, arrived, jacobian):
@@ -271,7 +252,7 @@ def determine_scales(stages, plan):
                 probed.controls[t, i] = plan.controls[t, i] + PROBE_DISTANCE * sin(1.0 + N + i)
         fill(stages.to_go.gradient[t], N, 0.0)
     constraint_slopes(stages, probed)
-    write_models(stages, plan, stages.to_go.gradient, inf)
+    write_models(True, stages, plan, stages.to_go.gradient, inf)
     project(stages, plan)
     return typical_sizes(stages, plan, stages.models.convex)
 
@@ -315,7 +296,7 @@ def typical_sizes(stages, plan, hessian):
             at = rows.size * t + row
             count += rows.live[at]
             for i in range(W):
-                span = models.slopes[at, i] * size_of(i, stages)
+                span = models.slopes[at, i] * entry(stages.state_size, stages.control_size, i)
                 total += span * span
         size = sqrt(total / max(count, 1.0)) if total > 0 else 1.0
         size = min(size, rows.limits[row, RANGE])
@@ -324,13 +305,9 @@ def typical_sizes(stages, plan, hessian):
     cost = 0.0
     for t in range(steps + 1):
         for i in range(W):
-            cost += 0.5 * abs(hessian[t, i, i]) * size_of(i, stages) * size_of(i, stages)
+            size = entry(stages.state_size, stages.control_size, i)
+            cost += 0.5 * abs(hessian[t, i, i]) * size * size
     return cost if cost > 0 and cost < inf else 1.0
-
-
-def size_of(i, stages):
-    """The typical size of an entry of (x, u)."""
-    return stages.state_size[i] if i < N else stages.control_size[i - N]
 
 
 def lagrangian_slope(t, stages, after, slope):
@@ -504,8 +481,7 @@ def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
         least[i] = TINY * abs(stage[N + i, N + i])
     add_cost_to_go(t, LinearStep(jacobian, gap), QuadraticStage(stage, slope), 0.0, to_go)
     for i in range(M):
-        for j in range(M):
-            block[i, j] = stage[N + i, N + j]
+        copy_part(stage[N + i], N, block[i], 0, M)
         block[i, i] -= least[i]
     if not cholesky(block, M):
         return False

@@ -2,17 +2,20 @@
 
 The data of each function begin with its address and, if given, the address of its derivatives; its parameters follow.
 Outputs are NaN where the user's function does not write them. `differences.py` computes derivatives by differences.
+Of JAX, whole Runge-Kutta steps are a function, too, one or all of a plan at once: that of `codegen/jax_steps.py`.
 """
 
 from math import nan
 
-from lqrsim.kernels.declarations import M, N, W, call, stack, zeros
+from lqrsim.kernels.declarations import HESSIANS, JACOBIANS, STATES, M, N, W, call, stack, zeros
 from lqrsim.kernels.linear_algebra import clear, fill
+from lqrsim.kernels.runge_kutta import state_jacobians as state_jacobians
 
 BALLS = 1  # number of balls of `places`
 COORDINATES = 3  # number of coordinates that the function returns per ball; 2 in a plane
 COLUMNS = 1  # number of columns of the noise matrix M
 STRENGTH = 1  # index in the data of the factor of M
+STEPS = 2  # index in the data of the address of JAX's steps: the rates and their Jacobian come first
 
 
 def rate(x, u, p, out):
@@ -27,6 +30,29 @@ def rate_jacobian(x, u, p, out, fx, fu):
     clear(fx, N, N)
     clear(fu, N, M)
     call(p[1], x, u, p, fx, fu)
+
+
+def advance(x, u, p, h, out):
+    """Write the state (N,) after `h` seconds."""
+    call(p[STEPS], STATES, 1, 0, x, u, p, h, out, out, out, out)
+
+
+def step_jacobian(x, u, p, h, out, jacobian):
+    """Write the state (N,) after `h` seconds, and its Jacobian `[A B]` (N, W)."""
+    call(p[STEPS], JACOBIANS, 1, 0, x, u, p, h, out, out, jacobian, jacobian)
+
+
+def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
+    """The same, and add the Hessian (W, W) of the next state times weights (N,)."""
+    call(p[STEPS], HESSIANS, 1, 0, x, u, p, h, weights, out, jacobian, hessian)
+
+
+def all_steps(what, steps, states, controls, p, h, costates, arrived, jacobian, hessian):
+    """Write the state after each step of a plan, or also its Jacobian, or also add its Hessian: see `STATES`.
+
+    The weights of the next states are costates[1:].
+    """
+    call(p[STEPS], what, steps, 1, states, controls, p, h, costates, arrived, jacobian, hessian)
 
 
 def value(x, u, t, data):

@@ -27,7 +27,7 @@ from lqrsim.codegen.user_functions import (
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, excerpt
-from lqrsim.kernels import differences, discrete_map, jax_steps, runge_kutta, substeps, user_functions
+from lqrsim.kernels import differences, runge_kutta, substeps, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
@@ -302,16 +302,16 @@ class Dynamics:
 
     @cached_property
     def step_source(self) -> Source:
-        """Source of `advance` and `step_jacobian`, as in `kernels/runge_kutta.py`, or in `kernels/discrete_map.py`."""
+        """Source of `advance` and `step_jacobian`, as in `kernels/runge_kutta.py`."""
         if self.level == "jax":
-            return source_of(jax_steps).filled(rate_jacobian=self.source)
+            return self.source.filled(rate_jacobian=self.source)
         step = self._part_source if self.substeps == 1 else source_of(substeps, PARTS=self.substeps)
         return step.filled(**self._rates)
 
     @property
     def _part_source(self) -> Source:
         """The same of one Runge-Kutta step."""
-        return source_of(discrete_map if self.discrete else runge_kutta).filled(**self._rates)
+        return source_of(runge_kutta, MAP=int(self.discrete)).filled(**self._rates)
 
     @property
     def _rates(self) -> dict[str, Source]:
@@ -362,8 +362,7 @@ class Dynamics:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)
         curved = text_source(traced["source"], f"second derivatives of {self.name}(x, u, p)")
-        step, sizes = (discrete_map, {}) if self.discrete else (runge_kutta, {"STATES": states})
-        open_source = source_of(step, SUPPORT=support, K=len(support), **sizes)
+        open_source = source_of(runge_kutta, SUPPORT=support, K=len(support), STATES=states, MAP=int(self.discrete))
         return open_source.filled(rate_curvature=curved, **self._rates)
 
     @cached_property

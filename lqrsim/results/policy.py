@@ -1,6 +1,6 @@
 """Feedback laws in the form that a robot runs, with and without a filter. NumPy only.
 
-`kernels/policy_evaluation.py` implements `AffinePolicy` in compiled code, for simulations of many trials. There a trial
+`kernels/feedback.py` implements `AffinePolicy` in compiled code, for simulations of many trials. There a trial
 gets the same bits whatever other trials run with it, which NumPy's matrix products do not guarantee.
 `tests/test_policy.py` compares the two.
 """

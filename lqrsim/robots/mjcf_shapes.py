@@ -12,7 +12,8 @@ from lqrsim.annotations import Finite, checked
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, vectors_of
-from lqrsim.kernels import differences, mjcf_distances
+from lqrsim.kernels import differences
+from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.outlines import Capsule
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances, ShapeInWorld
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
@@ -96,7 +97,7 @@ class GeomsInWorld(ShapeInWorld):
         index = {key: row for row, key in enumerate(rows)}
         count, numbered = max(1, len(rows)), np.array([index[key] for key in keys], dtype=np.int64)
         return GeomDistances(
-            source=source_of(mjcf_distances, ROWS=count),
+            source=source_of(kernel, ROWS=count),
             data=mjcf_obstacles.distance_data(model, self.geoms.pairs[chosen], numbered, count, reach),
             parts=tuple(model.body(body).name for body, _ in rows),
             obstacles=tuple(number for _, number in rows), leading_states=model.nv,
@@ -197,7 +198,7 @@ class SelfClearance(Constraint):
             described, rows = [f"{link!r} and other links" for link in firsts], merged[rows]
         count = max(1, len(described))
         distances = Residual(
-            source_of(mjcf_distances, ROWS=count), mjcf_obstacles.distance_data(model, self._pairs, rows, count, reach),
+            source_of(kernel, ROWS=count), mjcf_obstacles.distance_data(model, self._pairs, rows, count, reach),
             parts=tuple(described), leading_states=model.nv, functions=(MjcfMemory.of(mjcf_dynamics),),
         )  # fmt: skip
 
@@ -241,7 +242,7 @@ def _distances(
 
 
 def _module(states: int) -> Any:
-    return module_of(source_of(mjcf_distances), f"MuJoCo's distances ({states} states)", N=states)
+    return module_of(source_of(kernel), f"MuJoCo's distances ({states} states)", N=states)
 
 
 class MjcfBalls(CollisionSpheres):
@@ -276,5 +277,5 @@ class MjcfBalls(CollisionSpheres):
         memory = MjcfMemory.of(mjcf_dynamics)
         positions = tuple(range(mjcf_dynamics.physics.model.nv))
         data = np.concatenate([[len(self)], self._points.ravel()])
-        source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_distances))
+        source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(kernel))
         return SphereCenters(source, data, positions, functions=(memory,))

@@ -11,7 +11,6 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, brief, check_array, check_name, check_text, check_weights
 from lqrsim.kernels.declarations import N, at, call, int32, stack, store
 from lqrsim.kernels.linear_algebra import clear
-from lqrsim.kernels.mjcf_distances import turn_to_states
 from lqrsim.kernels.mjcf_dynamics import (
     COMPOS,
     DATA,
@@ -26,6 +25,7 @@ from lqrsim.kernels.mjcf_dynamics import (
     XMAT,
     XPOS,
     claim_slot,
+    turn_to_states,
     write_positions,
 )
 from lqrsim.kernels.rotation_ratios import cotangent_ratio

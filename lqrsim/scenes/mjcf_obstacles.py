@@ -123,7 +123,7 @@ def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 
 @checked
 def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int64], count: int, reach: Finite) -> Array:
-    """The data of `kernels/mjcf_distances.py`, except the address of p.
+    """The data of `kernels/mjcf_dynamics.py`, except the address of p.
 
     The first geom of each of K pairs moves; `rows` (K,) are theirs, of `count`; `reach` is the largest distance in m.
     """

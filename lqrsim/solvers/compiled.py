@@ -17,14 +17,12 @@ from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
-    cost_to_come_dual,
-    cost_to_come_primal,
     entry_points,
     model_functions,
     projection,
     records,
 )
-from lqrsim.kernels.declarations import FIRST, FORM, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
+from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
 from lqrsim.kernels.records import CostModel, DynamicsModel, Motion, NoiseModel, Policy, ProblemModel
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
@@ -33,7 +31,7 @@ from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.policy import AffinePolicy
 
-FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}  # of the cost-to-come, with their kernels
+FORMS = ("dual", "primal")  # of the cost-to-come
 
 
 def core(problem: Problem, form: str = "dual") -> CompiledModule:
@@ -42,19 +40,13 @@ def core(problem: Problem, form: str = "dual") -> CompiledModule:
     sizes = _sizes(problem.dynamics)
     description = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
     description += "" if form == "dual" else f", {form} form"
-    return module_of(with_form(form), description, **sizes, NOISY=int(noisy))
+    return module_of(source_of(entry_points), description, **sizes, NOISY=int(noisy), PRIMAL=int(form == "primal"))
 
 
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
     """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/entry_points.py`."""
     description = f"linear-quadratic problems, {n} states and {m} controls"
-    return module_of(with_form(form), description, N=n, M=m, NOISY=0)
-
-
-@functools.cache
-def with_form(form: str) -> Source:
-    """The entry points with a form of the cost-to-come."""
-    return source_of(entry_points).filled(**dict.fromkeys(FORM, source_of(FORMS[form])))
+    return module_of(source_of(entry_points), description, N=n, M=m, NOISY=0, PRIMAL=int(form == "primal"))
 
 
 def _sizes(dynamics: Dynamics) -> dict[str, int]:

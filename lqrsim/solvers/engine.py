@@ -14,7 +14,7 @@ from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
-from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
+from lqrsim.kernels.iterations import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Motion, Policy, Prior, StructuredArray, zeros_of
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of

@@ -82,7 +82,7 @@ def smooth(
         From controls, "backward" runs the dynamics backwards in time, from the minimiser of the final cost. The
         dynamics of an MJCF, and maps, cannot run backwards, and are run forwards.
       safeguard: if the method fails, continue from the best plan so far with steps that lower its cost; see
-        `kernels/descent.py`. If this does not converge either among contacts or joint limits of an MJCF, and
+        `kernels/iterations.py`. If this does not converge either among contacts or joint limits of an MJCF, and
         there is no start, plan for softer contacts and limits from nine starts, continue from there, and soften and
         descend within contact modes in at most five rounds; see docs/mjcf_robots.md. If the method converges, results
         are bit-identical with and without the safeguard.

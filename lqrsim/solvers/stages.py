@@ -142,7 +142,7 @@ class Stages:
 
     def jump(self, knots: Sequence[int]) -> None:
         """Let the last state jump at some knots, each after the first."""
-        self.about.jumps[[0, *knots]] = 1.0 if knots else 0.0
+        self.about.jumps[list(knots)] = 1.0
 
     @classmethod
     def lent(cls, problem: Problem) -> "Stages":
@@ -166,7 +166,7 @@ class Stages:
         costates, slopes = about.to_go.gradient, plan.controls
         self._module.prepare(
             interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, records.MEASURES)),
-            determine_scales=(about, plan), write_models=(about, plan, costates, 0.0),
+            determine_scales=(about, plan), write_models=(True, about, plan, costates, 0.0),
             adjoint=(about, costates, slopes), evaluate_plan=(about, plan, about.models.arrived),
             read_rows=(about, plan, about.rows.numbers),
             least_curvatures=(about, about.rows.force, slopes, slopes[0]),
@@ -192,7 +192,7 @@ class Stages:
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
         """Compute the models about a plan; constraints with multipliers (T+1, R) up to `least` count as linear."""
         self.force[...] = multipliers
-        self.call("write_models", self.about, plan, costates, float(least))
+        self.call("write_models", True, self.about, plan, costates, float(least))
 
     def least_curvatures(self, weights: Array, held: Array) -> Array | None:
         """The least curvature (m,) of each control along the plan; None unless the reduced Hessian is definite.

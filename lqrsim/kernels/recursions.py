@@ -1,14 +1,14 @@
-"""One step of the recursion of a closed loop's moments; `control/linear_loop.py` has its form. In the kernels' subset.
+"""Recursions along a plan: moments of closed loops, a Kalman filter in square-root form, and tracking laws.
 
-It does all of a step but the two products of large matrices, which BLAS does faster. One compiled function serves all
-sizes, so every array is flat. In the names below Y, X, m, ... are sizes, and the arrays have the shapes of
-`LoopArrays`.
+`control/linear_loop.py`, `control/kalman.py` and `control/tracking_laws.py` have their forms. A step of the moments and
+of the laws lacks only products of large matrices, which BLAS does faster. One compiled function serves all sizes, so
+every array is flat. In the names below Y, X, Z, m, ... are sizes, and the arrays have the shapes of their records.
 """
 
-from math import erfc, exp, pi, sqrt
+from math import copysign, erfc, exp, pi, sqrt
 
 from lqrsim.kernels.declarations import inline, outline
-from lqrsim.kernels.linear_algebra import copy_part
+from lqrsim.kernels.linear_algebra import copy_part, fill
 
 
 def advance(t, sizes, loops, work, moments):
@@ -62,8 +62,7 @@ def spread(t, system, sizes, loops, work):
     """Write the covariance of d at knot t."""
     R = sizes.entries - sizes.driven
     given, noise = R * R * system, R * R * (sizes.systems * t + system)
-    for i in range(R * R):
-        work.half[i] = 0.0
+    fill(work.half, R * R, 0.0)
     for i in range(R if t > 0 else 0):
         for a in range(R):
             if loops.transition[R * i + a] != 0.0:
@@ -187,3 +186,150 @@ def limit(centre, std, low, high):
     slope, first = 1.0 - clipped_low - clipped_high, excess_low - excess_high
     second = slope - below * excess_low - above * excess_high
     return slope, centre + sigma * first, max(second - first * first - slope * slope, 0.0) * sigma * sigma
+
+
+def filter_along(sizes, model, roots):
+    """Write the roots of all knots, from the root before the first measurement, or after it if that was `used`."""
+    Z = sizes.entries
+    for t in range(sizes.knots):
+        copy_part(roots.root, 0, roots.before, Z * Z * t, Z * Z)
+        measure(t, sizes, model, roots)
+        copy_part(roots.root, 0, roots.after, Z * Z * t, Z * Z)
+        if t + 1 < sizes.knots:
+            predict(t, sizes, model, roots)
+
+
+@outline
+def measure(t, sizes, model, roots):
+    """Update the root by a measurement.
+
+    [noise H root; 0 root] times an orthogonal matrix is [S 0; K S root'], of which S S' is the innovation's.
+    """
+    Z, Y, n = sizes.entries, sizes.measured, sizes.states
+    width = n + Y + Z
+    fill(roots.work, (Y + Z) * width, 0.0)
+    for i in range(Y):
+        noise, expected = width * i, width * i + n + Y
+        add_row(1.0, model.noise, n * (Y * t + i), roots.work, noise, n)
+        for j in range(n):
+            add_row(model.H[n * (Y * t + i) + j], roots.root, Z * j, roots.work, expected, Z)
+        variance = dot(roots.work, noise, roots.work, noise, n) + dot(roots.work, expected, roots.work, expected, Z)
+        roots.work[noise + n + i] = max(sizes.resolution * sqrt(variance), sizes.nothing)
+    for i in range(Z):
+        add_row(1.0, roots.root, Z * i, roots.work, width * (Y + i) + n + Y, Z)
+    triangularize(roots.work, Y + Z, width)
+    for i in range(Y):
+        copy_part(roots.work, width * i, roots.innovation, Y * (Y * t + i), Y)
+    if t > 0 or not sizes.used:
+        for i in range(Z):
+            copy_part(roots.work, width * (Y + i), roots.learned, Y * (Z * t + i), Y)
+            copy_part(roots.work, width * (Y + i) + Y, roots.root, Z * i, Z)
+
+
+@outline
+def predict(t, sizes, model, roots):
+    """Move the root to the next knot: [F root, disturbing] times an orthogonal matrix is [root' 0]."""
+    Z, D = sizes.entries, sizes.disturbing
+    width = Z + D
+    for i in range(Z):
+        for j in range(Z):
+            roots.work[width * i + j] = 0.0
+        for j in range(Z):
+            if model.F[Z * (Z * t + i) + j] != 0.0:
+                add_row(model.F[Z * (Z * t + i) + j], roots.root, Z * j, roots.work, width * i, Z)
+        copy_part(model.disturbing, D * (Z * t + i), roots.work, width * i + Z, D)
+    triangularize(roots.work, Z, width)
+    for i in range(Z):
+        copy_part(roots.work, width * i, roots.root, Z * i, Z)
+
+
+@outline
+def triangularize(a, rows, columns):
+    """Make a matrix with at least as many columns as rows lower triangular, with a nonnegative diagonal.
+
+    It is done by reflections of the columns. Squares are of numbers relative to the largest of their row, so that none
+    underflows.
+    """
+    for i in range(rows):
+        first, rest = columns * i + i, columns - i - 1
+        largest = 0.0
+        for j in range(rest):
+            largest = max(largest, abs(a[first + 1 + j]))
+        if largest > 0.0:
+            largest = max(largest, abs(a[first]))
+            for j in range(rest + 1):
+                a[first + j] /= largest
+            size = sqrt(dot(a, first, a, first, rest + 1))
+            diagonal = -copysign(size, a[first])
+            factor, scale = (diagonal - a[first]) / diagonal, 1.0 / (a[first] - diagonal)
+            for j in range(rest):
+                a[first + 1 + j] *= scale
+            for k in range(i + 1, rows):
+                at = columns * k + i
+                along = -factor * (a[at] + dot(a, first + 1, a, at + 1, rest))
+                a[at] += along
+                add_row(along, a, first + 1, a, at + 1, rest)
+            a[first] = diagonal * largest
+            for j in range(rest):
+                a[first + 1 + j] = 0.0
+        if a[first] < 0.0:
+            for k in range(i, rows):
+                a[columns * k + i] *= -1.0
+
+
+def improve(t, sizes, arrays, work):
+    """Write the laws of step t and the costs-to-go at t of all weights; the `products` are given."""
+    for k in range(sizes.laws):
+        eliminate(t, k, sizes, arrays, work)
+        go_back(t, k, sizes, arrays, work)
+
+
+@outline
+def eliminate(t, k, sizes, arrays, work):
+    """Write the law, -(R + G'SG)^-1 (G'S [F E c] + undo): Gaussian elimination, which needs no pivots here."""
+    Y, m, width = sizes.driven, sizes.controls, sizes.entries + 1
+    row = width + m
+    law, curve, right = m * width * (sizes.laws * t + k), m * m * k, row * ((Y + m) * k + Y)
+    for a in range(m):
+        for j in range(width):
+            arrays.laws[law + width * a + j] = -work.products[right + row * a + j]
+        for j in range(width):
+            arrays.laws[law + width * a + j] -= arrays.undo[law + width * a + j]
+        for b in range(m):
+            work.curve[curve + m * a + b] = work.products[right + row * a + width + b]
+        work.curve[curve + m * a + a] += arrays.control[a]
+    for a in range(m):
+        for b in range(a + 1, m):
+            factor = -work.curve[curve + m * b + a] / work.curve[curve + m * a + a]
+            add_row(factor, work.curve, curve + m * a, work.curve, curve + m * b, m)
+            add_row(factor, arrays.laws, law + width * a, arrays.laws, law + width * b, width)
+    for a in range(m - 1, -1, -1):
+        for b in range(a + 1, m):
+            factor = -work.curve[curve + m * a + b]
+            add_row(factor, arrays.laws, law + width * b, arrays.laws, law + width * a, width)
+        for j in range(width):
+            arrays.laws[law + width * a + j] /= work.curve[curve + m * a + a]
+
+
+@outline
+def go_back(t, k, sizes, arrays, work):
+    """Write the cost-to-go (S, D, s): its mean over commands that arrive and commands that get lost."""
+    Y, m, width, lost = sizes.driven, sizes.controls, sizes.entries + 1, sizes.lost
+    row, force = width + m, Y - m
+    law, held, first, cost = m * width * (sizes.laws * t + k), m * width * t, row * (Y + m) * k, width * Y * k
+    for j in range(m * width):
+        work.mean[j] = (1.0 - lost) * arrays.laws[law + j] + lost * arrays.held[held + j]
+    for i in range(Y):
+        copy_part(work.products, first + row * i, work.cost, cost + width * i, width)
+        add_rows(m, work.products, first + row * i + width, 1, work.mean, 0, width, work.cost, cost + width * i, width)
+    for a in range(m if lost > 0.0 else 0):
+        own, at = first + row * (Y + a), cost + width * (force + a)
+        add_row(lost, work.products, own, work.cost, at, width)
+        for j in range(m * width):
+            work.mean[j] = lost * arrays.held[held + j]
+        add_rows(m, work.products, own + width, 1, work.mean, 0, width, work.cost, at, width)
+    for i in range(Y):
+        for j in range(i):
+            mean = 0.5 * (work.cost[cost + width * i + j] + work.cost[cost + width * j + i])
+            work.cost[cost + width * i + j], work.cost[cost + width * j + i] = mean, mean
+        work.cost[cost + (width + 1) * i] += arrays.state[Y * k + i]

@@ -1,15 +1,15 @@
-"""The steps of a Kalman filter for many trials at once, and derivatives along a plan.
+"""Feedback for many trials at once: a policy, and the steps of a Kalman filter. `AffinePolicy` does the first in NumPy.
 
 An estimate is one row of Z numbers: the state x (N), the actuators' lagging controls (LAG: M numbers, or none), and the
 states of the unknowns' model (D). `output` times these are the unknowns: of P parameters of the dynamics, and of the
 gain and the offset of each control (V = P + 2 M).
 """
 
-from math import nan
+from math import floor, nan, pi, sqrt
 
 from lqrsim.kernels.declarations import M, N, call, outline, stack
 from lqrsim.kernels.linear_algebra import affine, clear, copy, copy_part, fill
-from lqrsim.kernels.policy_evaluation import to_nearest
+from lqrsim.kernels.riccati import limited_control
 
 LAG, D, Y = 0, 1, 1  # counts of lagging controls, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
@@ -52,22 +52,23 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
         q[k] = p[k]
 
 
-def correct(count, measured, nominal, gain, limit, wider, sensor, angular, estimates, innovations):
+def correct(count, shown, lost, nominal, gain, limit, wider, sensor, angular, estimates, innovations):
     """Update estimates (count, Z) with measurements, except where these were lost.
 
     Args:
-      measured: Measurements; its states are replaced by the representatives nearest to the estimates.
+      shown: (count, N) measured states, replaced by the representatives nearest to the estimates.
+      lost: (count,) 1 where a measurement was lost, else 0.
       nominal: (N,) a state; the estimates are first replaced by the representatives nearest to it. gain: (Z, Y).
       limit: (D,) largest corrections of the unknowns' states; if one is exceeded, all of these are scaled down.
       wider: (count,) factors of the limit. They double where it is exceeded, and are 1 again where it is not.
       innovations: (count, Y) measurements minus expectations, written; NaN where the measurement was lost.
     """
     for k in range(count):
-        shown, lost, z = measured.shown[k], measured.lost[k], estimates[k]
-        fraction = correct_one(shown, lost, nominal, gain, limit, wider[k], sensor, angular, z, innovations[k])
+        z, innovation = estimates[k], innovations[k]
+        fraction = correct_one(shown[k], lost[k], nominal, gain, limit, wider[k], sensor, angular, z, innovation)
         if fraction < 1.0:
             wider[k] *= 2.0
-        elif lost == 0.0:
+        elif lost[k] == 0.0:
             wider[k] = 1.0
 
 
@@ -164,3 +165,61 @@ def diverged(count, estimates, out):
         for i in range(Z - 1, -1, -1):
             if not abs(estimates[k, i]) <= FAR:
                 out[k] = i
+
+
+def apply_policy(count, states, policy, nominal, angular, limits, out):
+    """Write the controls (count, M), within their limits, at states (count, N).
+
+    The states are overwritten by their representatives nearest to the nominal (N,).
+    """
+    for k in range(count):
+        apply_one(states[k], policy, nominal, angular, limits, out[k])
+
+
+@outline
+def apply_one(x, policy, nominal, angular, limits, u):
+    """Write the control (M,) at one state (N,)."""
+    to_nearest(x, nominal, angular)
+    limited_control(policy.gain, policy.offset, x, limits, u)
+
+
+def all_to_nearest(steps, count, states, nominal, angular):
+    """Replace states (steps count, N) by their representatives nearest to the nominal of their step, (steps, N)."""
+    for t in range(steps):
+        for k in range(count):
+            to_nearest(states[t * count + k], nominal[t], angular)
+
+
+@outline
+def to_nearest(x, nominal, angular):
+    """Replace a state by its representative nearest to the nominal: its angles and its rotation vectors."""
+    for k in range(angular.angle_count):  # to within half a turn
+        i = int(angular.angles[k])
+        x[i] -= 2.0 * pi * floor((x[i] - nominal[i]) / (2.0 * pi) + 0.5)
+    for k in range(angular.rotation_count):
+        nearest_rotation(x, nominal, int(angular.rotations[k, 0]), int(angular.rotations[k, 1]))
+
+
+def nearest_rotation(x, nominal, first, turn):
+    """Replace the rotation vector at x[first] by the nearest to the nominal among (angle + 2 pi k) axis, which are all
+    the same rotation; without its entry `turn`, 0 to 2, if that is an angle. See coordinates.py.
+    """
+    axis, reference, square, length, along = stack(3), stack(3), 0.0, 0.0, 0.0
+    for i in range(3):
+        axis[i], reference[i] = 0.0, 0.0
+        if i != turn:
+            axis[i], reference[i] = x[first + i], nominal[first + i]
+        square += axis[i] * axis[i]
+        length += reference[i] * reference[i]
+    angle, distance = sqrt(square), sqrt(length)
+    for i in range(3):
+        if angle < 1e-12:  # the identity has every axis
+            axis[i] = reference[i] / distance if distance > 0.0 else 0.0
+        else:
+            axis[i] /= angle
+        along += axis[i] * reference[i]
+    turns = floor((along - angle) / (2.0 * pi) + 0.5)
+    if turns != 0:
+        for i in range(3):
+            if i != turn:
+                x[first + i] = (angle + 2.0 * pi * turns) * axis[i]

@@ -1,28 +1,45 @@
-"""The dual form: a Kalman filter for the moments of the cost-to-come, in which the control acts as process noise.
+"""The cost-to-come, in one of two forms; `PRIMAL` says which.
 
-The cost-to-come is `1/2 (x - mean)' covariance^-1 (x - mean) + constant`. The covariance may be singular, and is zero
-at a fixed start; neither inverse dynamics nor an invertible A is needed. In the backward pass the costate, the gradient
-of the cost-to-go at the smoothed state, is propagated from each step to the previous step (the modified Bryson-Frazier
-smoother).
+The primal form is that of the paper, Eqs. (14)-(21): a quadratic, by inverse dynamics.
 
-`cost_to_come_primal.py` has functions of the same names; `passes.py` is written against either. With F = R^-1 P and h =
-R^-1 r, the substitution u = w - F x - h eliminates the control: At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B h.
+The dual form is a Kalman filter for its moments, in which the control acts as process noise. The cost-to-come is
+`1/2 (x - mean)' covariance^-1 (x - mean) + constant`. The covariance may be singular, and is zero at a fixed start;
+neither inverse dynamics nor an invertible A is needed. In the backward pass the costate, the gradient of the cost-to-go
+at the smoothed state, is propagated from each step to the previous step (the modified Bryson-Frazier smoother). With
+F = R^-1 P and h = R^-1 r, the substitution u = w - F x - h eliminates the control: At = A - B F, Qt = Q - P'F,
+qt = q - P'h, ct = c - B h.
 """
 
 from math import sqrt
 
-from lqrsim.kernels.declarations import M, N, inline, stack
-from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clamp, copy_matrix
-from lqrsim.kernels.model_functions import linearize_forward as linearize  # noqa: F401  # fills the form
-from lqrsim.kernels.records import EliminatedControl
+from lqrsim.kernels.declarations import NOISY, PRIMAL, M, N, W, inline, stack, zeros
+from lqrsim.kernels.linear_algebra import (
+    affine,
+    cholesky,
+    cholesky_solve,
+    clamp,
+    congruence,
+    copy,
+    copy_matrix,
+    copy_part,
+    quadratic_at,
+    step_offset,
+)
+from lqrsim.kernels.model_functions import advance, linearize_forward, step_jacobian
+from lqrsim.kernels.riccati import limited_control, minimize_control
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
-    """Write the cost-to-come at 0, given c_0 quadratised at x.
+    """Write the cost-to-come at 0, given c_0 quadratised at x; return its constant, and whether it exists. Eq. (18).
 
-    If c_0 has no curvature, there is no covariance. It then gets a small curvature about x, relative to each state's
-    own curvature, or to the cost-to-go's. An optimum remains an optimum, and the next iteration moves x further.
+    If c_0 has no curvature, there is no covariance. In the dual form it then gets a small curvature about x, relative
+    to each state's own curvature, or to the cost-to-go's. An optimum remains an optimum, and the next iteration moves x
+    further.
     """
+    if PRIMAL:
+        copy(q, N, to_come.vector[0])
+        copy_matrix(Q, N, N, to_come.matrix[0])
+        return constant, True
     S, covariance, mean = to_go.hessian[0], to_come.matrix[0], to_come.vector[0]
     factor, column, slope = stack(N, N), stack(N), stack(N)
     largest = 0.0
@@ -66,28 +83,109 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     return constant, True
 
 
-def forward_jacobian(x, u, model, arrived, step, spare):
-    """The Jacobian (N, W) of the step forwards, which this form linearises."""
-    return step.jacobian
+@inline
+def linearize(x, u, model, arrived, step, spare):
+    """Write the next state (N,), and the linear step of `riccati_forward`; return the Jacobian (N, W) forwards.
+
+    In the primal form the linear step is the inverse, linearised there: x = jacobian (x_next, u) + offset. The Jacobian
+    forwards is then computed, in `spare`, only if there is a risk; else it is undefined.
+    """
+    if not PRIMAL:
+        linearize_forward(x, u, model, arrived, step)
+        return step.jacobian
+    x_back = stack(N)
+    advance(x, u, model, model.dt, arrived)
+    step_jacobian(arrived, u, model, -model.dt, x_back, step.jacobian)
+    step_offset(step.jacobian, arrived, u, x_back, step.offset)
+    if NOISY and model.noise.risk[0] != 0:
+        step_jacobian(x, u, model, model.dt, arrived, spare)
+    return spare
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """Write the moments of the cost-to-come at t + 1, given those at t, and the smoother's gains at t.
+    """Write the cost-to-come at t + 1 and the smoother's gains at t; return whether the cost-to-come exists.
 
-    The step is x_{t+1} = [A B] (x, u) + c, the stage is about the origin.
+    Args:
+      step: LinearStep of `linearize`. stage, constant: the cost at t about the origin. to_come: CostToCome.
+      smoothing: SmootherGains; in the primal form it gets the inverse policy u_t = Lbar x_{t+1} + lbar.
     """
-    V0, x0, c, slope = to_come.matrix[t], to_come.vector[t], step.offset, stage.gradient
-    V, x, updated = to_come.matrix[t + 1], to_come.vector[t + 1], smoothing.state[t]
-    reduced = EliminatedControl(
-        stack(M, M), stack(M, N), stack(M), stack(N, N), stack(M, N), stack(N, N), stack(N), stack(N)
-    )  # fmt: skip
-    h, AT, BT, Q, q = reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
-    slope0 = stack(N)
+    if PRIMAL:
+        return primal_step(t, step, stage, constant, to_come, smoothing)
+    return dual_step(t, step, stage, constant, to_come, smoothing)
+
+
+@inline
+def primal_step(t, step, stage, constant, to_come, smoothing):
+    """`riccati_forward` by the inverse step, x_t = [Abar Bbar] (x_{t+1}, u_t) + cbar. Eqs. (15)-(17), (19)."""
+    S0, s0, jacobian, c = to_come.matrix[t], to_come.vector[t], step.jacobian, step.offset
+    cost, slope = stage.hessian, stage.gradient
+    z, a, v, b, joint = stack(N, N), stack(N), stack(N), zeros(W), zeros(W, W)
+    crossed = 0.0
+    for i in range(N):
+        a[i] = s0[i] + slope[i]
+        v[i] = a[i]
+        for j in range(N):
+            z[i, j] = S0[i, j] + cost[i, j]
+            v[i] += z[i, j] * c[j]
+        for j in range(M):
+            crossed += abs(cost[i, N + j])
+    for i in range(M):
+        b[N + i] = slope[N + i]
+        copy_part(cost[N + i], N, joint[N + i], N, M)
+    if crossed != 0:
+        # The cross term u'P x_t in terms of (x_{t+1}, u): P Abar, P Bbar + its transpose, P cbar.
+        for i in range(M):
+            for k in range(N):
+                factor = cost[N + i, k]
+                b[N + i] += factor * c[k]
+                for j in range(W):
+                    joint[N + i, j] += factor * jacobian[k, j]
+                    joint[j, N + i] += factor * jacobian[k, j]
+    shifted = to_come.constant[t] + constant + quadratic_at(z, a, c)
+    congruence(jacobian, z, v, joint, b)
+    decrease = minimize_control(
+        joint, b, smoothing.control_gain[t], smoothing.control[t], to_come.matrix[t + 1], to_come.vector[t + 1]
+    )
+    to_come.constant[t + 1] = shifted - decrease
+    return decrease >= 0
+
+
+@inline
+def dual_step(t, step, stage, constant, to_come, smoothing):
+    """`riccati_forward` by the step x_{t+1} = [A B] (x, u) + c."""
+    jacobian, c, cost, slope = step.jacobian, step.offset, stage.hessian, stage.gradient
+    V0, x0, V, x = to_come.matrix[t], to_come.vector[t], to_come.matrix[t + 1], to_come.vector[t + 1]
+    updated, gain, feedforward = smoothing.state[t], smoothing.control_gain[t], smoothing.control[t]
+    factor, F, h, AT, BT = stack(M, M), stack(M, N), stack(M), stack(N, N), stack(M, N)
+    Q, q, size, slope0 = stack(N, N), stack(N), stack(N), stack(N)
     # Products are formed in arrays of this function and then copied: without aliasing they become vector code.
     U, G = stack(N, N), stack(N, N)
-    good, crossed = eliminate_control(step, stage, reduced)
-    if not good:
+    # Eliminate the control from the step and its stage.
+    crossed = 0.0
+    for i in range(M):
+        h[i] = slope[N + i]
+        copy_part(cost[N + i], N, factor[i], 0, M)
+        for j in range(N):
+            F[i, j] = cost[N + i, j]
+            BT[i, j] = jacobian[j, N + i]
+            crossed += abs(F[i, j])
+    if not cholesky(factor, M):
         return False
+    cholesky_solve(factor, M, h)
+    for i in range(N):
+        q[i], size[i] = slope[i], abs(cost[i, i])
+        for j in range(N):
+            Q[i, j] = cost[i, j]
+            AT[i, j] = jacobian[j, i]
+    if crossed != 0:
+        forward_substitute(factor, F)
+        back_substitute(factor, F)
+        for k in range(M):
+            for i in range(N):
+                q[i] -= cost[N + k, i] * h[k]
+                for j in range(N):
+                    Q[i, j] -= cost[N + k, i] * F[k, j]
+                    AT[i, j] -= F[k, i] * BT[k, j]
     # Update with the cost of the stage: first its value and gradient at the mean.
     value = to_come.constant[t] + constant
     for k in range(M):
@@ -99,7 +197,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
             U[i, j] = V0[i, j]
         slope0[i] = curved + q[i]
         value += (0.5 * curved + q[i]) * x0[i]
-    if not update(U, Q, reduced.size):
+    if not update(U, Q, size):
         return False
     for i in range(N):
         moved = 0.0
@@ -120,7 +218,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
         for k in range(M):
             total -= BT[k, i] * h[k]
         x[i] = total
-    forward_substitute(reduced.factor, BT)
+    forward_substitute(factor, BT)
     for i in range(N):
         for j in range(N):
             total = 0.0
@@ -133,53 +231,8 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
         for j in range(N):
             smoothing.state_gain[t, i, j] = G[i, j]
             V[i, j] = U[i, j] if i <= j else U[j, i]
-    back_substitute(reduced.factor, BT)
-    control_response(reduced, G, updated, crossed, smoothing.control_gain[t], smoothing.control[t])
-    to_come.constant[t + 1] = value
-    return True
-
-
-@inline
-def eliminate_control(step, stage, reduced):
-    """Eliminate the control from a step and its stage: write an EliminatedControl.
-
-    Returns whether R is positive definite, and a number that is zero if no cost couples states and controls.
-    """
-    jacobian, cost, slope = step.jacobian, stage.hessian, stage.gradient
-    factor, F, h, AT, BT, Q, q = reduced.factor, reduced.F, reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
-    crossed = 0.0
-    for i in range(M):
-        h[i] = slope[N + i]
-        for j in range(M):
-            factor[i, j] = cost[N + i, N + j]
-        for j in range(N):
-            F[i, j] = cost[N + i, j]
-            BT[i, j] = jacobian[j, N + i]
-            crossed += abs(F[i, j])
-    if not cholesky(factor, M):
-        return False, crossed
-    cholesky_solve(factor, M, h)
-    for i in range(N):
-        q[i], reduced.size[i] = slope[i], abs(cost[i, i])
-        for j in range(N):
-            Q[i, j] = cost[i, j]
-            AT[i, j] = jacobian[j, i]
-    if crossed != 0:
-        forward_substitute(factor, F)
-        back_substitute(factor, F)
-        for k in range(M):
-            for i in range(N):
-                q[i] -= cost[N + k, i] * h[k]
-                for j in range(N):
-                    Q[i, j] -= cost[N + k, i] * F[k, j]
-                    AT[i, j] -= F[k, i] * BT[k, j]
-    return True, crossed
-
-
-@inline
-def control_response(reduced, G, updated, crossed, gain, feedforward):
-    """Write the control at t as an affine function of the costate at t + 1: gain (M, N) and feedforward (M,)."""
-    F, h, BT = reduced.F, reduced.h, reduced.BT
+    back_substitute(factor, BT)
+    # The control at t, an affine function of the costate at t + 1.
     for k in range(M):
         feedforward[k] = -h[k]
         for j in range(N):
@@ -190,6 +243,8 @@ def control_response(reduced, G, updated, crossed, gain, feedforward):
                 feedforward[k] -= F[k, i] * updated[i]
                 for j in range(N):
                     gain[k, j] += F[k, i] * G[i, j]
+    to_come.constant[t + 1] = value
+    return True
 
 
 def forward_substitute(factor, rows):
@@ -265,9 +320,24 @@ def update(V, Q, size):
 
 
 def smoothed_state(t, to_go, to_come, costate, x):
-    """Write the smoothed state x = x0 - V costate, (N,), and costate = (I + S V)^-1 (S x0 + s), (N,), at t."""
-    S, s, V, x0 = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
-    a = stack(N, N)
+    """Write the smoothed state (N,) at t, and the costate there, (N,); return whether it exists.
+
+    In the primal form they are x = -(S + Sbar)^-1 (s + sbar), Eq. (21), and S x + s; in the dual form x = x0 - V
+    costate, and (I + S V)^-1 (S x0 + s).
+    """
+    S, s, a = to_go.hessian[t], to_go.gradient[t], stack(N, N)
+    if PRIMAL:
+        Sbar, sbar = to_come.matrix[t], to_come.vector[t]
+        for i in range(N):
+            x[i] = -(s[i] + sbar[i])
+            for j in range(N):
+                a[i, j] = S[i, j] + Sbar[i, j]
+        if not cholesky(a, N):
+            return False
+        cholesky_solve(a, N, x)
+        affine(S, s, x, N, N, costate)
+        return True
+    V, x0 = to_come.matrix[t], to_come.vector[t]
     for i in range(N):
         for j in range(N):
             total = 1.0 if i == j else 0.0
@@ -317,7 +387,11 @@ def solve(a, b):
 
 
 def previous_state(t, x_hat, costate, smoothing, model, x, u):
-    """Write the state (N,) and control (M,) at t, given the costate (N,) at the smoothed state at t + 1."""
+    """Write the state (N,) and control (M,) at t, given the smoothed state (N,) at t + 1 and the costate (N,) there."""
+    if PRIMAL:
+        limited_control(smoothing.control_gain[t], smoothing.control[t], x_hat, model.limits, u)
+        advance(x_hat, u, model, -model.dt, x)
+        return
     for i in range(N):
         total = smoothing.state[t, i]
         for j in range(N):

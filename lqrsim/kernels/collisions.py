@@ -1,8 +1,8 @@
-"""Distances of many robots to all obstacles. Written in the kernels' subset."""
+"""The centres of robots' balls, and distances of robots to all obstacles, at many states at once."""
 
 from math import inf, isnan
 
-from lqrsim.kernels.declarations import ROW, outline, stack
+from lqrsim.kernels.declarations import ROW, outline, places, places_jacobian, stack
 from lqrsim.kernels.hull_distance import MESH, hull_distance
 from lqrsim.kernels.signed_distance import signed_distance
 
@@ -59,3 +59,27 @@ def nearest_to(obstacles, data, point, displaced, first):
         if distance < least or isnan(distance):
             least = distance
     return least
+
+
+def centres_of(count, states, data, out):
+    """Write the centres (count, 3 balls) at states (count, N)."""
+    for i in range(count):
+        centres_at(states[i], data, out[i])
+
+
+def jacobians_of(count, states, data, out, slopes):
+    """Write the centres, and their Jacobians (count, 3 balls, N), which the caller has set to zero."""
+    for i in range(count):
+        jacobian_at(states[i], data, out[i], slopes[i])
+
+
+@outline
+def centres_at(x, data, out):
+    """Write the centres at one state."""
+    places(x, data, out)
+
+
+@outline
+def jacobian_at(x, data, out, slopes):
+    """Write the centres and their Jacobian at one state."""
+    places_jacobian(x, data, out, slopes)
