@@ -14,7 +14,7 @@ A row whose price is too low to keep it does not press more than its price: it s
 
 from math import copysign, inf, isfinite, nan
 
-from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
+from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, inline
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
 from lqrsim.kernels.passes import larger
@@ -34,6 +34,8 @@ from lqrsim.kernels.stages import (
     write_models,
 )
 
+COMPACT = 1  # all functions but those that are inline
+
 # What rows do: nothing, stay at their targets, or, at a price, stay violated.
 FREE, HELD, PAID = 0.0, 1.0, 2.0
 SOFTNESS = 1e-8  # inverse of the weight that holds a row, relative to the cost of a change by its size
@@ -52,7 +54,6 @@ PATIENCE = 3  # pivots without fewer wrong rows before rows change one at a time
 BEGIN, PREPARE, PIVOT, TAKE, ROLL_OUT = 0, 1, 2, 3, 4
 
 
-@compact
 def active_set(task, violation, stages, work, memory):
     """Do a part of a step with an active set, so that the caller can end it in time; for PIVOT as `pivot` returns.
 
@@ -74,7 +75,6 @@ def active_set(task, violation, stages, work, memory):
     return RUNNING
 
 
-@compact
 def begin_active_set(violation, stages, work, mem):
     """Compute the models about the plan, its costates, typical sizes and measures; choose the first active set."""
     rows = stages.rows
@@ -90,7 +90,6 @@ def begin_active_set(violation, stages, work, mem):
     measure_plan(violation, stages, work, mem)
 
 
-@compact
 def leave(stages):
     """Remove rows that do not act at a step from the active set."""
     rows = stages.rows
@@ -101,7 +100,6 @@ def leave(stages):
             rows.force[at], rows.held[at] = 0.0, FREE
 
 
-@compact
 def measure_plan(violation, stages, work, mem):
     """Compute the measures of the plan about which the models are, and whether it keeps the constraints."""
     rows, priced = stages.rows, False
@@ -115,14 +113,12 @@ def measure_plan(violation, stages, work, mem):
     mem.violation = larger(larger(missed, unequal), 0.0)
 
 
-@compact
 def prepare_step(stages, work, mem):
     """Begin a step: with the rows that are known."""
     copy(stages.rows.held, stages.rows.size * (stages.steps + 1), work.before)
     mem.phase, mem.pivots, mem.fewest, mem.patience = 0.0, 0.0, inf, float(PATIENCE)
 
 
-@compact
 def pivot(softness, stages, work, mem):
     """Solve the quadratic problem with the rows that are held; then change rows, or go to the next phase, if need be.
 
@@ -153,7 +149,6 @@ def pivot(softness, stages, work, mem):
     return RUNNING
 
 
-@compact
 def hold(weight, price, stages, work):
     """Write the curvature and the force of each row: `weight` holds limits, `price` constraints; relative to sizes."""
     rows = stages.rows
@@ -165,7 +160,6 @@ def hold(weight, price, stages, work):
             work.forces[at] -= work.curves[at] * (rows.numbers[at] - rows.targets[at])
 
 
-@compact
 def predict_rows(scale, stages, work):
     """Write the multipliers after a step, and which rows are wrong there; return the number of wrong rows."""
     rows, count = stages.rows, 0
@@ -192,7 +186,6 @@ def predict_rows(scale, stages, work):
     return count
 
 
-@compact
 def change_rows(worst, stages, work):
     """Hold rows that are violated, and release or pay for rows with a wrong multiplier.
 
@@ -217,6 +210,7 @@ def change_rows(worst, stages, work):
         change_row(last, rows, work)
 
 
+@inline
 def change_row(at, rows, work):
     """Hold a row; or, if it is held, release it or pay for it."""
     if rows.held[at] != HELD:
@@ -228,7 +222,6 @@ def change_row(at, rows, work):
         rows.held[at] = FREE
 
 
-@compact
 def apply_step(violation, stages, work, mem):
     """Take the step that pivoting has found; compute the models and measures there."""
     rows, changes = stages.rows, stages.changes
@@ -248,7 +241,6 @@ def apply_step(violation, stages, work, mem):
     measure_plan(violation, stages, work, mem)
 
 
-@compact
 def roll_out(stages, work, mem):
     """Roll out a policy about the plan into `work.out`, and evaluate the constraints there; write the cost.
 

@@ -74,7 +74,7 @@ def outline(function: Callable) -> Callable:
 def compact(function: Callable) -> Callable:
     """Decorate a kernel that takes little of the time: it is not inlined, and its loops are not unrolled.
 
-    Compiling it then takes a third of the time.
+    Compiling it then takes a third of the time. In a file of kernels with `COMPACT = 1`, all without a decorator are.
     """
     return function
 

@@ -32,7 +32,7 @@ from lqrsim.kernels.active_set import (
     pivot,
     prepare_step,
 )
-from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
+from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, inline
 from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix
 from lqrsim.kernels.passes import copy_plan, larger
 from lqrsim.kernels.secants import forget, learn, remember
@@ -50,6 +50,8 @@ from lqrsim.kernels.stages import (
     row_change,
     write_models,
 )
+
+COMPACT = 1  # all functions but those that are inline
 
 # Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
 # must exceed 1e-9 of its weight; the kernel treats less as rounding.
@@ -110,7 +112,6 @@ SIGNS = (1.0, -1.0)
 SCALE, BEGIN, POLISH, ITERATE, CLOSE = 0, 1, 2, 3, 4
 
 
-@compact
 def interior_point(task, first, last, tolerance, violation, begun, stages, work, memory, log):
     """Begin an interior point, polish a known optimum, or run the iterations `first` to `last` - 1.
 
@@ -137,7 +138,6 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     return iterations(first, last, task == CLOSE, tolerance, violation, stages, work, memory[0], log)
 
 
-@compact
 def find_sizes(begun, stages, work, mem):
     """Take a plan, with its controls a little inside their limits; compute typical sizes and the models there."""
     now, steps, limits = work.now, stages.steps, stages.model.limits
@@ -160,7 +160,6 @@ def find_sizes(begun, stages, work, mem):
     mem.typical = determine_scales(stages, now.plan)
 
 
-@compact
 def begin(begun, stages, work, mem):
     """Begin from that plan: compute slacks, multipliers and measures."""
     rows, now, steps = stages.rows, work.now, stages.steps
@@ -196,7 +195,6 @@ def begin(begun, stages, work, mem):
     mem.farthest = FARTHEST * max(PER_ROW * max(float(steps), mem.pairs), violated)
 
 
-@compact
 def begin_row(at, begun, stages, work, mem):
     """Choose the first slacks and the multiplier of a row."""
     rows = stages.rows
@@ -221,16 +219,19 @@ def begin_row(at, begun, stages, work, mem):
     rows.force[at] = min(max(force, -highest if equality else 0.0), highest)
 
 
+@inline
 def has_slack(at, side, rows):
     """Whether a row has the slack of a side: rows with a price have both, other inequalities the lower one."""
     return rows.prices[at] < inf or (side == LOWER and rows.kinds[at] != EQUALITY)
 
 
+@inline
 def regularised(at, rows):
     """Whether a row is an equality without a price."""
     return rows.kinds[at] == EQUALITY and not rows.prices[at] < inf
 
 
+@inline
 def from_bound(at, side, rows):
     """Distance of a row's multiplier from the bound of a side."""
     if side == UPPER:
@@ -241,7 +242,6 @@ def from_bound(at, side, rows):
 # The loop.
 
 
-@compact
 def iterations(first, last, closing, tolerance, violation, stages, work, mem, log):
     """Run the iterations `first` to `last` - 1, until the measures are within tolerance or no step helps.
 
@@ -288,6 +288,7 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
         ended = creeping(violation, mem) or (stages.learns == 1 and cost_is_flat(mem))
 
 
+@inline
 def creeping(violation, mem):
     """Whether the steps are short, and have been for long."""
     falls = mem.violation <= violation and mem.cost < mem.before - SLOW * abs(mem.before)
@@ -298,6 +299,7 @@ def creeping(violation, mem):
     return mem.short >= CREEPING
 
 
+@inline
 def count_unchanged(learns, violation, mem):
     """Count the iterations in a row in which the cost does not change, though the plan is not stationary.
 
@@ -310,11 +312,13 @@ def count_unchanged(learns, violation, mem):
         mem.unchanged, mem.level = 0.0, mem.cost
 
 
+@inline
 def cost_is_flat(mem):
     """Whether the cost no longer changes at the least barrier."""
     return mem.unchanged >= ENDS and mem.pairs * mem.parameter <= FLAT * mem.scale
 
 
+@inline
 def within(learns, tolerance, violation, mem):
     """Whether the measures are within tolerance. The violation of elastic rows is in their slacks.
 
@@ -327,13 +331,13 @@ def within(learns, tolerance, violation, mem):
     return stationary and mem.gap < tolerance and mem.complementarity < tolerance and missed
 
 
+@inline
 def central(tolerance, mem):
     """Whether the barrier costs no more than the tolerance, relative to the cost."""
     close = mem.pairs * mem.complementarity <= OUTLIER * tolerance
     return close and mem.pairs * mem.parameter <= tolerance * mem.scale
 
 
-@compact
 def iterate(done, tolerance, stages, work, mem):
     """Do one iteration; return whether a step was found."""
     least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
@@ -363,7 +367,6 @@ def iterate(done, tolerance, stages, work, mem):
     return True
 
 
-@compact
 def largest_multiplier_step(stages, work):
     """The largest change of the multiplier of an equality without a price, times its row's size."""
     rows, largest = stages.rows, 0.0
@@ -373,7 +376,6 @@ def largest_multiplier_step(stages, work):
     return largest
 
 
-@compact
 def falls_lately(work, mem):
     """Whether the measures have decreased lately, so that Mehrotra's rule may choose the barrier parameter.
 
@@ -392,7 +394,6 @@ def falls_lately(work, mem):
     return good
 
 
-@compact
 def lower_barrier(done, least, free, stages, work, mem):
     """Lower the barrier parameter while the measures are small relative to it, unless Mehrotra's rule will."""
     # A bad first plan may cost a hundred times the optimum, which would make the first barrier too high.
@@ -410,7 +411,6 @@ def lower_barrier(done, least, free, stages, work, mem):
         mem.parameter, mem.filtered = max(least, min(FALL * mem.parameter, lower)), 0.0
 
 
-@compact
 def off_centre(stages, work, mem):
     """The largest difference of a product of slack and multiplier from the barrier parameter."""
     rows, slacks, largest = stages.rows, work.now.slacks, 0.0
@@ -421,7 +421,6 @@ def off_centre(stages, work, mem):
     return largest
 
 
-@compact
 def models_with_barrier(stages, work, mem):
     """Give the models the barrier's curvature, and the least regularisation with which they have a minimum."""
     rows, slacks = stages.rows, work.now.slacks
@@ -445,7 +444,6 @@ def models_with_barrier(stages, work, mem):
     return True
 
 
-@compact
 def write_row_forces(extra_residuals, corrections, stages, work, mem):
     """Write the forces of the rows in the condensed equations of a step; `extra_residuals` adds further residuals."""
     rows = stages.rows
@@ -457,7 +455,6 @@ def write_row_forces(extra_residuals, corrections, stages, work, mem):
             work.forces[at] = rows.force[at] - work.curves[at] * residual
 
 
-@compact
 def residual_of(at, corrections, rows, work, mem):
     """Residual of a row in these equations: its value, minus slacks with the desired products."""
     residual = work.now.numbers[at]
@@ -467,14 +464,12 @@ def residual_of(at, corrections, rows, work, mem):
     return residual
 
 
-@compact
 def solve(extra_residuals, corrections, gaps, stages, work, mem):
     """Compute another step with the same models, but without weights on changes; return whether there is one."""
     write_row_forces(extra_residuals, corrections, stages, work, mem)
     return direction(stages, work.now.plan, gaps, mem.convex_fraction, 0.0, 1.0, work.curves, work.forces) == -1
 
 
-@compact
 def complete(extra_residuals, corrections, out, stages, work, mem):
     """Complete the step in `stages` by slacks and multipliers, (PlanStep)."""
     rows, slacks = stages.rows, work.now.slacks
@@ -497,7 +492,6 @@ def complete(extra_residuals, corrections, out, stages, work, mem):
                 out.slacks[at, side] = wanted / dual - slack - SIGNS[side] * slack / dual * change
 
 
-@compact
 def find_step(least, free, stages, work, mem):
     """Find the step of an iteration, with corrections if its models have a minimum without regularisation."""
     if mem.rung == 0 and free and mem.fraction >= LONG and mem.pairs > 0:
@@ -508,7 +502,6 @@ def find_step(least, free, stages, work, mem):
         centre(stages, work, mem)
 
 
-@compact
 def predict(least, stages, work, mem):
     """Mehrotra's rule: set the barrier parameter by an affine step, and second-order corrections of the products."""
     rows, slacks, step, corrections = stages.rows, work.now.slacks, work.other, work.corrections
@@ -532,7 +525,6 @@ def predict(least, stages, work, mem):
                 corrections[at, side] = SIGNS[side] * step.slacks[at, side] * step.force[at]
 
 
-@compact
 def centre(stages, work, mem):
     """If a slack stops the step early, replace it by another step if that goes further.
 
@@ -564,18 +556,19 @@ def centre(stages, work, mem):
         copy_matrix(work.other.costates, stages.steps + 1, N, step.costates)
 
 
+@inline
 def lacking(product, mem):
     """What brings a product to within a factor of the barrier parameter, but not more than that."""
     wanted = min(max(product, mem.parameter / OUTLIER), OUTLIER * mem.parameter)
     return max(wanted - product, -OUTLIER * mem.parameter)
 
 
+@inline
 def boundary(mem):
     """The fraction of the distance to a zero slack that a step may take."""
     return max(BOUNDARY, 1 - mem.parameter / mem.scale)
 
 
-@compact
 def longest(tau, slacks, step, stages):
     """The largest fractions of a PlanStep by the fraction-to-the-boundary rule with `tau`, at most 1.
 
@@ -596,7 +589,6 @@ def longest(tau, slacks, step, stages):
 # The line search.
 
 
-@compact
 def search(corrected, stages, work, mem):
     """Backtrack along the step until the filter accepts; the first trial also with a second-order correction.
 
@@ -626,7 +618,6 @@ def search(corrected, stages, work, mem):
     return -1.0
 
 
-@compact
 def correct(fraction, stages, work, mem):
     """Try a step that also reduces the residuals at a trial, if these have not fallen; return whether it is accepted.
 
@@ -654,7 +645,6 @@ def correct(fraction, stages, work, mem):
     return True
 
 
-@compact
 def close_residuals(fraction, stages, work, mem):
     """Move the trial towards feasibility by the smallest changes, as far as the filter accepts them.
 
@@ -688,7 +678,6 @@ def close_residuals(fraction, stages, work, mem):
         mem.tried = cost
 
 
-@compact
 def force_step(stages, work, mem):
     """A step for when the filter rejects every fraction of the last step: its fraction; -1 if there is none.
 
@@ -710,7 +699,6 @@ def force_step(stages, work, mem):
     return fraction if isfinite(mem.tried) else -1.0
 
 
-@compact
 def accept_step(fraction, stages, work, mem):
     """Go to the trial, with that fraction of the step in multipliers and costates."""
     rows, step, count = stages.rows, work.step, int(mem.filtered)
@@ -740,7 +728,6 @@ def accept_step(fraction, stages, work, mem):
         learn(stages, work.costates, work.last_step, work.turns, fraction >= LONG and mem.stationarity > CRAWL * before)
 
 
-@compact
 def go(fraction, about, changes, slacks, out, stages):
     """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
     rows, steps, good = stages.rows, stages.steps, True
@@ -765,17 +752,18 @@ def go(fraction, about, changes, slacks, out, stages):
     return cost if good else nan
 
 
+@inline
 def is_hard(at, rows):
     """Whether a row is an inequality without a price."""
     return rows.kinds[at] != EQUALITY and not rows.prices[at] < inf
 
 
+@inline
 def missed(at, point):
     """A row's value minus its slacks."""
     return point.numbers[at] - (point.slacks[at, LOWER] - point.slacks[at, UPPER])
 
 
-@compact
 def off(point, stages):
     """Total violation of dynamics and rows at a point, relative to their sizes."""
     rows, total = stages.rows, gap_of(point, stages)
@@ -785,7 +773,6 @@ def off(point, stages):
     return total
 
 
-@compact
 def gap_of(point, stages):
     """The part of the violation that is due to the dynamics."""
     total = 0.0
@@ -795,7 +782,6 @@ def gap_of(point, stages):
     return total
 
 
-@compact
 def merit_of(point, cost, stages, mem):
     """Cost plus prices plus barrier."""
     rows, logarithms, paid = stages.rows, 0.0, 0.0
@@ -810,7 +796,6 @@ def merit_of(point, cost, stages, mem):
     return cost + paid - mem.parameter * logarithms
 
 
-@compact
 def slope_of_merit(stages, work, mem):
     """Derivative of the merit along the step."""
     rows, step, slacks, slope = stages.rows, work.step, work.now.slacks, 0.0
@@ -828,7 +813,6 @@ def slope_of_merit(stages, work, mem):
     return slope
 
 
-@compact
 def acceptable(fraction, point, cost, stages, work, mem):
     """Whether the filter accepts a trial."""
     violated, merit, before, slope = off(point, stages), merit_of(point, cost, stages, mem), mem.violated, mem.slope
@@ -847,7 +831,6 @@ def acceptable(fraction, point, cost, stages, work, mem):
 # Points, and the models about them.
 
 
-@compact
 def copy_point(source, target, stages):
     """Copy a point."""
     count = stages.rows.size * (stages.steps + 1)
@@ -857,7 +840,6 @@ def copy_point(source, target, stages):
     copy_matrix(source.slacks, count, 2, target.slacks)
 
 
-@compact
 def go_to(point, cost, least, stages, work, mem):
     """Go to a point of this cost; its multipliers up to `least` count as zero in the models."""
     copy_point(point, work.now, stages)
@@ -867,7 +849,6 @@ def go_to(point, cost, least, stages, work, mem):
     measure_iterate(stages, work, mem)
 
 
-@compact
 def renew(stages, work, mem):
     """Compute the derivatives of the dynamics anew, about the iterate."""
     stages.reuses_derivatives[0], mem.age = 0.0, 0.0
@@ -875,7 +856,6 @@ def renew(stages, work, mem):
     measure_iterate(stages, work, mem)
 
 
-@compact
 def go_back(stages, work, mem):
     """Go back to the point that was kept."""
     stages.reuses_derivatives[0], mem.age = 0.0, 0.0
@@ -884,7 +864,6 @@ def go_back(stages, work, mem):
     go_to(work.kept, mem.kept, NEGLIGIBLE * mem.kept_scale, stages, work, mem)
 
 
-@compact
 def keep_point(stages, work, mem):
     """Keep the iterate."""
     copy_point(work.now, work.kept, stages)
@@ -893,7 +872,6 @@ def keep_point(stages, work, mem):
     copy_matrix(work.costates, stages.steps + 1, N, work.kept_costates)
 
 
-@compact
 def measure_iterate(stages, work, mem):
     """Compute the measures of the iterate, about which the models are."""
     rows, slacks = stages.rows, work.now.slacks
@@ -916,7 +894,6 @@ def measure_iterate(stages, work, mem):
 # The crossover from the barrier to the active set.
 
 
-@compact
 def polish(tolerance, violation, begun, stages, work, mem):
     """Take steps without a barrier from the given plan and multipliers; return whether they converge."""
     rows, plan = stages.rows, work.active.plan
@@ -938,7 +915,6 @@ def polish(tolerance, violation, begun, stages, work, mem):
     return polish_rows(tolerance, violation, stages, work, mem)
 
 
-@compact
 def cross(tolerance, violation, stages, work, mem):
     """Cross over from the barrier to the active set: active rows become equalities. Return whether they were right.
 
@@ -952,7 +928,6 @@ def cross(tolerance, violation, stages, work, mem):
     return polish_rows(tolerance, violation, stages, work, mem)
 
 
-@compact
 def polish_rows(tolerance, violation, stages, work, mem):
     """Take steps with the rows that press held at their targets, and go where they converge, or else back.
 
@@ -994,7 +969,6 @@ def polish_rows(tolerance, violation, stages, work, mem):
     return True
 
 
-@compact
 def first_state(at, rows, mem):
     """What a row does in the active set, by its value and multiplier."""
     number, force = rows.numbers[at], rows.force[at]
@@ -1006,6 +980,7 @@ def first_state(at, rows, mem):
     return HELD if equality or force * size / mem.scale > number / size else FREE
 
 
+@inline
 def farthest_from_target(rows, steps):
     """The largest distance of a row that is held from its target."""
     largest = 0.0

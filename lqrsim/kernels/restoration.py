@@ -13,7 +13,7 @@ changes of controls. Both are reduced after full steps and increased after short
 
 from math import hypot, inf, isfinite, log
 
-from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N, compact
+from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N
 from lqrsim.kernels.linear_algebra import copy_matrix, fill, finite
 from lqrsim.kernels.passes import copy_plan, larger
 from lqrsim.kernels.stages import (
@@ -26,6 +26,8 @@ from lqrsim.kernels.stages import (
     row_change,
     write_models,
 )
+
+COMPACT = 1  # all functions
 
 # First and least barrier parameter, relative to the price; factor by which it falls.
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2
@@ -44,7 +46,6 @@ CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
 LEVEL, FINER = 1e-4, 0.1  # negligible predicted decrease, relative to the merit; factor by which it falls
 
 
-@compact
 def restoration(first, last, price, stages, work, memory, log):
     """Run the iterations `first` to `last` - 1 from the plan in `work.plan`; `last` = 0 only prepares them.
 
@@ -85,7 +86,6 @@ def restoration(first, last, price, stages, work, memory, log):
             return done, NO_PROGRESS
 
 
-@compact
 def begin_restoration(price, stages, work, mem):
     """Begin with the rollout of the plan's controls, moved inside their limits."""
     rows, limits, steps = stages.rows, stages.model.limits, stages.steps
@@ -110,7 +110,6 @@ def begin_restoration(price, stages, work, mem):
         fill(work.costates[t], N, 0.0)
 
 
-@compact
 def confine(stages, work):
     """Write the limits of the controls in one step from the plan."""
     limits = stages.model.limits
@@ -121,7 +120,6 @@ def confine(stages, work):
             work.limits.high[t, i] = high - INSIDE * (high - control) if high < inf else high
 
 
-@compact
 def descend(price, stages, work, mem):
     """Find a step and try fractions of it, into `work.trial`; return whether there is a step."""
     rows, steps = stages.rows, stages.steps
@@ -170,7 +168,6 @@ def descend(price, stages, work, mem):
     return True
 
 
-@compact
 def slope_of_merit(stages):
     """Derivative of the merit along the step."""
     changes, rows, slope = stages.changes, stages.rows, 0.0
@@ -187,7 +184,6 @@ def slope_of_merit(stages):
     return slope
 
 
-@compact
 def model_penalties(price, stages, work, mem):
     """Write forces and curvatures of the penalties; unknown multipliers are the forces."""
     rows, parameter = stages.rows, mem.parameter
@@ -229,7 +225,6 @@ def slacks_of(at, number, price, parameter, rows):
     return small, large
 
 
-@compact
 def penalized(cost, numbers, price, stages, mem):
     """The merit of a plan of this cost, whose rows have these values: cost and penalties; infinite if there is none."""
     rows, total, parameter = stages.rows, cost, mem.parameter
@@ -245,7 +240,6 @@ def penalized(cost, numbers, price, stages, mem):
     return total if isfinite(total) else inf
 
 
-@compact
 def measure_violation(stages, work, mem):
     """Compute the violation of the plan before the step; return whether the descent ends."""
     rows, relative = stages.rows, 0.0
@@ -261,7 +255,6 @@ def measure_violation(stages, work, mem):
     return mem.close >= PATIENCE
 
 
-@compact
 def write_relative_multipliers(price, stages, work):
     """Write the multipliers after the step relative to the price, from -1 to 1; 0 for limits."""
     rows = stages.rows

@@ -5,14 +5,15 @@ the changes of the Lagrangian's gradient by the steps taken, by symmetric update
 Hessians only if convergence without it is slow: at first the updates know little.
 """
 
-from lqrsim.kernels.declarations import M, N, W, compact, stack
+from lqrsim.kernels.declarations import M, N, W, stack
 from lqrsim.kernels.linear_algebra import fill
 from lqrsim.kernels.stages import add_matrix, lagrangian_slope
+
+COMPACT = 1  # all functions
 
 NOTHING = 1e-8  # least part of a residual along its step from which curvature is learned (Nocedal and Wright, (6.26))
 
 
-@compact
 def forget(stages):
     """Begin with nothing learned."""
     stages.uses_learned[0] = 0.0
@@ -21,7 +22,6 @@ def forget(stages):
             fill(stages.models.learned[t, i], W, 0.0)
 
 
-@compact
 def remember(stages, before, after, costates, last_step, turns):
     """Before a step is taken, keep it, (T+1, W), and the Lagrangian's gradients at its beginning, (T+1, W).
 
@@ -35,7 +35,6 @@ def remember(stages, before, after, costates, last_step, turns):
             last_step[t, N + i] = after.controls[t, i] - before.controls[t, i] if t < stages.steps else 0.0
 
 
-@compact
 def learn(stages, costates, last_step, turns, slow):
     """Update what is learned, with the models at the end of the step; after a `slow` step, add it to the Hessians."""
     models, slope, lacks = stages.models, stack(W), stack(W)
