@@ -177,6 +177,7 @@ class Commanded(Controller, ControllerRun):
 class Resettable:
     """Base class of `Environment` and `VectorEnvironment`: a task, and its current episode."""
 
+    _prefix = ""
     task: Task
     _trials: int = 1  # of an episode
     _frames: bool = True
@@ -321,12 +322,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
       task: the scenario and its plant. solution: the solution with the plan.
     """
 
-    _prefix = ""
-
-    metadata: dict[str, Any] = {  # noqa: RUF012 - as in its base class
-        "render_modes": list(RENDER_MODES),
-        "render_fps": 30,
-    }
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012 - as in its base
 
     @checked
     def __init__(
@@ -434,8 +430,6 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
       num_envs: K. threads: number of MuJoCo's threads; by default one per processor.
       frames: whether `rollout()` can be drawn; it takes memory.
     """
-
-    _prefix = ""
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 - as in its base class
 
