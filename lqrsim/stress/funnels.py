@@ -9,6 +9,7 @@ Maurer, Hothorn & Lehmacher, 1995). The tests may share their trials. They are e
 bound of Clopper and Pearson is at least the rate.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -74,17 +75,11 @@ def smallest_test(
     def proves(trials: int) -> bool:
         return lowest_rate(trials - failures, trials, confidence) >= rate
 
-    high = failures + 1
-    while not proves(high):
-        high *= 2
-        if high > MOST_TRIALS:
-            got = f"{rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
-            raise InputError(f"rate: got {got} {MOST_TRIALS:,} trials, want a smaller one of the three")
-    low = failures  # with as many trials nothing is proved
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if proves(middle) else (middle, high)
-    return LevelTest(high, failures)
+    trials = bisect_left(range(MOST_TRIALS + 1), True, lo=failures + 1, key=proves)
+    if trials > MOST_TRIALS:
+        got = f"{rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
+        raise InputError(f"rate: got {got} {MOST_TRIALS:,} trials, want a smaller one of the three")
+    return LevelTest(trials, failures)
 
 
 def lowest_rate(successes: int, trials: int, confidence: float) -> float:

@@ -239,23 +239,18 @@ class _Splitting:
         chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
         return vectors[chosen], scores[chosen]
 
-    def step(
-        self, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
-    ) -> tuple[Array, Array, float]:
-        """Move each vector if it stays above the level. Returns vectors, scores and the fraction of accepted moves."""
-        proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
-        proposed_scores = self.score(proposed)
-        accepted = proposed_scores > level
-        vectors, scores = np.where(accepted[:, None], proposed, vectors), np.where(accepted, proposed_scores, scores)
-        return vectors, scores, float(accepted.mean())
-
     def move(
-        self, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """The vectors after all their moves at the level."""
+        self, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator, *, tune: bool = False
+    ) -> tuple[Array, Array, float]:
+        """Move the vectors where they stay above the level; `tune` adapts b to the wanted fraction of accepted moves."""
         for _ in range(self.moves):
-            vectors, scores, _ = self.step(vectors, scores, level, b, rng)
-        return vectors, scores
+            proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
+            new_scores = self.score(proposed)
+            accepted = new_scores > level
+            vectors, scores = np.where(accepted[:, None], proposed, vectors), np.where(accepted, new_scores, scores)
+            if tune:
+                b = float(np.clip(b * np.exp(accepted.mean() - ACCEPTANCE), 1e-3, 1.0))
+        return vectors, scores, b
 
     def pilot_run(
         self, keep: float, most_levels: int, rng: np.random.Generator, on_level: OnLevel
@@ -275,7 +270,7 @@ class _Splitting:
                 while sum(len(kept) for _, kept in survivors) < enough and batch_count < MOST_BATCHES:
                     on_level(level)
                     # As many vectors again, from the distribution above the last level.
-                    vectors, scores = self.move(vectors, scores, levels[-1], b, rng) if levels else self.draw(rng)
+                    vectors, scores = self.move(vectors, scores, levels[-1], b, rng)[:2] if levels else self.draw(rng)
                     above, batch_count = scores > level, batch_count + 1
                     survivors.append((vectors[above], scores[above]))
                 vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
@@ -288,10 +283,7 @@ class _Splitting:
             if level == 0:
                 return np.array([*levels, 0.0]), np.array(step_sizes), batches
             vectors, scores = self.resample(vectors, scores, level, rng)
-            for _ in range(self.moves):
-                vectors, scores, accepted = self.step(vectors, scores, level, b, rng)
-                # Larger if more are accepted than wanted.
-                b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
+            vectors, scores, b = self.move(vectors, scores, level, b, rng, tune=True)
             levels.append(level)
             step_sizes.append(b)
         got = f"no failure in {len(levels)} levels up to {scores.max():g}"
@@ -310,7 +302,7 @@ class _Splitting:
                 else:
                     last = levels[number - 1]
                     moved, moved_scores = self.resample(vectors, scores, last, rng)
-                    moved, moved_scores = self.move(moved, moved_scores, last, step_sizes[number - 1], rng)
+                    moved, moved_scores, _ = self.move(moved, moved_scores, last, step_sizes[number - 1], rng)
                 above = moved_scores > level
                 survivors.append((moved[above], moved_scores[above]))
             vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))
