@@ -7,7 +7,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
@@ -95,22 +95,21 @@ def say(text: str = "") -> None:
             sys.stdout.flush()
 
 
-def check_output(field: str, folder: Path, name: str = "") -> None:
-    """Check before the work starts that `folder`, or the file `name` in it, can be written."""
+def check_output(field: str, path: Path, kind: str = "folder", *, suffixes: Collection[str] = ()) -> None:
+    """Check before the work starts that a folder or a file, whose name has to end in a suffix, can be written."""
     from lqrsim.errors import check_path
     from lqrsim.results.archive import excerpt_of
 
-    check_path(field, folder / name, "the path of an output")
-    absolute = folder.absolute()
+    check_path(field, path, "the path of an output", suffixes=suffixes)
+    absolute = (path if kind == "folder" else path.parent).absolute()
     existing = next((place for place in (absolute, *absolute.parents) if os.path.exists(place)), absolute)
     try:
         tempfile.TemporaryFile(dir=existing).close()
         with contextlib.suppress(FileNotFoundError):
-            os.lstat(folder / name)  # fails for invalid names
+            os.lstat(path)  # fails for invalid names
     except (OSError, ValueError) as error:
-        reason, kind = getattr(error, "strerror", None) or error, "file" if name else "folder"
-        place = excerpt_of(folder / name)
-        raise ls.InputError(f"{field}: got {place}, want a {kind} that can be written ({reason})") from None
+        reason = getattr(error, "strerror", None) or error
+        raise ls.InputError(f"{field}: got {excerpt_of(path)}, want a {kind} that can be written ({reason})") from None
 
 
 @contextlib.contextmanager

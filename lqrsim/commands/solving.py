@@ -104,11 +104,9 @@ class Solve:
         folder = self.out or Path("runs") / folder_name(scenario)
         console.check_output("--out", folder)
         if self.figure is not None:
-            from lqrsim.errors import check_path
             from lqrsim.view.style import METADATA
 
-            check_path("--figure", self.figure, suffixes=METADATA)
-            console.check_output("--figure", self.figure.parent, self.figure.name)
+            console.check_output("--figure", self.figure, "file", suffixes=METADATA)
         problem = scenario.problem
         if self.clearance is not None:
             clearance = ls.Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)
@@ -133,20 +131,8 @@ class Solve:
         solution = replace(solved, scenario=reference)
         console.save(solution, folder / "solution.npz")
         console.result(solution=as_json.of_solution(solution))
-        if self.figure is not None and solution.cost_to_go is None:
-            console.say("no figure: the solve has no cost-to-go, which it shows")
-        elif self.figure is not None:
-            from lqrsim.problem.belief import Belief
-            from lqrsim.simulation.uncertainty_of import tube_under
-
-            fixed = scenario.with_duration_of(solution)
-            tube, remark = tube_under(fixed.problem, solution, fixed.plant(), fixed.disturbances)
-            if remark:
-                console.say(remark)
-            world, robot = scenario.scene.world, scenario.robot
-            radius, dynamics = robot.shape.get("radius", 0.0), scenario.problem.dynamics
-            options = {"tube": tube, "belief": dynamics if isinstance(dynamics, Belief) else None}
-            console.wrote(ls.view.plot_policy(solution, self.figure, world=world, radius=radius, **options))
+        if self.figure is not None:
+            _plot_policy(scenario.with_duration_of(solution), solution, self.figure)
         return 0 if solution.success else 1
 
     def _start(self, scenario: "ls.Scenario") -> "StartLike":
@@ -164,6 +150,24 @@ class Solve:
                 raise ls.InputError(f"--paper-start: got {scenario.name}, want a scenario of the paper")
             return scenario.paper_start
         return None if self.starts is not None else scenario.start
+
+
+def _plot_policy(scenario: "ls.Scenario", solution: "ls.Solution", path: Path) -> "ls.types.Tube | None":
+    """Plot the policy of a solution of a scenario, which has its duration. Returns the tube, if one is predicted."""
+    from lqrsim.problem.belief import Belief
+    from lqrsim.simulation.uncertainty_of import tube_under
+
+    tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
+    if remark:
+        console.say(remark)
+    if solution.cost_to_go is None:
+        console.say("no figure: the solve has no cost-to-go, which it shows")
+        return tube
+    dynamics = scenario.problem.dynamics
+    options = {"tube": tube, "belief": dynamics if isinstance(dynamics, Belief) else None}
+    world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)
+    console.wrote(ls.view.plot_policy(solution, path, world=world, radius=radius, **options))
+    return tube
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -378,7 +382,6 @@ class Demo:
     def run(self) -> int:
         from lqrsim.control.belief_feedback import BeliefFeedback
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
-        from lqrsim.simulation.uncertainty_of import tube_under
         from lqrsim.stress.policies import make_controller
         from lqrsim.view import cameras, gl
 
@@ -403,16 +406,9 @@ class Demo:
             solution = replace(console.solve_and_print(scenario), scenario=from_anywhere(reference))
             console.save(solution, folder / "solution.npz")
             scenario = scenario.with_duration_of(solution)
-            tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
-            if remark:
-                console.say(remark)
+            tube = _plot_policy(scenario, solution, folder / "policy.png")
             law = make_controller("feedback", scenario, solution)
             plan, belief = (law.plan, law.belief) if isinstance(law, BeliefFeedback) else (solution, None)
-            world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)
-            if solution.cost_to_go is not None:
-                path = folder / "policy.png"
-                options = {"world": world, "radius": radius, "tube": tube, "belief": belief}
-                console.wrote(ls.view.plot_policy(solution, path, **options))
             if not solution.success:
                 failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
             runs = dict[str, ls.Rollout]()
@@ -429,7 +425,8 @@ class Demo:
             if not worst <= scenario.tracking_bound:  # also true for the NaN of a diverged run
                 bound = f"want <= {scenario.tracking_bound:g} {unit}"
                 failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
-            console.wrote(ls.view.plot_run(plan, runs, folder / "figure.png", world=world, belief=belief))
+            path, world = folder / "figure.png", scenario.scene.world
+            console.wrote(ls.view.plot_run(plan, runs, path, world=world, belief=belief))
             misses += [f"{reference}: {line}" for line in undisturbed.target.of_plan(undisturbed.goal_radius)[1:]]
             if video:  # with the calibrated panes that show the robot's position
                 run, (quality, fps) = runs["disturbed"], ("draft", 5) if self.quick else ("standard", 30)

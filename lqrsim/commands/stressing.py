@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -113,7 +112,7 @@ class Replay:
         from lqrsim.stress.results import differences
         from lqrsim.versions import changed
 
-        console.check_output("--out", self.out.parent, self.out.name)
+        console.check_output("--out", self.out, "file")
         results = ls.stress.Results(self.folder, scenario=self.scenario)
         cell = ls.stress.Cell.named(self.cell, results.cells)
         if others := changed(results.manifest["versions"]):
@@ -152,15 +151,13 @@ class Report:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.errors import check_path
         from lqrsim.stress.data_table import ENDINGS
 
         path = self.out or self.folder / "report.html"
-        check_path("--out", path, suffixes=(".html", *ENDINGS))
+        console.check_output("--out", path, "file", suffixes=(".html", *ENDINGS))
         is_table = path.suffix.lower() in ENDINGS
         if is_table:
             refuse(self, ("videos",), f"with {path}, want it with a page, .html")
-        console.check_output("--out", path.parent, path.name)
         results = ls.stress.Results(self.folder, scenario=self.scenario)
         if is_table:
             results.rates().save(path)
@@ -195,12 +192,10 @@ class Compare:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.errors import check_path
         from lqrsim.stress.data_table import ENDINGS
 
         if self.out is not None:
-            check_path("--out", self.out, suffixes=ENDINGS)
-            console.check_output("--out", self.out.parent, self.out.name)
+            console.check_output("--out", self.out, "file", suffixes=ENDINGS)
         table = ls.stress.compare(self.folder, self.other, policies=self.policies)
         console.say(str(table))
         if self.out is not None:
@@ -232,7 +227,15 @@ class FailureOptions(StudyOptions):
         console.check_output("--out", folder)
 
         def write(result: Any) -> int:
-            return self._write(result, folder)
+            console.say(self._words(result))
+            runs = result.save(folder, **stated(self, result.save))
+            if runs is not None:
+                console.say(runs.summary())
+            for name in self.FILES if runs is not None else self.FILES[:2]:
+                console.wrote(folder / name)
+            command = type(self).__name__.lower()
+            console.result(**json.loads((folder / f"{command}.json").read_text(encoding="utf-8")))
+            return 0 if getattr(result, "success", True) else 1
 
         try:
             with console.keeping(write), console.progress(*self.SEARCH) as progress:
@@ -242,14 +245,14 @@ class FailureOptions(StudyOptions):
         return write(result)
 
     SEARCH: ClassVar[tuple[str, str]]  # what the command does, and in which units, for its progress
+    FILES: ClassVar[tuple[str, ...]]  # what it writes; without failures the first two
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> Any:
         """The result of the search, with these callbacks."""
         raise NotImplementedError
 
-    def _write(self, result: Any, folder: Path) -> int:
-        """Write a result, and print it. Returns the exit code."""
-        raise NotImplementedError
+    def _words(self, result: Any) -> str:
+        return result.summary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,18 +273,15 @@ class Rare(FailureOptions):
     """Number of failures to write."""
 
     SEARCH = "splitting", "repetition"
+    FILES = "rollout.npz", "rare.json", "certificate.npz"
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "RareFailures":
         return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
 
-    def _write(self, result: "RareFailures", folder: Path) -> int:
-        console.say(result.summary())
+    def _words(self, result: "RareFailures") -> str:
         failures = len(result.splitting.failures)
         others = min(failures, self.shown) - 1
-        console.say(f"the worst of {failures:,} failures, as trial 0, and {others} others:")
-        console.say(result.save(folder, shown=self.shown).summary())
-        _wrote(folder, "rare.json", ("rollout.npz", "rare.json", "certificate.npz"))
-        return 0
+        return f"{result.summary()}\nthe worst of {failures:,} failures, as trial 0, and {others} others:"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,15 +298,10 @@ class Break(FailureOptions):
     """
 
     SEARCH = "searching", "round"
+    FILES = "rollout.npz", "break.json"
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
         return problem.smallest_failure(**stated(self, problem.smallest_failure, **callbacks))
-
-    def _write(self, result: "SmallestFailure", folder: Path) -> int:
-        console.say(result.summary())
-        console.say(result.save(folder).summary())
-        _wrote(folder, "break.json", ("rollout.npz", "break.json"))
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,18 +327,13 @@ class Harden(FailureOptions):
     """Number of failures to write."""
 
     SEARCH = "hardening", "repetition"
+    FILES = "solution.npz", "harden.json", "rollout.npz", "rare.json", "certificate.npz"
 
     def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
         return ls.stress.harden(problem, **stated(self, ls.stress.harden, **callbacks))
 
-    def _write(self, result: "HardenedPlan", folder: Path) -> int:
-        console.say(result.verdict())
-        shown, files = result.save(folder, shown=self.shown), ["solution.npz", "harden.json"]
-        if shown is not None:
-            console.say(shown.summary())
-            files += ["rollout.npz", "rare.json", "certificate.npz"]
-        _wrote(folder, "harden.json", files)
-        return 0 if result.success else 1
+    def _words(self, result: "HardenedPlan") -> str:
+        return result.verdict()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -387,13 +377,6 @@ def _say_none(none: Exception) -> int:
     console.say(f"no failure was found ({none})")
     console.result(found=None, reason=str(none))
     return 1
-
-
-def _wrote(folder: Path, result: str, files: Sequence[str]) -> None:
-    """Say which files were written. The result for `--json` is the content of one of them."""
-    for name in files:
-        console.wrote(folder / name)
-    console.result(**json.loads((folder / result).read_text(encoding="utf-8")))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,7 +83,7 @@ class Render:
             raise ls.InputError(f"ROLLOUT: got {self.rollouts[0]}, a folder, want a file that `lqrsim simulate` wrote")
         out = self.out or self.rollouts[0].with_suffix(".mp4")
         self._check_options(out)
-        console.check_output("--out", out.parent, out.name)
+        console.check_output("--out", out, "file")
         runs = [ls.load(path, ls.Rollout) for path in self.rollouts]
         if self.overlays != OVERLAYS and "tube" in self.overlays:
             for path in (path for path, run in zip(self.rollouts, runs, strict=True) if run.tube is None):

@@ -242,7 +242,7 @@ class _Splitting:
     def move(
         self, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator, *, tune: bool = False
     ) -> tuple[Array, Array, float]:
-        """Move the vectors where they stay above the level; `tune` adapts b to the wanted fraction of accepted moves."""
+        """Move vectors where they stay above the level; `tune` adapts b to the wanted fraction of accepted moves."""
         for _ in range(self.moves):
             proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
             new_scores = self.score(proposed)
