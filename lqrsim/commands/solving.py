@@ -57,7 +57,9 @@ class List:
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("solvers/smoother.py", "smooth", tolerance="SHARE", time_limit="SECONDS")
+@options_of(
+    "solvers/smoother.py", "smooth", tolerance="SHARE", max_iterations="INT", time_limit="SECONDS", starts="INT"
+)
 class Solve:
     """Compute a feedback policy for a scenario.
 
@@ -78,11 +80,6 @@ class Solve:
     """cost: stop when the cost has settled, as in the paper. optimal: also require gap and first-order optimality."""
     finish: Literal["newton", "none"] = "newton"
     """newton: smooth leaves the last iterations to Newton's method. none: the paper's method does them all."""
-    max_iterations: Annotated[int | None, optional("INT")] = None
-    """Stop after this many iterations. By default the solver's own limit."""
-    starts: Annotated[int | None, optional("INT")] = None
-    """Number of starting paths that smooth tries for a few iterations; the best continues. By default 7,
-    if there is no start."""
     start: Annotated[Path | None, optional("FILE.npz")] = None
     """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with the
     same number of steps. By default the scenario's own start, or a search."""

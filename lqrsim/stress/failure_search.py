@@ -180,9 +180,7 @@ class RareFailures:
     """The probability that a policy fails, and typical failures."""
 
     problem: ReliabilityProblem
-    splitting: (
-        reliability.SplittingResult
-    )  # with the levels, the estimate of each repetition, and all failures that were found
+    splitting: reliability.SplittingResult  # with the levels, each repetition's estimate, and all failures
     options: Mapping[str, Any]  # `seed`, `particles`, `repetitions` and `keep`
 
     @property
