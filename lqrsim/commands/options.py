@@ -118,7 +118,6 @@ def _parsed(file: str) -> ast.Module:
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
-Strength = Annotated[float, arg(metavar="FACTOR", help="Factor by which the disturbances are scaled.")]
 DesignSet = Annotated[
     str | None,
     optional("NAME", "Set for which track and offset_free are designed, as in `lqrsim stress`. By default moderate."),
@@ -140,19 +139,14 @@ def stated(command: Any, function: Callable[..., Any], **others: Any) -> dict[st
     return {name: getattr(command, name) for name in names if hasattr(command, name)} | others
 
 
-def changed(command: Any) -> dict[str, Any]:
-    """The options of a command that are not at their defaults, by the names of its fields, and their values."""
-    values = {field.name: (getattr(command, field.name), field.default) for field in fields(command)}
-    return {name: value for name, (value, default) in values.items() if value != default}
-
-
 def refuse(command: Any, names: Collection[str], why: str) -> None:
     """Raise InputError if one of these options was given, which would be ignored; `why` ends the message."""
-    for name, value in changed(command).items():
-        if name in names:
+    for field in fields(command):
+        value = getattr(command, field.name)
+        if field.name in names and value != field.default:
             got = f"{value:g}" if type(value) is float else value
             got = " ".join(map(str, value)) if isinstance(value, tuple) else got
-            raise ls.InputError(f"--{name.replace('_', '-')}: got {got} {why}")
+            raise ls.InputError(f"--{field.name.replace('_', '-')}: got {got} {why}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,9 +162,9 @@ class SetupOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/study.py", "Study", strength="FACTOR")
 class StudyOptions(SetupOptions):
     """The options that state a `Study`, for commands that examine one policy."""
 
-    strength: Strength = 1.0
     policy: PolicyName = "smooth"
     """As in `lqrsim stress`."""

@@ -11,17 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import as_json, console
-from lqrsim.commands.options import (
-    ControllerName,
-    DesignSet,
-    Folder,
-    Json,
-    Strength,
-    optional,
-    options_of,
-    refuse,
-    stated,
-)
+from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
     from lqrsim.solvers.initial_guess import StartLike
@@ -170,6 +160,7 @@ def _plot_policy(scenario: "ls.Scenario", solution: "ls.Solution", path: Path) -
 @dataclass(frozen=True, kw_only=True)
 @options_of("simulation/closed_loop.py", "simulate", seed="INT", trials="INT", first_trial="INT")
 @options_of("stress/study.py", "Setup", goal_radius="METRES", goal_tolerance="SHARE")
+@options_of("stress/study.py", "Study", strength="FACTOR")
 class Simulate:
     """Run a policy in MuJoCo, in closed loop.
 
@@ -198,7 +189,6 @@ class Simulate:
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
     the set of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
-    strength: Strength = 1.0
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
     force_noise: Annotated[float, arg(metavar="STD")] = 0.0

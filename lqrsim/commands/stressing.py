@@ -17,7 +17,6 @@ from lqrsim.commands.options import (
     OwnScenario,
     SetupOptions,
     StudyOptions,
-    changed,
     optional,
     options_of,
     refuse,
@@ -64,8 +63,7 @@ class Stress(SetupOptions):
 
         if self.resume:
             accepted = {"scenario", "solution", "out", "resume", "json", "workers", "batch", "scheduler"}
-            others = changed(self).keys() - accepted
-            refuse(self, others, "with --resume, which has the campaign's own, want it without")
+            refuse(self, vars(self).keys() - accepted, "with --resume, which has the campaign's own, want it without")
         setup = ls.stress.Setup(**stated(self, ls.stress.Setup))
         folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
         console.check_output("--out", folder)

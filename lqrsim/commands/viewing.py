@@ -11,17 +11,7 @@ from tyro.conf import Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import (
-    ControllerName,
-    DesignSet,
-    Json,
-    SolutionFile,
-    changed,
-    optional,
-    options_of,
-    refuse,
-    stated,
-)
+from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional, options_of, refuse, stated
 from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -117,11 +107,11 @@ class Render:
             raise ls.InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
         # Whoever opens such a file chooses the camera and the time.
         accepted = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if kind == ".html" else [])]
-        refuse(self, changed(self).keys() - accepted, f"with {out.name}, want it with a video or a still")
+        refuse(self, vars(self).keys() - accepted, f"with {out.name}, want it with a video or a still")
         single = ["rollouts", "solution", "funnel"] if kind == ".html" else ["rollouts", "funnel", "trial"]
         for name in single:
-            if name in changed(self) and (count := len(getattr(self, name))) != 1:
-                raise ls.InputError(f"{name}: got {count} with {out.name}, want one")
+            if (given := getattr(self, name)) not in (None, ()) and len(given) != 1:
+                raise ls.InputError(f"{name}: got {len(given)} with {out.name}, want one")
 
 
 def _one_or_all(items: Sequence[Any]) -> Any:

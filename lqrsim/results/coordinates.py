@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Protocol, TypeVar
 
 import numpy as np
@@ -232,10 +233,7 @@ class Coordinates:
         """The lowest and the highest value of each entry, (n,) each, as `limited` takes them."""
         if isinstance(limits, Mapping):
             low, high = self.limits
-
-            def pair_of(entry: str, pair: object) -> Array:
-                return check_array(entry, pair, (2,), infinite=True)  # pyright: ignore[reportArgumentType]
-
+            pair_of = partial(check_array, shape=(2,), infinite=True)
             for i, pair in self._by_name(field, limits, pair_of).items():
                 low[i], high[i] = pair
             return low, high

@@ -144,6 +144,7 @@ class Study(Setup):
 
     Attributes:
       sweep: the name of a set of disturbances, as in `lqrsim stress`; by default that of the scenario's demo.
+      strength: factor by which the disturbances are scaled.
     """
 
     design_disturbances: SetName | None = None
