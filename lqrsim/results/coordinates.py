@@ -10,17 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import Finite, Index, Want, checked
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_name,
-    check_number,
-    excerpt,
-    keep,
-    numbers_of,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt, keep, real, vectors_of
 from lqrsim.scenes.world import PLANES, SPACE
 
 _Value = TypeVar("_Value")
@@ -238,7 +228,7 @@ class Coordinates:
                 low[i], high[i] = pair
             return low, high
         try:
-            low, high = (np.broadcast_to(numbers_of(field, side), len(self)) for side in limits)
+            low, high = (np.broadcast_to(real(field, side), len(self)) for side in limits)
         except Exception:  # not a pair, not numbers, or the wrong number of them
             wanted = f"(lowest, highest), each a number or ({len(self)},), or such pairs by name"
             raise InputError(f"{field}: got {excerpt(limits)}, want {wanted}") from None
