@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,8 +38,6 @@ Columns = dict[str, npt.NDArray[np.generic]]  # of the table of a shard, by name
 _KEY = b"lqrsim shard"
 _TEXTS = "outcome", "obstacle", "reason"
 _TYPES = dict.fromkeys((*COLUMNS, "reason"), pa.float64()) | {"trial": pa.int64()} | dict.fromkeys(_TEXTS, pa.string())
-_SNAPPY_RATIO = 22  # bytes that come of one at most; of other compressions it may be tens of thousands
-_TEXT_BYTES = 1 << 26  # bytes of text that are unpacked before they are looked at
 _MAGIC = b"PAR1"  # of parquet; its footer has values of these kinds
 _DEEPEST = 21  # values within each other; a footer has fewer
 _BOOLEANS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _MAP, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, (9, 10), 11, 12
@@ -106,10 +104,10 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Columns:
     about = _about(shard, campaign)
     try:
         groups = _chunks(contents)
-        rows = [[chunk.values for chunk in group] for group in groups]
-        if any(chunk.codec not in (0, 1) for group in groups for chunk in group):
+        rows = [[count for _, count in group] for group in groups]
+        if any(codec not in (0, 1) for group in groups for codec, _ in group):
             raise ValueError("another compression than Snappy's")  # a few bytes of it may be gigabytes
-        file = pq.ParquetFile(io.BytesIO(contents), page_checksum_verification=True)
+        file = pq.ParquetFile(io.BytesIO(contents))
         if not file.metadata.num_rows == shard.count == sum(group[0] for group in rows):
             raise ValueError(f"{file.metadata.num_rows} rows")
         if file.schema_arrow.names != [*_TYPES] or file.schema_arrow.types != [*_TYPES.values()]:
@@ -117,11 +115,9 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Columns:
         if any(len(group) != len(_TYPES) or len({*group}) > 1 for group in rows):
             raise ValueError("columns of different lengths")
         meta = json.loads((file.schema_arrow.metadata or {})[_KEY])
-        numbers = file.read([name for name in _TYPES if name not in _TEXTS], use_threads=False)
-        table: Columns = {name: numbers[name].to_numpy() for name in _TYPES if name not in _TEXTS}
-        for name in _TEXTS:
-            table[name] = _texts(file, name, max(group[[*_TYPES].index(name)].size for group in groups))
-        table = {name: table[name] for name in _TYPES}
+        file = pq.ParquetFile(io.BytesIO(contents), read_dictionary=[*_TEXTS], page_checksum_verification=True)
+        columns = file.read(use_threads=False)
+        table = {name: _texts(columns[name]) if name in _TEXTS else columns[name].to_numpy() for name in _TYPES}
         good = meta == about | {"sha256": _digest(table, about)}
     except Exception as error:  # a parser may raise anything for damaged bytes
         raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
@@ -155,16 +151,15 @@ def _about(shard: Shard, campaign: str) -> dict[str, Any]:
     return {"campaign": campaign, "cell": shard.cell, "first": shard.first, "count": shard.count}
 
 
-def _texts(file: pq.ParquetFile, name: str, size: int) -> npt.NDArray[np.str_]:
-    # In parts, of a column of `size` bytes: a text that rows have in common stands in the file once, and is unpacked
-    # for each.
-    column = list[str]()
-    for part in file.iter_batches(max(_TEXT_BYTES // (_SNAPPY_RATIO * size + 1), 1), columns=[name], use_threads=False):
-        texts = part.column(0).to_pylist()
+def _texts(column: pa.ChunkedArray) -> npt.NDArray[np.str_]:
+    """The texts of a column that is read as a dictionary: a text that rows have in common is unpacked once."""
+    parts = list[npt.NDArray[np.str_]]()
+    for part in column.chunks:
+        texts = part.dictionary.to_pylist()
         if (longest := max(map(len, texts), default=0)) > LONGEST:
             raise ValueError(f"a text of {longest} characters")
-        column += texts
-    return np.array(column, dtype=np.str_)
+        parts.append(np.array(texts, dtype=np.str_)[part.indices.to_numpy()])
+    return np.concatenate(parts)
 
 
 def _digest(table: Columns, about: Mapping[str, Any]) -> str:
@@ -177,16 +172,10 @@ def _digest(table: Columns, about: Mapping[str, Any]) -> str:
     return sha256(*parts)
 
 
-class _Chunk(NamedTuple):
-    """A column of a row group: its codec (0 none, 1 Snappy), number of values, and bytes in the file."""
+def _chunks(contents: bytes) -> list[list[tuple[int, int]]]:
+    """Codec (0 none, 1 Snappy) and number of values of each column of each row group, by the footer.
 
-    codec: int
-    values: int
-    size: int
-
-
-def _chunks(contents: bytes) -> list[list[_Chunk]]:
-    """The columns of each row group, by the footer. Raises an exception of any kind where that is damaged.
+    Raises an exception of any kind where the footer is damaged.
 
     PyArrow's own objects of a footer end the process where it is damaged, so it is read here, as far as it bounds the
     memory that a file takes. The format is Thrift's compact protocol: https://github.com/apache/parquet-format and
@@ -197,7 +186,7 @@ def _chunks(contents: bytes) -> list[list[_Chunk]]:
         raise ValueError("no footer of parquet")
     footer = _value(io.BytesIO(contents[-8 - length : -8]), _STRUCT, _DEEPEST)
     columns = [[chunk[3] for chunk in group[1]] for group in footer[4]]
-    return [[_Chunk(chunk[4], chunk[5], chunk[7]) for chunk in group] for group in columns]
+    return [[(chunk[4], chunk[5]) for chunk in group] for group in columns]
 
 
 def _value(data: io.BytesIO, kind: int, depth: int) -> Any:

@@ -13,7 +13,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -87,8 +87,7 @@ def lowest_rate(successes: int, trials: int, confidence: float) -> float:
     return rate_of(successes, trials, confidence=max(2 * confidence - 1, 1e-12)).low
 
 
-@dataclass(frozen=True)
-class FoundLevel:
+class FoundLevel(NamedTuple):
     """A certified level, 0 if no level passed."""
 
     level: float
@@ -272,15 +271,10 @@ def funnel(
 
     def so_far() -> Funnel:
         missing = FoundLevel(0.0, 0, 0, "stopped before this knot was done", 0.0, 0)
-        every = [*levels, *[missing] * (len(starts) - len(levels))]
-        return replace(
-            blank,
-            levels=np.array([result.level for result in every]),
-            trials=np.array([result.trials for result in every]),
-            successes=np.array([result.successes for result in every]),
-            reasons=tuple(result.reason for result in every),
-            simulated=sum(result.simulated for result in every),
-        )
+        every = *levels, *[missing] * (len(starts) - len(levels))
+        found, trials, successes, reasons, _, simulated = zip(*every, strict=True)
+        arrays = {"levels": np.array(found), "trials": np.array(trials), "successes": np.array(successes)}
+        return replace(blank, **arrays, reasons=reasons, simulated=sum(simulated))
 
     run = 0
 
