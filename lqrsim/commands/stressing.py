@@ -1,7 +1,6 @@
 """Commands that measure how policies fail: stress tests, rare failures, the smallest failure, and funnels."""
 
 import json
-import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -59,7 +58,7 @@ class Stress(SetupOptions):
     """Resume the campaign in the folder with its own settings, without the options that state others."""
 
     def run(self) -> int:
-        from lqrsim.scenarios.references import folder_name, names_code
+        from lqrsim.scenarios.references import folder_name
 
         if self.resume:
             accepted = {"scenario", "solution", "out", "resume", "json", "workers", "batch", "scheduler"}
@@ -79,8 +78,7 @@ class Stress(SetupOptions):
             results = ls.stress.run_campaign(campaign, folder, **options)
         console.say(results.summary())
         console.wrote(folder)
-        code = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
-        console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *code])}")
+        console.say(f"\nnext:\n  {results.command_of('report')}")
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0

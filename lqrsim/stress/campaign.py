@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import Bounds, Progress, Want, checked
-from lqrsim.errors import InputError, check_path, excerpt, without_addresses
+from lqrsim.errors import InputError, check_path, excerpt, free_name, without_addresses
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
@@ -277,14 +277,10 @@ def _is_intact(results: Results, shard: Shard) -> bool:
     try:
         files.read(path, shard, results.manifest["digest"])
     except files.Damaged as error:
-        aside = results.folder / "damaged" / path.name
-        for number in itertools.count(1):
-            if not aside.exists():
-                break
-            aside = aside.with_name(f"{path.name}.{number}")
+        folder = results.folder / "damaged"
         try:
-            aside.parent.mkdir(exist_ok=True)
-            path.replace(aside)
+            folder.mkdir(exist_ok=True)
+            aside = path.replace(folder / free_name(path.name, os.listdir(folder)))
         except OSError as problem:
             got = f"{path}, which is damaged and cannot be moved ({problem.strerror})"
             raise InputError(f"shard: got {got}, want it removed") from None
