@@ -26,7 +26,7 @@ from lqrsim.problem.noise import Noise
 from lqrsim.process import keeping
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel, flat, inverse_of
-from lqrsim.results.goal import Target, endings
+from lqrsim.results.goal import Target
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.simulation.disturbances import Disturbance, InitialStateError, as_disturbances
@@ -378,7 +378,7 @@ def points_of(numbers: npt.NDArray[np.intp], seed: int, size: int, between: tupl
     points = np.empty((len(numbers), size))
     low, high = (radius**size for radius in between)
     for row, trial in enumerate(numbers.tolist()):
-        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, START_STREAM))))
+        rng = seeded(seed)(trial, START_STREAM)
         direction = rng.standard_normal(size)
         points[row] = direction / np.linalg.norm(direction) * (low + (high - low) * rng.random()) ** (1 / size)
     return points
@@ -414,11 +414,8 @@ class _Trials:
             self.plant, self.solution, states, knot=knot, disturbances=self.disturbances, controller=self.law,
             generators=lambda trial, stream: streams(int(numbers[trial]), stream), **self.options,
         )  # fmt: skip
-        outcome, *_ = endings(
-            collided_at=run.collided_at, diverged_at=run.diverged_at, failed_at=run.failed_at,
-            distance=self.target.distance(run.states[:, -1]), radius=self.radius, horizon=run.plan.horizon,
-        )  # fmt: skip
-        return outcome == "reached"
+        ran = np.isin(run.outcome, ("reached", "timed out"))
+        return ran & (self.target.distance(run.states[:, -1]) <= self.radius)
 
 
 def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list[int]) -> Array:
