@@ -47,7 +47,8 @@ def _value_or_default(info: PrimitiveTypeInfo) -> Any:
 def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Command]], type[Command]]:
     """Give a command options of a function or a record of the API, with its types, defaults and help.
 
-    They are read from its source: to import it would take a second, for `--help` too.
+    They are read from its source: to import it would take a second, for `--help` too. The command declares those that
+    its own code uses, without help.
 
     Args:
       file: path in the package. name: the function or class, or CLASS.METHOD.
@@ -76,7 +77,7 @@ def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Comma
             shown = arg(metavar=metavar, help=text[0].upper() + text[1:], **{} if default is not None else NO_DEFAULT)
             options[option] = Annotated[kind, shown]
             setattr(command, option, default)
-        command.__annotations__ = options | inspect.get_annotations(command)
+        command.__annotations__ = options | inspect.get_annotations(command) | options
         return command
 
     return add
@@ -166,5 +167,6 @@ class SetupOptions:
 class StudyOptions(SetupOptions):
     """The options that state a `Study`, for commands that examine one policy."""
 
+    strength: float = 1.0
     policy: PolicyName = "smooth"
     """As in `lqrsim stress`."""

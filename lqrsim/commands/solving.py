@@ -70,6 +70,7 @@ class Solve:
     """cost: stop when the cost has settled, as in the paper. optimal: also require gap and first-order optimality."""
     finish: Literal["newton", "none"] = "newton"
     """newton: smooth leaves the last iterations to Newton's method. none: the paper's method does them all."""
+    starts: int | None = None
     start: Annotated[Path | None, optional("FILE.npz")] = None
     """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with the
     same number of steps. By default the scenario's own start, or a search."""
@@ -189,6 +190,7 @@ class Simulate:
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
     the set of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
+    strength: float = 1.0
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
     force_noise: Annotated[float, arg(metavar="STD")] = 0.0

@@ -116,8 +116,8 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Columns:
             raise ValueError("columns of different lengths")
         meta = json.loads((file.schema_arrow.metadata or {})[_KEY])
         file = pq.ParquetFile(io.BytesIO(contents), read_dictionary=[*_TEXTS], page_checksum_verification=True)
-        columns = file.read(use_threads=False)
-        table = {name: _texts(columns[name]) if name in _TEXTS else columns[name].to_numpy() for name in _TYPES}
+        read = file.read(use_threads=False)
+        table: Columns = {name: _texts(read[name]) if name in _TEXTS else read[name].to_numpy() for name in _TYPES}
         good = meta == about | {"sha256": _digest(table, about)}
     except Exception as error:  # a parser may raise anything for damaged bytes
         raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
