@@ -1,4 +1,4 @@
-"""The goal of a trial, its distance from goal and plan, and how it ended, for every robot. NumPy only.
+"""The goal of a trial, distances from goal and plan, and the ways in which a trial ends, for every robot. NumPy only.
 
 Distances are in metres for robots with a position. For other robots they are a scaled error: the largest difference
 among the states that count, from the goal relative to the way from the start (`Target.scale`), from the plan relative
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.annotations import Positive, checked
 from lqrsim.errors import Array, InputError, check_number, excerpt, keep, shaped
@@ -240,24 +239,3 @@ class Target:
           radius: the scaled error within which the target counts as reached; None if it is not known.
         """
         return "" if self.places else worst_of(self.space, self._off(state), self.scale, radius)
-
-
-def endings(
-    *, collided_at: Array, diverged_at: Array, failed_at: Array, distance: Array, radius: float, horizon: float
-) -> tuple[npt.NDArray[np.str_], Array]:
-    """The outcomes of trials and their times. The first event ends a trial; later events do not count.
-
-    Args:
-      collided_at, diverged_at, failed_at: (K,) seconds, infinite for events that did not happen. If events happen at
-        the same time, the event named first counts.
-      distance: (K,) distance from the target at the end. radius: distance within which the target counts as reached.
-
-    Returns:
-      one of OUTCOMES for each trial, (K,), and the time in seconds at which it ended, (K,).
-    """
-    events = np.stack([collided_at, diverged_at, failed_at])
-    first = np.argmin(events, axis=0)
-    happened = np.isfinite(events.min(axis=0))
-    arrived = np.where(np.asarray(distance) <= radius, "reached", "timed out")
-    outcome = np.where(happened, np.array(["collided", "diverged", "error"])[first], arrived)
-    return outcome, np.where(happened, events.min(axis=0), horizon)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Bounds, Index, Line, NonNegative, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_symmetric, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_unit, worst_of
+from lqrsim.results.goal import OUTCOMES, Target, departure, scale_of, tracking_unit, worst_of
 from lqrsim.results.notebook import SHOWN, drawing, number_text, of_table
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
@@ -300,10 +300,12 @@ class Rollout:
 
     @cached_property
     def _endings(self) -> tuple[npt.NDArray[np.str_], Array]:
-        return endings(
-            collided_at=self.collided_at, diverged_at=self.diverged_at, failed_at=self.failed_at,
-            distance=self.goal_distance, radius=self.goal_radius, horizon=self.plan.horizon,
-        )  # fmt: skip
+        """The outcomes, (K,), and the times in seconds, (K,). Of events at the same time the first of these counts."""
+        events = np.stack([self.collided_at, self.diverged_at, self.failed_at])
+        first, names = events.min(axis=0), np.array(["collided", "diverged", "error"])
+        arrived = np.where(self.goal_distance <= self.goal_radius, "reached", "timed out")
+        outcome = np.where(np.isfinite(first), names[np.argmin(events, axis=0)], arrived)
+        return outcome, np.where(np.isfinite(first), first, self.plan.horizon)
 
     @property
     def outcome(self) -> tuple[str, ...]:
