@@ -3,7 +3,7 @@
 import ast
 import inspect
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -73,7 +73,7 @@ def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Comma
             entry = re.search(rf"^  {option}: (.+(?:\n    .+)*)", words, re.MULTILINE)
             assert entry is not None, f"{name} does not say what {option} is"
             text = " ".join(entry[1].split())
-            kind, default = _type_of(types[option]), ast.literal_eval(defaults[option])
+            kind, default = _type_of(types[option], _kinds(file)), ast.literal_eval(defaults[option])
             shown = arg(metavar=metavar, help=text[0].upper() + text[1:], **{} if default is not None else NO_DEFAULT)
             options[option] = Annotated[kind, shown]
             setattr(command, option, default)
@@ -83,9 +83,8 @@ def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Comma
     return add
 
 
-def _type_of(annotation: ast.expr) -> Any:
+def _type_of(annotation: ast.expr, kinds: Mapping[str, ast.expr]) -> Any:
     """The type that an annotation of the API says, without what `checked` asks of it besides."""
-    kinds = _kinds()
 
     class Bare(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.expr:
@@ -98,14 +97,14 @@ def _type_of(annotation: ast.expr) -> Any:
             self.generic_visit(node)
             return node
 
-    return eval(ast.unparse(Bare().visit(annotation)), {"Literal": Literal})
+    return eval(ast.unparse(Bare().visit(annotation)), {"Literal": Literal, "Sequence": Sequence})
 
 
 @cache
-def _kinds() -> dict[str, ast.expr]:
-    """The annotations that have a name in `annotations.py`, such as `Positive`."""
+def _kinds(file: str) -> dict[str, ast.expr]:
+    """The annotations that have a name in a file or in `annotations.py`, such as `Positive`."""
     kinds = dict[str, ast.expr]()
-    for statement in _parsed("annotations.py").body:
+    for statement in (*_parsed("annotations.py").body, *_parsed(file).body):
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
             kinds[statement.targets[0].id] = statement.value
     return kinds

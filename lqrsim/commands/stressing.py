@@ -84,6 +84,9 @@ class Stress(SetupOptions):
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0
 
 
+CampaignFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="A folder from `lqrsim stress`.")]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Replay:
     """Repeat one trial of a stress test exactly.
@@ -93,8 +96,7 @@ class Replay:
     with 1 if there are any. On another kind of processor, or with other versions, results can differ; it then says so.
     """
 
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """A folder from `lqrsim stress`."""
+    folder: CampaignFolder
     cell: Annotated[str, arg(metavar="CELL")]
     """policy,sweep,strength, such as smooth,light,1.5; or the number with which the names of its files begin."""
     trial: int
@@ -139,8 +141,7 @@ class Report:
     test has ended, and then say so.
     """
 
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """A folder from `lqrsim stress`."""
+    folder: CampaignFolder
     out: Annotated[Path | None, optional("FILE")] = None
     """The page, .html, or the table: .csv, .tex or .md. By default report.html in that folder."""
     scenario: OwnScenario = None
@@ -177,8 +178,7 @@ class Compare:
       lqrsim compare runs/first --with runs/second --out difference.tex
     """
 
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """A folder from `lqrsim stress`."""
+    folder: CampaignFolder
     other: Annotated[Path | None, optional("FOLDER"), arg(name="with")] = None
     """Folder of the stress test to compare it with. By default the same."""
     policies: Annotated[tuple[str, str] | None, optional("POLICY POLICY")] = None
@@ -201,11 +201,10 @@ class Compare:
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/study.py", "Study", sweep="NAME")
 class FailureOptions(StudyOptions):
     """Options of `rare`, `break` and `harden`."""
 
-    sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
-    """Disturbances, as in `lqrsim stress`. By default the disturbances of the scenario's demo."""
     failure: Literal["collision", "miss"] = "collision"
     """collision: the robot hits an obstacle, its trial diverges, or its controller fails. miss: it does not reach its
     goal, which is what `lqrsim stress` calls a failure."""
@@ -376,7 +375,7 @@ def _say_none(none: Exception) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("stress/funnels.py", "funnel", rate="FLOAT", failures="INT")
+@options_of("stress/funnels.py", "funnel", rate="FLOAT", failures="INT", knots="N ...", states="NAME ...")
 class FunnelCommand(StudyOptions):
     """Find from how far off its plan a policy still works.
 
@@ -394,10 +393,6 @@ class FunnelCommand(StudyOptions):
     """Sets by name, as in `lqrsim simulate`. By default the disturbances of the scenario's demo."""
     confidence: float = 0.95
     """Probability that all levels are right."""
-    knots: Annotated[tuple[int, ...] | None, optional("N ...")] = None
-    """Numbers of the knots at which runs begin. By default five, from the first on."""
-    states: Annotated[tuple[str, ...] | None, optional("NAME ...")] = None
-    """States that may be off the plan. By default all."""
     out: Folder = None
     """Output folder. By default runs/funnel/ and the name of the scenario."""
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -223,8 +223,8 @@ class Coordinates:
         """The lowest and the highest value of each entry, (n,) each, as `limited` takes them."""
         if isinstance(limits, Mapping):
             low, high = self.limits
-            pair_of: Callable[[str, Any], Array] = partial(check_array, shape=(2,), infinite=True)
-            for i, pair in self._by_name(field, limits, pair_of).items():
+            pair_of = partial(check_array, shape=(2,), infinite=True)
+            for i, pair in self._by_name(field, limits, pair_of).items():  # pyright: ignore[reportArgumentType]
                 low[i], high[i] = pair
             return low, high
         try:
