@@ -116,7 +116,6 @@ def _parsed(file: str) -> ast.Module:
 
 
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
-CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
 DesignSet = Annotated[
     str | None,
@@ -127,9 +126,6 @@ SolutionFile = Annotated[
     optional("FILE.npz", "Run this solution instead of solving the scenario, with its robot, horizon and goal."),
 ]
 Folder = Annotated[Path | None, optional("FOLDER")]
-OwnScenario = Annotated[
-    str | None, optional("SCENARIO", "The scenario, if it is your own function: files never choose code to run.")
-]
 Json = Annotated[FlagCreatePairsOff[bool], arg(help="Print one JSON object, all else to stderr; see docs/json.md.")]
 
 
@@ -159,13 +155,3 @@ class SetupOptions:
     design_disturbances: DesignSet = None
     solution: SolutionFile = None
     json: Json = False
-
-
-@dataclass(frozen=True, kw_only=True)
-@options_of("stress/study.py", "Study", strength="FACTOR")
-class StudyOptions(SetupOptions):
-    """The options that state a `Study`, for commands that examine one policy."""
-
-    strength: float = 1.0
-    policy: PolicyName = "smooth"
-    """As in `lqrsim stress`."""

@@ -9,23 +9,14 @@ from tyro.conf import Positional, Suppress, arg
 
 import lqrsim as ls
 from lqrsim.commands import as_json, console
-from lqrsim.commands.options import (
-    CampaignPolicyName,
-    Folder,
-    Json,
-    OwnScenario,
-    SetupOptions,
-    StudyOptions,
-    optional,
-    options_of,
-    refuse,
-    stated,
-)
+from lqrsim.commands.options import Folder, Json, PolicyName, SetupOptions, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
     from lqrsim.results.funnel import Funnel
     from lqrsim.stress.failure_search import RareFailures, SmallestFailure
     from lqrsim.stress.safer_plans import HardenedPlan
+
+CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +75,9 @@ class Stress(SetupOptions):
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0
 
 
+OwnScenario = Annotated[
+    str | None, optional("SCENARIO", "The scenario, if it is your own function: files never choose code to run.")
+]
 CampaignFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="A folder from `lqrsim stress`.")]
 
 
@@ -198,6 +192,16 @@ class Compare:
             console.wrote(table.save(self.out))
         console.result(cells=as_json.rows_of(table.columns), notes=table.notes)
         return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+@options_of("stress/study.py", "Study", strength="FACTOR")
+class StudyOptions(SetupOptions):
+    """The options that state a `Study`, for commands that examine one policy."""
+
+    strength: float = 1.0
+    policy: PolicyName = "smooth"
+    """As in `lqrsim stress`."""
 
 
 @dataclass(frozen=True, kw_only=True)
