@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -32,7 +33,7 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import Array, InputError
 from lqrsim.reports.page import report
-from lqrsim.results.goal import OF_RANGE, OF_WAY, OUTCOMES, Target, endings
+from lqrsim.results.goal import OF_RANGE, OF_WAY, OUTCOMES, Target
 from lqrsim.robots.base import Robot
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.scenes.scene import scene_from_xml
@@ -612,9 +613,11 @@ def test_a_collision_between_two_knots_is_one(cage: Plant) -> None:
 )  # fmt: skip
 def test_the_first_event_ends_a_trial(rows: list[tuple[float, float, float, float]]) -> None:
     collided, diverged, failed, distance = (np.array(column) for column in zip(*rows, strict=True))
-    outcome, ended = endings(
-        collided_at=collided, diverged_at=diverged, failed_at=failed, distance=distance, radius=0.1, horizon=2.0
-    )
+    run = SimpleNamespace(
+        collided_at=collided, diverged_at=diverged, failed_at=failed, goal_distance=distance, goal_radius=0.1,
+        plan=SimpleNamespace(horizon=2.0),
+    )  # fmt: skip
+    outcome, ended = ls.Rollout._endings.func(run)
     for one, when, (hit, lost, erred, away) in zip(outcome, ended, rows, strict=True):
         first = min(hit, lost, erred)
         if first == np.inf:

@@ -67,10 +67,10 @@ class DataTable:
             raise InputError(f"{who}: got {got}, want at least one column, all of one length")
         for name, spec in self.formats.items():
             check_name("DataTable: formats", name, columns)
-            if not (isinstance(spec, str) and re.fullmatch(r"(\.\d\d?)?[efg]", spec)):
+            if not re.fullmatch(r"(\.\d\d?)?[efg]", spec):
                 raise InputError(f"DataTable: formats: {excerpt(name)}: got {excerpt(spec)}, want such as '.3f' or 'g'")
         notes = tuple(check_text("DataTable: notes", note, "a line", at_most=_LONGEST) for note in self.notes)
-        keep(self, columns=columns, formats=dict(self.formats), notes=notes)
+        keep(self, columns=columns, notes=notes)
 
     @checked
     def select(self, headings: Annotated[Sequence[str], Want("a list of headings")]) -> "DataTable":
