@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,23 @@ def test_every_form_holds_the_table(rows: list[tuple[str, float, int | None]], h
         digits, power = match.groups()
         assert float(f"{digits}e{power}") == float(f"{x:.1e}")
         assert count == ("" if n is None else f"${n}$")
+
+
+BEGINNINGS = ("", "#", "# ", "- ", "---", "+ ", "1. ", "12) ", "    ", "-5 ", "2.5 ", "* ", "> ", "=== ")
+
+
+@given(st.lists(st.tuples(st.sampled_from(BEGINNINGS), names), min_size=1, max_size=3))
+def test_a_note_is_a_paragraph_however_it_begins(notes: list[tuple[str, str]]) -> None:
+    said = [f"{beginning}{name}" for beginning, name in notes]
+    text = ls.types.DataTable({"x": [1.0]}, notes=said).markdown()
+    for html in (
+        markdown.markdown(text, extensions=["tables"]),
+        MarkdownIt("gfm-like", {"linkify": False}).render(text),
+    ):
+        _, _, below = html.partition("</table>")
+        paragraphs = re.findall(r"<p>(.*)</p>", below)
+        assert re.sub(r"<p>.*</p>", "", below).strip() == ""
+        assert [squeezed(unescape(paragraph)) for paragraph in paragraphs] == [squeezed(note) for note in said]
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no LaTeX here")

@@ -36,6 +36,8 @@ _LATEX = str.maketrans({
 })  # fmt: skip
 # An underscore within a word is only that. Not all renderers know a backslash before the others.
 _MARKDOWN = re.compile(r"[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])")
+# What would begin a heading, a list or a rule in place of a paragraph.
+_BLOCK = re.compile(r"^(\d+(?=[.)](?: |$))|(?=[#+-]))(.)")
 _ENTITIES = str.maketrans({letter: f"&#{ord(letter)};" for letter in "&<>~$"})
 
 
@@ -106,7 +108,8 @@ class DataTable:
             f"| {' | '.join(f'{entry:{side}{width}}' for entry, side, width in zip(row, sides, widths, strict=True))} |"
             for row in (rows[0], rule, *rows[1:])
         )
-        return _lines(head, *body, *(line for note in self.notes for line in ("", _markdown_text(note))))
+        notes = (_BLOCK.sub(r"\1\\\2", _markdown_text(note.strip())) for note in self.notes)
+        return _lines(head, *body, *(line for note in notes for line in ("", note)))
 
     __str__ = markdown
 
