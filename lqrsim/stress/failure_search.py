@@ -291,9 +291,7 @@ def certify(
     if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     stated: dict[str, Any] = {field.name: getattr(certificate, field.name) for field in fields(ReliabilityProblem)}
-    if scenario is not None:
-        stated["scenario"] = scenario
-    problem = ReliabilityProblem(**stated)
+    problem = ReliabilityProblem(**stated | {"scenario": certificate.scenario if scenario is None else scenario})
     facts = problem.facts
     was = {name: getattr(certificate, name) for name in facts}
     differences = [f"{name}: got {facts[name]}, want {was[name]}" for name in facts if facts[name] != was[name]]
