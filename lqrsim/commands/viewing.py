@@ -110,7 +110,7 @@ class Render:
         refuse(self, vars(self).keys() - accepted, f"with {out.name}, want it with a video or a still")
         single = ["rollouts", "solution", "funnel"] if kind == ".html" else ["rollouts", "funnel", "trial"]
         for name in single:
-            if (given := getattr(self, name)) not in (None, ()) and len(given) != 1:
+            if (given := getattr(self, name)) != getattr(Render, name, None) and len(given) != 1:
                 raise ls.InputError(f"{name}: got {len(given)} with {out.name}, want one")
 
 
