@@ -291,7 +291,8 @@ def certify(
     if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     stated: dict[str, Any] = {field.name: getattr(certificate, field.name) for field in fields(ReliabilityProblem)}
-    problem = ReliabilityProblem(**stated | {"scenario": certificate.scenario if scenario is None else scenario})
+    stated["scenario"] = certificate.scenario if scenario is None else scenario
+    problem = ReliabilityProblem(**stated)
     facts = problem.facts
     was = {name: getattr(certificate, name) for name in facts}
     differences = [f"{name}: got {facts[name]}, want {was[name]}" for name in facts if facts[name] != was[name]]
