@@ -406,7 +406,9 @@ def brief(value: object, depth: int = 0) -> str:
     if isinstance(value, (bool, str)) or value is None:
         return repr(value)
     if isinstance(value, (int, float, np.number)):
-        return f"{value + 0:.6g}"  # no -0
+        with contextlib.suppress(OverflowError):  # of an int beyond all floats
+            return f"{value + 0:.6g}"  # no -0
+        return excerpt(value)
     if isinstance(value, np.ndarray):
         square = value.ndim == 2 and value.shape[0] == value.shape[1]
         if square and not (value - np.diag(np.diag(value))).any():

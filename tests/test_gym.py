@@ -229,6 +229,7 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
         ({"scenario": "quadrotor", "actions": "torques"}, "actions: got 'torques', want one of: normalized, controls"),
         ({"scenario": "quadrotor", "render_mode": "human"}, "render_mode: got 'human', want one of: rgb_array"),
         ({"scenario": "quadrotor", "camera": "chase"}, "camera: got 'chase'"),
+        ({"scenario": "quadrotor", "camera": np.zeros(0)}, "camera: got array([], dtype=float64), want the name"),
         *[
             ({"scenario": "quadrotor", "strength": size}, f"strength: got {size} without disturbances")
             for size in (0, 2.5)

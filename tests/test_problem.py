@@ -137,6 +137,16 @@ def test_a_problem_and_its_parts_print_what_they_were_made_of(
     assert f"margin={margin / 100:g}, radius=0.25)" in text
 
 
+@given(digits=st.integers(1, 5000), sign=st.sampled_from([1, -1]))
+def test_numbers_of_any_size_are_printed(digits: int, sign: int) -> None:
+    """Also beyond 1e308, which no float holds, and beyond 4,300 digits, which Python does not print."""
+    shown = repr(ls.types.BetweenKnots(sign * 10 ** (digits - 1), 0.0, {}))
+    assert shown.startswith(
+        "BetweenKnots(step_error=" + (f"{sign * 10.0 ** (digits - 1):g}," if digits < 310 else "an int of ")
+    )
+    assert len(shown) < 100
+
+
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_weights_of_any_number_of_controls_are_printed(size: int) -> None:
     listed = {1: "7", 2: "7, 7", 5: "7, ... 5 times"}[size]

@@ -2,7 +2,7 @@
 
 The gap between the end of a step and the next state is closed by the iterations. The rows are those of all constraints,
 then the limits of the controls. To a model, a row of value d is `curve d^2 / 2 - force d`; each method has its own
-curves and forces: see `interior_point.py`, `active_set.py` and `solvers/restoration.py`.
+curves and forces: see `interior_point.py`, `active_set.py` and `restoration.py`.
 """
 
 from math import inf, sin, sqrt
