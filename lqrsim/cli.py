@@ -189,7 +189,7 @@ def _repeated_option(command: Any, arguments: list[str]) -> str:
     options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
     for option, count in collections.Counter(f"--{option[2:].removeprefix('no-')}" for option in options).items():
         if count > 1:
-            several = isinstance(getattr(command, option[2:].replace("-", "_"), None), tuple)
+            several = isinstance(getattr(command, option[2:].replace("-", "_"), None), (tuple, list))
             return f"{option}: got it {count} times, want it once" + (", with all its values" if several else "")
     return ""
 

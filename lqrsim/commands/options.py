@@ -141,7 +141,7 @@ def refuse(command: Any, names: Collection[str], why: str) -> None:
         value = getattr(command, field.name)
         if field.name in names and value != field.default:
             got = f"{value:g}" if type(value) is float else value
-            got = " ".join(map(str, value)) if isinstance(value, tuple) else got
+            got = " ".join(map(str, value)) if isinstance(value, (tuple, list)) else got
             raise ls.InputError(f"--{field.name.replace('_', '-')}: got {got} {why}")
 
 
