@@ -5,7 +5,7 @@ What is possible at all is bounded by plans that know what each trial meets; `cl
 
 import copy
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -95,8 +95,8 @@ class BothWays(ls.Quadrotor):
 
     lowest: float = 0.0
 
-    @property
-    def dynamics(self) -> ls.Dynamics:
+    @cached_property
+    def dynamics(self) -> ls.Dynamics:  # pyright: ignore[reportIncompatibleMethodOverride]
         made = copy.copy(super().dynamics)
         made.control_coordinates = replace(made.control_coordinates, low=(self.lowest,) * 4)
         return made
