@@ -1,11 +1,10 @@
 """Worker processes for a campaign, on this machine or a dask cluster. If they die or hang, the campaign continues.
 
-On this machine each worker has its own pipe. On a cluster dask starts workers,
-distributes tasks, and repeats the tasks of dead workers, up to its `allowed-failures`. Tables come back as bytes, so no
-folder needs to be shared. This module adds four things: a time limit that counts from the moment when a worker begins a
-task; restarts of workers that hang, because `cancel()` does not stop a running task; one task at a time per worker; and
-at most two queued tasks per worker, so that the scheduler never holds a whole campaign. CONTRIBUTING.md explains why no
-library does all of this.
+On this machine each worker has its own pipe. On a cluster dask starts workers, distributes tasks, and repeats the tasks
+of dead workers, up to its `allowed-failures`. Tables come back as bytes, so no folder needs to be shared. This module
+adds four things: a time limit that counts from the moment when a worker begins a task; restarts of workers that hang,
+because `cancel()` does not stop a running task; one task at a time per worker; and at most two queued tasks per worker,
+so that the scheduler never holds a whole campaign. CONTRIBUTING.md explains why no library does all of this.
 """
 
 import asyncio
