@@ -225,7 +225,6 @@ class Episode:
             **task.scenario.near_enough(),
         )  # fmt: skip
         self._costs, self._plan = task.costs, self.loop.trajectory
-        self.loop.begin()
         self.ended = np.zeros(trials, dtype=bool)
         self.outcomes = np.full(trials, "", dtype=object)  # empty while an episode is running
         self._terminated, self._truncated = np.zeros((2, trials), dtype=bool)

@@ -96,7 +96,9 @@ def simulate(
     Returns:
       A Rollout of the trials. Its `controller_run` is the run of the controller, with its records.
     """
-    return ClosedLoop(**locals()).run()  # all arguments, by name
+    loop = ClosedLoop(**locals())  # all arguments, by name
+    loop.run()
+    return loop.rollout(undisturbed=loop.undisturbed())
 
 
 def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **options: Any) -> Rollout:
@@ -112,7 +114,9 @@ def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **o
         `InitialStateError`, are refused. Times of the rollout count from the knot.
     """
     states = check_array("states", states, (None, None))
-    return ClosedLoop(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options).run()
+    loop = ClosedLoop(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options)
+    loop.run()
+    return loop.rollout()
 
 
 Mask = npt.NDArray[np.bool_]
@@ -200,16 +204,16 @@ class Records:
 class ClosedLoop:
     """The closed loop of K trials, with a method for each phase of a control period, by the arguments of `simulate`.
 
-    All trials are advanced together. `run` runs the whole loop; `begin` and `period` run it step by step. Steps count
-    from the knot at which the run begins; disturbances and controller are given those of the whole plan.
+    All trials are advanced together. `run` runs the whole loop, `period` one step. Steps count from the knot at
+    which the run begins; disturbances and controller are given those of the whole plan.
 
     Attributes:
       starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
         which they begin. Both are for `simulate_from`.
       active_disturbances: the disturbances, each `Noise` as a StateNoise.
       law: the controller, by default the plan's policy.
-      full_trajectory: the plan's trajectory from its own first knot on. trajectory: the same from the knot on.
       remaining_plan: the plan of the run, the given one or else the controller's own, from the knot on.
+      trajectory: its trajectory.
       state_coordinates, control_coordinates: those of the controller, with limits within the robot's limits.
       step: number of the next control period. measured: (K, n), the measured states at its beginning.
       controller_run: the run of the controller.
@@ -243,7 +247,7 @@ class ClosedLoop:
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
         self.state_coordinates, self.control_coordinates = _coordinates_of(self.law, plan, plant)
-        self.full_trajectory = full = plan.trajectory
+        full = plan.trajectory
         if self.knot >= full.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {full.steps - 1}, before the plan's end")
         self.remaining_plan = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
@@ -276,41 +280,36 @@ class ClosedLoop:
         self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._limits = space.names, space.limits
-        self.step, self.measured = 0, self.states
         sensors = self.law.sensors
         self._readings: Readings | BeliefReadings | None = None
         if isinstance(sensors, Belief):
-            self._readings = BeliefReadings(sensors, self.effects)
+            self._readings = BeliefReadings(sensors, self.effects, self.knot)
         elif sensors is not None:
-            self._readings = Readings(sensors, self.effects, self.physics, dt)
+            self._readings = Readings(sensors, self.effects, self.physics, full, self.knot)
+        self._follow(full)
+        self.step, self.measured = 0, self.measure(0)
 
-    def run(self) -> Rollout:
-        """Run all control periods; fewer if all trials have ended. Then maybe another loop: see `_undisturbed`."""
-        steps = self.trajectory.steps
-        with unlogged():
-            self.begin()
-            while self.step < steps and self.period():
-                if self.progress is not None:
-                    self.progress(self.step, steps)
-            self.detect_contacts_at_end()
-        return self.rollout(undisturbed=self._undisturbed())
-
-    def begin(self) -> None:
-        """Let disturbances and controller follow the plan to the first knot, and measure the states there."""
+    def _follow(self, plan: Trajectory) -> None:
+        """Let disturbances and controller follow the plan to the knot at which the run begins."""
         for step in range(self.knot):
-            states = np.tile(self.full_trajectory.states[step], (self.trials, 1))
-            controls = np.tile(self.full_trajectory.controls[step], (self.trials, 1))
+            states, controls = (np.tile(rows[step], (self.trials, 1)) for rows in (plan.states, plan.controls))
             self.effects.follow(step, states, controls)
-            observed = states
-            if self._readings is not None:
-                observed = self._readings.arriving(step, states, states, self._held(step), planned=True)
+            observed = states if self._readings is None else self._readings.arriving(step, states, states)
             try:
                 self.controller_run.control(step, observed)
             except Exception as error:
                 failed = dict.fromkeys(range(self.trials), format_error(error))
                 self.records.end(self.records.failed_since, 0, "controller", failed)
                 break
-        self.step, self.measured = 0, self.measure(0)
+
+    def run(self) -> None:
+        """Run all control periods; fewer if all trials have ended."""
+        steps = self.trajectory.steps
+        with unlogged():
+            while self.step < steps and self.period():
+                if self.progress is not None:
+                    self.progress(self.step, steps)
+            self.detect_contacts_at_end()
 
     def period(self) -> bool:
         """Run one control period, up to the measurement at its end. Returns False if all trials have ended."""
@@ -338,8 +337,7 @@ class ClosedLoop:
         shape = self.trials, len(self._names)
         observed, knot = measured, self.knot + step
         if self._readings is not None:
-            held = None if step else self._held(knot)
-            observed = self._readings.arriving(knot, self.states, measured, held, planned=False)
+            observed = self._readings.arriving(knot, self.states, measured)
         try:
             commands = shaped("commands", self.controller_run.control(knot, observed), shape)
             failed = _not_finite(commands)
@@ -356,10 +354,6 @@ class ClosedLoop:
         records.end(records.failed_since, step, "controller", reasons)
         records.commanded[:, step] = commands
         return np.where(failed[:, None], self.trajectory.controls[step], commands)
-
-    def _held(self, knot: int) -> Array:
-        """The plan's controls (K, m) of the period before a knot; at the first knot those of its first period."""
-        return np.tile(self.full_trajectory.controls[max(knot - 1, 0)], (self.trials, 1))
 
     def actuate(self, step: int, commands: Array) -> Array:
         """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""
@@ -424,14 +418,14 @@ class ClosedLoop:
             twin.records.end(twin.records.failed_since, self.step, "controller", reasons)
         return twin.rollout()
 
-    def _undisturbed(self) -> Array | None:
+    def undisturbed(self) -> Array | None:
         """States (T+1, n) of the plan's own policy without disturbances, NaN once that run has ended; None if unknown.
 
         A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
         plant repeats, there is a further run; the plant remembers it until another plan runs there.
         """
         plant, plan, records = self.plant, self.remaining_plan, self.records
-        if self.starts is not None or self.moving is not None:
+        if self.moving is not None:
             return None
         if not self.active_disturbances and self.law.digest == plan.policy.digest:
             records.turn_to_plan(self.state_coordinates)
@@ -441,11 +435,11 @@ class ClosedLoop:
             return None
         which = plan.policy.digest, plan.trajectory.states.tobytes()
         if plant.ran is None or plant.ran[:2] != which:
-            alone = ClosedLoop(
-                plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1,
+            alone = simulate(
+                plant, plan, controller=plan.policy, frames=False, threads=1,
                 goal_radius=self.goal_radius, goal_tolerance=self.goal_tolerance,
             )  # fmt: skip
-            plant.ran = (*which, alone.run().undisturbed)
+            plant.ran = (*which, alone.undisturbed)
         return plant.ran[2]
 
     def rollout(self, *, undisturbed: Array | None = None) -> Rollout:

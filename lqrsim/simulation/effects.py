@@ -135,25 +135,28 @@ class Effects:
 class Readings:
     """What a controller reads of the sensors of an MJCF in K trials, with errors, rates and delays.
 
-    A number is NaN where no reading of its sensor arrives, or it got lost.
+    A number is NaN where no reading of its sensor arrives, or it got lost. The run begins at the plan's knot `first`.
     """
 
-    def __init__(self, sensors: RobotSensors, effects: Effects, physics: AnyPhysics, dt: float) -> None:
+    def __init__(
+        self, sensors: RobotSensors, effects: Effects, physics: AnyPhysics, plan: Trajectory, first: int
+    ) -> None:
         if not isinstance(physics, MujocoPhysics):
             raise InputError("controller: got one that reads sensors of the MJCF, want a plant moved by MuJoCo")
-        self._sensors, self._effects, self._physics, self._dt = sensors, effects, physics, dt
-        self._late, self._readings = sensors.delay_periods(dt), dict[int, Array]()
+        self._sensors, self._effects, self._physics, self._plan = sensors, effects, physics, plan
+        self._first, self._late, self._readings = first, sensors.delay_periods(plan.dt), dict[int, Array]()
 
-    def arriving(self, step: int, states: Array, measured: Array, held: Array | None, planned: bool) -> Array:
-        """The readings (K, Y) that arrive at a knot, under the controls `held` (K, m), or those that act already.
+    def arriving(self, step: int, states: Array, measured: Array) -> Array:
+        """The readings (K, Y) that arrive at a knot; those before the run begins are exact.
 
-        Those of `planned` states, before the run begins, are exact.
+        They are taken under the last controls. Up to the first knot of the run these are the plan's.
         """
-        sensors = self._sensors
-        if planned and held is not None:
+        sensors, planned = self._sensors, step < self._first
+        held = np.tile(self._plan.controls[max(step - 1, 0)], (len(states), 1))
+        if planned:
             exact = np.repeat(sensors.reader()(states[:1], held[:1], np.zeros((1, 6))), len(states), axis=0)
         else:
-            exact = sensors.readings(self._physics.sense(held))
+            exact = sensors.readings(self._physics.sense(held if step == self._first else None))
         pairs = zip(sensors.sensors, sensors.columns, strict=True)
         named = self._effects.read(step, {sensor.name: exact[:, at] for sensor, at in pairs})
         noisy = np.concatenate([named[sensor.name] for sensor in sensors.sensors], axis=1)
@@ -161,7 +164,7 @@ class Readings:
         self._readings.pop(step - max(self._late) - 1, None)
         out = np.full(readings.shape, np.nan)
         for i, (at, late) in enumerate(zip(sensors.columns, self._late, strict=True)):
-            if step - late in self._readings and sensors.due(step - late, self._dt)[i]:
+            if step - late in self._readings and sensors.due(step - late, self._plan.dt)[i]:
                 out[:, at] = self._readings[step - late][:, at]
         return out
 
@@ -169,20 +172,20 @@ class Readings:
 class BeliefReadings:
     """The readings of K trials by the formulas of a belief, in the true states, followed by the states that it knows.
 
-    `ReadingErrors` adds the noise of the readings.
+    `ReadingErrors` adds the noise of the readings. The run begins at the plan's knot `first`.
     """
 
-    def __init__(self, belief: Belief, effects: Effects) -> None:
-        self.belief, self._effects, self._readings = belief, effects, list[Array]()
+    def __init__(self, belief: Belief, effects: Effects, first: int) -> None:
+        self.belief, self._effects, self._first, self._readings = belief, effects, first, list[Array]()
 
-    def arriving(self, step: int, states: Array, measured: Array, held: Array | None, planned: bool) -> Array:
+    def arriving(self, step: int, states: Array, measured: Array) -> Array:
         """The readings (K, Y) that arrive in the true states (K, n), NaN for lost ones; and measured known states.
 
-        Those of `planned` states, before the run begins, are exact.
+        Those before the run begins are exact.
         """
         exact, deviations = self.belief.read(states)
         noisy = self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS]
-        self._readings.append(exact if planned else noisy)
+        self._readings.append(exact if step < self._first else noisy)
         arrived = len(self._readings) > self.belief.sensors.delay
         arriving = self._readings.pop(0) if arrived else np.full_like(exact, np.nan)
         return np.hstack([arriving, measured[:, self.belief.known]])
