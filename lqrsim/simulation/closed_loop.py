@@ -277,7 +277,7 @@ class ClosedLoop:
         self.records = Records(self.trajectory, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
-        self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
+        self.collisions = Collisions(self.physics, self.effects.displaced, dt, passing)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._limits = space.names, space.limits
         sensors = self.law.sensors
@@ -379,21 +379,12 @@ class ClosedLoop:
         end. MuJoCo computes contacts at the beginning of a physics step, so those at the end of a period, after a kick,
         too, are detected in the next one; at the last knot by `detect_contacts_at_end`.
         """
-        physics, over = self.physics, self.records.over(step)
-        period = physics.advance(controls, wrench, wind)
-        kick = self.effects.kick(self.knot + step, self.states, controls)
-        if kick is not None:
-            physics.kick(period, kick)
-        collided = self.collisions.detect(step, period, ignored=over)
-        if isinstance(physics, MujocoPhysics) and physics.solidifies:
-            if len(collided):
-                physics.rerun_with_contacts(collided, period)
-                if kick is not None:
-                    physics.kick(period, kick, collided)
-                self.collisions.relocate(period.states[-1])
-            self.records.contacts += physics.touched(period) & ~over
+        physics, records, watch = self.physics, self.records, self.watch
+        over, kick = records.over(step), self.effects.kick(self.knot + step, self.states, controls)
+        period = physics.advance(controls, wrench, wind, kick)
+        self.collisions.detect(step, period, ignored=over)
+        records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]
-        records, watch = self.records, self.watch
         for frame in physics.drawn(period) if self.frames else ():
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
             records.frames.append(frame)
@@ -402,12 +393,7 @@ class ClosedLoop:
 
     def detect_contacts_at_end(self) -> None:
         """Detect contacts at the last knot, which no period follows."""
-        if not (isinstance(self.physics, MujocoPhysics) and self.physics.senses_contacts):
-            return
-        plan, touching = self.trajectory, self.physics.touching_now()
-        never_lost = self.records.lost_since > plan.steps
-        for row in np.flatnonzero(touching.any(axis=1) & np.isinf(self.collisions.at) & never_lost):
-            self.collisions.touch(int(row), plan.horizon, touching[row])
+        self.collisions.detect_at_end(self.trajectory.horizon, ignored=self.records.lost_since <= self.trajectory.steps)
 
     def so_far(self) -> Rollout:
         """A Rollout of the records so far, as if the controller had failed now. The loop can continue."""

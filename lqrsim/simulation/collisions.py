@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.problem.collision_shape import ShapeInWorld
-from lqrsim.simulation.physics import Period
-from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, Period
 
 FINEST = 0.02  # smallest step along a line, relative to the radius; a larger clearance is itself the step
 MOST_STEPS = 1000  # along a line
@@ -27,40 +26,47 @@ class Collisions:
       clearance: (K,) current signed distance to the nearest obstacle, minus the radius, in metres.
     """
 
-    def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float, passing: ShapeInWorld | None) -> None:
-        self.plant, self.shape, self.dt, self._passing = plant, plant.shape, dt, passing
+    def __init__(self, physics: AnyPhysics, displaced: Array, dt: float, passing: ShapeInWorld | None) -> None:
+        self._physics, self.plant, self.shape, self.dt = physics, physics.plant, physics.plant.shape, dt
+        self._passing = passing
         moving = () if passing is None else passing.world.obstacles
         self._velocities = np.array([obstacle.velocity for obstacle in moving]).reshape(-1, 3)
         self._fastest = float(np.linalg.norm(self._velocities, axis=1).max(initial=0.0))
-        self._displaced, self._any_displaced = plant.shape.across(displaced), bool(displaced.any())
-        self.at = np.full(len(states), np.inf)
-        self.obstacles = [""] * len(states)
+        self._displaced, self._any_displaced = self.shape.across(displaced), bool(displaced.any())
+        self.at = np.full(len(displaced), np.inf)
+        self.obstacles = [""] * len(displaced)
         self._time = 0.0  # of the last places, in s
-        self.relocate(states)
+        self._relocate(physics.state())
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._places[row])
 
-    def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-        """The rows of the trials that first collide in a period; those `ignored` (K,) have ended before."""
+    def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> None:
+        """Find trials, except `ignored` ones (K,), that first collide in a period; obstacles may stop them in it."""
         begun, parts = self.at.copy(), len(period.states)
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
             running = np.isinf(self.at) & ~ignored & (part < period.stable)
-            start = (step + part / parts) * self.dt
-            for row in np.flatnonzero(running & touching.any(axis=1)):
-                self.touch(int(row), start, touching[row])
+            self._touch((step + part / parts) * self.dt, touching, running)
             if len(self.plant.world) or len(self._velocities):
                 self._search_line(step, part, parts, self.shape.places(states), running)
         rows = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # Rounding may put a time in the period past the period's end.
         self.at[rows] = np.minimum(self.at[rows], (step + 1) * self.dt)
-        return rows
+        if len(rows) and isinstance(self._physics, MujocoPhysics) and self._physics.solidifies:
+            self._physics.rerun_with_contacts(rows, period)
+            self._relocate(period.states[-1])
 
-    def touch(self, row: int, time: float, touching: npt.NDArray[np.bool_]) -> None:
-        """Record a contact that MuJoCo detected, with these obstacles (obstacles,)."""
-        self.at[row] = time
-        self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching))]
+    def detect_at_end(self, time: float, *, ignored: npt.NDArray[np.bool_]) -> None:
+        """Detect contacts at the last knot, which no period follows."""
+        if isinstance(self._physics, MujocoPhysics) and self._physics.senses_contacts:
+            self._touch(time, self._physics.touching_now(), np.isinf(self.at) & ~ignored)
 
-    def relocate(self, states: Array) -> None:
+    def _touch(self, time: float, touching: npt.NDArray[np.bool_], running: npt.NDArray[np.bool_]) -> None:
+        """Record contacts that MuJoCo detected, (K, obstacles), in the `running` trials (K,)."""
+        for row in np.flatnonzero(running & touching.any(axis=1)):
+            self.at[row] = time
+            self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching[row]))]
+
+    def _relocate(self, states: Array) -> None:
         """Replace the current states, as after obstacles have stopped some of the trials."""
         self._places = self.shape.places(states)
         self.clearance = self._clear(self._places, self._time)

@@ -42,19 +42,25 @@ class Physics(abc.ABC):
 
     Attributes:
       parts: S, parts of a control period. drawn_parts: number of parts that end with a frame to draw.
-      unstable: (K,) whether a simulation has become unstable.
+      unstable: (K,) whether a simulation has become unstable. solid: (K,) whether its obstacles are solid.
       warnings: (K, 7) number of MuJoCo's warnings of each kind, as in a `Rollout`.
     """
 
-    def __init__(self, plant: Plant, trials: int, substeps: int, part: int) -> None:
-        self.plant, self._part, self.parts = plant, part, substeps // part
-        self._every = steps_per_frame(plant, substeps) // part
-        self.drawn_parts = self.parts // self._every
+    def __init__(self, plant: Plant, trials: int, substeps: int, *, each_step: bool = False) -> None:
+        per_frame = steps_per_frame(plant, substeps)
+        self.plant, self._part = plant, 1 if each_step else per_frame
+        self.parts, self.drawn_parts = substeps // self._part, substeps // per_frame
+        self._every = self.parts // self.drawn_parts
         self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
+        self.solid: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
         self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
 
     def drawn(self, period: Period) -> list[Array]:
         return period.frames[self._every - 1 :: self._every]
+
+    def touched(self, period: Period) -> npt.NDArray[np.bool_]:
+        """Whether each trial with solid obstacles touched one, (K,)."""
+        return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
     @abc.abstractmethod
     def state(self) -> Array: ...
@@ -64,8 +70,11 @@ class Physics(abc.ABC):
     def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
         """Advance some or all simulations by a part of a period; returns the contacts, as in `Period.touching`."""
 
-    def _run(self, rows: npt.NDArray[np.intp] | None = None) -> Period:
-        """Advance some or all simulations by a period."""
+    @abc.abstractmethod
+    def _kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None) -> None: ...
+
+    def _run(self, jumps: Array | None, rows: npt.NDArray[np.intp] | None = None) -> Period:
+        """Advance some or all simulations by a period, and let their states jump at its end."""
         period = Period([], [], [], np.full(len(self.unstable), self.parts))
         for part in range(self.parts):
             touching = self._step(rows)
@@ -74,6 +83,8 @@ class Physics(abc.ABC):
             period.states.append(self.state())
             period.frames.append(self.frame())
             period.touching.append(touching)
+        if jumps is not None:
+            self._kick(period, jumps, rows)
         return period
 
 
@@ -84,14 +95,14 @@ class MujocoPhysics(Physics):
     clearance above 0, contacts are sensed without a force.
 
     Attributes:
-      simulations: MuJoCo's simulations. solid: (K,) whether the obstacles of each are solid.
+      simulations: MuJoCo's simulations.
       senses_contacts: whether contacts are sensed without a force. solidifies: whether obstacles may become solid.
     """
 
     def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
         self.senses_contacts, self.solidifies = not plant.enclosed, contacts
         # Contacts are sensed at each step.
-        super().__init__(plant, trials, substeps, 1 if self.senses_contacts else steps_per_frame(plant, substeps))
+        super().__init__(plant, trials, substeps, each_step=self.senses_contacts)
         sensing = contacts or self.senses_contacts
         model = plant.model if sensing else plant.without_contacts
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
@@ -102,7 +113,6 @@ class MujocoPhysics(Physics):
         # Velocity of the medium, to which winds are added.
         self._medium = self.simulations.expand("opt.wind") if plant.has_medium else None
         self._in_qpos, self._in_qvel, self._in_ctrl = map(_span, (plant.qpos, plant.qvel, plant.ctrl))
-        self.solid = np.zeros(trials, dtype=bool)
         self._before = self.simulations.state
         self._inactive: list[tuple[Array, npt.NDArray[np.intp], Array]] = []
         self._quaternions = _quaternions(plant)
@@ -183,18 +193,18 @@ class MujocoPhysics(Physics):
         self.simulations.state[:] = before
         return readings.copy()
 
-    def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
-        """Run one control period with controls (K, m), forces and torques (K, 6), and the wind (K, 3)."""
+    def advance(self, controls: Array, wrench: Array, wind: Array, jumps: Array | None) -> Period:
+        """Run a control period with controls (K, m), forces and torques (K, 6), wind (K, 3), and jumps (K, n)."""
         self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench
         if self._medium is not None:
             self._medium[:] = self.plant.model.opt.wind + wind
         if self.solidifies:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
-            self._had_warned = self.warnings.copy()
-        return self._run()
+            self._had_warned, self._jumps = self.warnings.copy(), jumps
+        return self._run(jumps)
 
-    def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
+    def _kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None) -> None:
         """Let the states of some or all trials jump by (K, n) at the end of a period.
 
         MuJoCo's positions that are not in the state, such as the wheels' angles or a small tilt, do not change.
@@ -221,16 +231,12 @@ class MujocoPhysics(Physics):
         if self.senses_contacts:
             self.simulations.set_const(rows)
         self.solid[rows] = True
-        again = self._run(rows)
+        again = self._run(self._jumps, rows)
         for part in range(self.parts):
             period.states[part][rows] = again.states[part][rows]
             period.frames[part][rows] = again.frames[part][rows]
             period.touching[part][rows] = again.touching[part][rows]  # the others' are those of their own period
         period.stable[rows] = again.stable[rows]
-
-    def touched(self, period: Period) -> npt.NDArray[np.bool_]:
-        """Whether each trial with solid obstacles touched one, (K,)."""
-        return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
     def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
         try:
@@ -252,7 +258,7 @@ class SimulatorPhysics(Physics):
     """The physics of a plant with a `Simulator`. Robots pass through obstacles; frames show them in their states."""
 
     def __init__(self, plant: Plant, simulator: Simulator, trials: int, substeps: int) -> None:
-        super().__init__(plant, trials, substeps, steps_per_frame(plant, substeps))
+        super().__init__(plant, trials, substeps)
         self._simulator, self._factors = simulator, dict[str, Array]()
 
     def place(self, states: Array) -> None:
@@ -289,16 +295,16 @@ class SimulatorPhysics(Physics):
         frames[np.ix_(known, plant.qpos)] = plant.robot.configuration(self._states[known])[0]
         return frames
 
-    def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
+    def advance(self, controls: Array, wrench: Array, wind: Array, jumps: Array | None) -> Period:
         self._inputs = controls, wrench, wind
-        return self._run()
+        return self._run(jumps)
 
     def _step(self, rows: npt.NDArray[np.intp] | None) -> npt.NDArray[np.bool_]:
         self._simulator.step(self._simulations, *self._inputs, self._part)
         self._read_states()
         return np.zeros((len(self._states), len(self.plant.obstacles)), dtype=bool)
 
-    def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
+    def _kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None) -> None:
         self._simulator.place(self._simulations, self._states + jumps)
         self._read_states()
         period.states[-1], period.frames[-1] = self.state(), self.frame()
