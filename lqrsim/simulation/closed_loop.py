@@ -7,7 +7,7 @@ applies the disturbances, `physics.py` advances the physics, and `collisions.py`
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -154,9 +154,9 @@ class Records:
         if lost.any():
             self.lost_since[lost] = np.minimum(self.lost_since[lost], step)
 
-    def end(self, since: npt.NDArray[np.int64], step: int, who: str, reasons: Mapping[int, str]) -> None:
-        """Record in `lost_since` or `failed_since` that trials end, row -> reason, unless they have ended before."""
-        over = self.over(step)
+    def end(self, step: int, who: Literal["controller", "filter", "disturbances"], reasons: Mapping[int, str]) -> None:
+        """Record that trials end, row -> reason, unless they have before; where it is the controller, they failed."""
+        over, since = self.over(step), self.failed_since if who == "controller" else self.lost_since
         for row, reason in reasons.items():
             if not over[row]:
                 since[row] = step
@@ -298,8 +298,7 @@ class ClosedLoop:
             try:
                 self.controller_run.control(step, observed)
             except Exception as error:
-                failed = dict.fromkeys(range(self.trials), format_error(error))
-                self.records.end(self.records.failed_since, 0, "controller", failed)
+                self.records.end(0, "controller", dict.fromkeys(range(self.trials), format_error(error)))
                 break
 
     def run(self) -> None:
@@ -349,10 +348,9 @@ class ClosedLoop:
         except Exception as error:  # a controller may raise anything; its trials have failed
             commands, failed = np.zeros(shape), np.ones(len(measured), dtype=bool)
             reasons = dict.fromkeys(range(len(measured)), format_error(error))
-        records = self.records
-        records.end(records.lost_since, step, "filter", self.controller_run.estimator_diverged())
-        records.end(records.failed_since, step, "controller", reasons)
-        records.commanded[:, step] = commands
+        self.records.end(step, "filter", self.controller_run.estimator_diverged())
+        self.records.end(step, "controller", reasons)
+        self.records.commanded[:, step] = commands
         return np.where(failed[:, None], self.trajectory.controls[step], commands)
 
     def actuate(self, step: int, commands: Array) -> Array:
@@ -368,7 +366,7 @@ class ClosedLoop:
         lost = _not_finite(wrench) | _not_finite(wind)
         if lost.any():  # MuJoCo would let such a robot stand still, without a warning
             reasons = dict.fromkeys(np.flatnonzero(lost).tolist(), "got a force, torque or wind that is not finite")
-            self.records.end(self.records.lost_since, step, "disturbances", reasons)
+            self.records.end(step, "disturbances", reasons)
             wrench[lost], wind[lost] = 0.0, 0.0
         return wrench, wind
 
@@ -400,8 +398,7 @@ class ClosedLoop:
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
         if self.step < self.trajectory.steps:
-            reasons = dict.fromkeys(range(self.trials), "went no further")
-            twin.records.end(twin.records.failed_since, self.step, "controller", reasons)
+            twin.records.end(self.step, "controller", dict.fromkeys(range(self.trials), "went no further"))
         return twin.rollout()
 
     def undisturbed(self) -> Array | None:
