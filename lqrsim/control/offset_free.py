@@ -44,7 +44,7 @@ MUCH_WORSE = 0.1
 # actuators, as in `PlanModel.assumed`.
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
 WIDEST = 1.25  # the largest width of the chosen tube with the lag, relative to the narrowest of all designs
-UNSTABLE = (1.0, 1e30, 1.0)  # the `Predictions` for a loop whose moments are not finite
+WORST = (1.0, 1e30, 1.0)  # the `Predictions` for a loop whose moments are not finite
 
 
 class OffsetFree(Controller):
@@ -274,7 +274,7 @@ def robust_to_lag(
         for moment in moments:
             moment[lost] = 0.0
         finite = Predictions.of(solution, surroundings, norm, moments)
-        return Predictions(*(np.where(lost, worst, value) for worst, value in zip(UNSTABLE, finite, strict=True)))
+        return Predictions(*(np.where(lost, worst, value) for worst, value in zip(WORST, finite, strict=True)))
 
     outcomes = predicted(design)
     scores = outcomes.scores(narrowest(norm, stated.plan, outcomes.width[0]))

@@ -105,7 +105,7 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
 INEXACT = 0.02
 # The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
 # is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
-HELD = 0.3
+STALE = 0.3
 # Step of a parameter for differences, relative to its value if that is larger than 1; and the largest relative to a
 # small value, such as a moment of inertia of 1e-5 kg m^2, unless the step is then one of rounding.
 STEP, OF_SMALL, LEAST_STEP = 1e-5, 1e-3, 1e-10
@@ -392,7 +392,7 @@ class PlanModel:
         stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
         steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss
         control = per_entry("Uncertainty: control", stated.control, controls)
-        control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
+        control = np.hypot(control, np.sqrt(lost * (1 - lost)) * STALE * effort)  # the filter expects the mean
         error = per_entry("Uncertainty: model_error", stated.model_error, space)
         behind = zip(controls.names, bypass * Lag.of(stated.lag, self.plan.dt).mean * effort, strict=True)
         directly = [Unknown(OFFSET + name, float(std), time_constant=0.0) for name, std in behind if std]

@@ -28,10 +28,11 @@ from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, steps_per_frame
-from lqrsim.simulation.plant import MOST_STEPS, Plant
+from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.versions import versions
 
+MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
 Watch = Annotated[
     Callable[[float, Array, npt.NDArray[np.bool_]], object],
     Want("a function of the time, MuJoCo's qpos and which trials are unstable"),

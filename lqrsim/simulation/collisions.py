@@ -15,7 +15,7 @@ from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, Period
 
 FINEST = 0.02  # smallest step along a line, relative to the radius; a larger clearance is itself the step
-MOST_STEPS = 1000  # along a line
+MOST_POINTS = 1000  # that are checked along a line
 
 
 class Collisions:
@@ -82,7 +82,7 @@ class Collisions:
         rows = rows[np.isfinite(length[rows])]
         if not len(rows):
             return
-        finest = np.maximum(FINEST * float(self.shape.radii.min()), length[rows] / MOST_STEPS)
+        finest = np.maximum(FINEST * float(self.shape.radii.min()), length[rows] / MOST_POINTS)
         travelled, clear = np.zeros(len(rows)), before[rows]
         searching = np.ones(len(rows), dtype=bool)
         while searching.any():

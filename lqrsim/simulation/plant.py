@@ -31,7 +31,6 @@ from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator
 
-MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
 MOST_SUBSTEPS = 20_000  # physics steps in a control period
 
 
