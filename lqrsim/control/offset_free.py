@@ -179,6 +179,7 @@ class OffsetFree(Controller):
 
     @property
     def sensors(self) -> RobotSensors | None:
+        """The sensors of the MJCF; None for measured states, of which `options` says which."""
         return None if self._sensing is None else self._sensing.sensors
 
     def _check_in_advance(self, what: str) -> None:
@@ -201,7 +202,7 @@ class OffsetFree(Controller):
         stated.check(self.problem.dynamics)
         truth = self.model.under(stated.steady(np.inf))
         offset = self.offset - self.solution.trajectory.controls
-        offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
+        offset = offset + np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, self.coordinates[1].limits, self.model)
 
     @property
@@ -217,7 +218,7 @@ class OffsetFree(Controller):
     @property
     def digest(self) -> str:
         model, limits = self.model, np.array(self.coordinates[1].limits)
-        parts = (self.gain, self.offset, self._law.nominal, self.filter.gain, model.output, model.transition, limits)
+        parts = (self.gain, self.offset, self.nominal, self.filter.gain, model.output, model.transition, limits)
         uncertainty = self.uncertainty
         numbers = np.array(
             [model.plan.dt, model.uncertainty.lag, uncertainty.latency, uncertainty.delay, uncertainty.command_loss]

@@ -247,7 +247,7 @@ class ClosedLoop:
         self.active_disturbances = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
-        self.state_coordinates, self.control_coordinates = _coordinates_of(self.law, plan, plant)
+        self.state_coordinates, self.control_coordinates = _check_controller(self.law, plan, plant)
         full = plan.trajectory
         if self.knot >= full.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {full.steps - 1}, before the plan's end")
@@ -469,8 +469,8 @@ def _not_finite(rows: Array) -> Mask:
     return ~np.all(finite, axis=1)
 
 
-def _coordinates_of(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
-    """The coordinates of the controller's states and controls, which have to match the plant's, as has the plan."""
+def _check_controller(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
+    """The coordinates of the controller's states and controls; InputError unless they and the plan fit the robot's."""
     dynamics, kind = plant.robot.dynamics, type(controller).__name__
     check_string(f"{kind}.digest", controller.digest, LINE)
     wanted_kind = "Coordinates of states and of controls"
