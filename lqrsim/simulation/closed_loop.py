@@ -382,7 +382,8 @@ class ClosedLoop:
         over, kick = records.over(step), self.effects.kick(self.knot + step, self.states, controls)
         period = physics.advance(controls, wrench, wind, kick)
         self.collisions.detect(step, period, ignored=over)
-        records.contacts += physics.touched(period) & ~over
+        if physics.solid.any():
+            records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]
         for frame in physics.drawn(period) if self.frames else ():
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
