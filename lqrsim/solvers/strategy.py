@@ -1,6 +1,6 @@
 """The attempts of `smooth`, in order, until one converges.
 
-`Search.make_attempts` says what is tried in which order, and each attempt when it is called for. Loops around these
+`Search.make_attempts` and `Search.choose_start` say what is tried in which order, and when. Loops around these
 (`solve`) find a free duration (`free_duration.py`), put right what a plan does between its knots (`between_knots.py`),
 and leave the last command out of a plan with a `control_rate` (`control_rates.py`).
 
@@ -267,8 +267,9 @@ class Search:
         )  # fmt: skip
         self._callback, self._threads = self._budget.stop.callback, self._budget.stop.threads
         self._solving = self._threads if len(named) == 1 else 1
+        self._exact = first.second_order  # as all runs of the search
         self._guided = multistart.path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
-        self._default = self._settings.start is None and self._settings.starts is None
+        self._default = self._settings.start is None and self._settings.starts is None  # not by the caller's choice
         self.tried = not self._settings.safeguard  # whether other starts were tried, as far as they are to be
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._unmoved_of: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
@@ -294,20 +295,31 @@ class Search:
         with self._problem.dynamics.solving(self._solving):
             if trees and self.may_go_on and self.is_barred:
                 self.grow_trees()
-            self.try_detours()
-            self.leave_saddles()
-        self.push_and_approach()
-        self.retry_without_risk()
-        self.soften_contacts()
-        self.keep_given()
-        self.alternate_softness()
-        self.leave_contact_modes()
+            if self._settings.start is None and self._exact and not self._guided and self.touches_passable:
+                self.try_detours()
+            self.leave_saddles()  # while the best plan is one
+        if self._default and self.may_go_on and self._unmoved():
+            self.push_and_approach()
+        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
+        if self._problem.risk > 0 and too_high and self.may_go_on:
+            self.retry_without_risk()
+        alone = self._best_nearer is not None and not self._comes_nearer(self.best[1])  # the best leaves a body alone
+        if self._default and self.may_go_on and (alone or not self.best[1].success):
+            self.soften_contacts()
+        if self._given is not None:
+            self.keep_given(self._given)
+        if not self.best[1].success and self.may_go_on:
+            self.alternate_softness()
+        if not self.best[1].success and self.has_cheaper_beside and self.may_go_on:
+            self.leave_contact_modes()
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         with self._problem.dynamics.solving(self._solving):
             self.finish_promising()
-            self.try_finite()
+            lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
+            if lost and self._problem.start is not None and not self._budget.stop.due:
+                self.try_finite()
             if self.needs_others and self.is_barred:
                 self.try_past_constraints()
             if self.needs_others and self._guided:
@@ -320,10 +332,16 @@ class Search:
 
     def finish_promising(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
+        problem = self._problem
         chosen, *others = choose([run for _, run in self._named], self._threads)
-        chosen = self._smooth_or_follow_a_line(chosen)
+        driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
+        known = problem.start is not None and problem.goal is not None
+        # Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
+        plain = not problem.constraints and self._default and not self._exact
+        if driven and known and plain and self._settings.safeguard:
+            chosen = self._smooth_or_follow_a_line(chosen)
         self._offer(chosen, self._finish(chosen))
-        if not chosen.problem.constraints:
+        if not problem.constraints:
             return
         # Constraints can make the best route the worst, or close it. The costs of the other runs so far, without
         # constraints, are approximate lower bounds on their costs with constraints.
@@ -337,32 +355,21 @@ class Search:
         """If smoothing fails for an arm, say, whose every joint has a motor, the run from a line of states, if cheaper.
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
-        Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
         """
-        problem = self._problem
-        driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
-        known = problem.start is not None and problem.goal is not None
-        plain = not problem.constraints and self._default and not self._named[0][1].second_order
-        if not (driven and known and plain and self._settings.safeguard):
-            return run
         run.budget.report_to(self._callback)
         run.smooth(self._settings.max_iterations)
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
         if run.ending.success or run.ending.status in unfinished or self._budget.stop.due:
             return run
-        line = self._add(resolve(line_of_states(problem), problem), "a line of states")
+        line = self._add(resolve(line_of_states(self._problem), self._problem), "a line of states")
         line.budget.report_to(self._callback)
         line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
 
     def try_finite(self) -> None:
         """Where states leave their domain, try constant controls under which they do not, and a line of states."""
-        problem, exact, best = self._problem, self.best[0].second_order, self.best[1]
-        lost = not np.isfinite(best.cost) and best.status is not Status.RISK_TOO_HIGH
-        if not lost or problem.start is None or self._budget.stop.due:
-            return
         self._known.from_start = False
-        work, plans = self.best[0].work, list[tuple[float, float, Array]]()
+        problem, work, plans = self._problem, self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in multistart.constant_controls(problem):
             missed = float(f"{work.violation(work.constraint_values(plan)):.2g}")
             cost = compiled.cost_of(problem, *plan)
@@ -372,9 +379,8 @@ class Search:
             self._try(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
             if self.best[1].success or self._budget.stop.due:
                 return
-        if np.isfinite(self.best[1].cost) or not exact:
-            return
-        self._try("a line of states", line_of_states(problem), from_states)
+        if self._exact and not np.isfinite(self.best[1].cost):
+            self._try("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
@@ -399,10 +405,10 @@ class Search:
 
     def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
-        problem, exact = self._problem, self.best[0].second_order
-        if exact:
+        problem = self._problem
+        if self._exact:
             self._follow_ways()
-        motions = dict[str, StartLike](self._motions()) if exact and not self.best[1].success else {}
+        motions = dict[str, StartLike](self._motions()) if self._exact and not self.best[1].success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
             if self._budget.stop.due or self.best[1].success:
@@ -410,7 +416,7 @@ class Search:
             self._known.from_start = False
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
-            self._try(name, start, finish if exact and name in sways else refine)
+            self._try(name, start, finish if self._exact and name in sways else refine)
         self.tried = not self._budget.stop.due
 
     def _follow_ways(self) -> None:
@@ -425,7 +431,7 @@ class Search:
     @property
     def is_barred(self) -> bool:
         """Whether no plan keeps the constraints, some of which may be passed on one side or another."""
-        return self.is_poor and self.best[0].second_order and self.is_without_plan and any(passable(self._problem))
+        return self.is_poor and self._exact and self.is_without_plan and any(passable(self._problem))
 
     def try_past_constraints(self) -> None:
         """Plan without the constraints that may be passed on one side or another.
@@ -485,15 +491,16 @@ class Search:
         self._offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._budget.stop.due
 
+    @property
+    def touches_passable(self) -> bool:
+        """Whether the best plan touches a constraint that may be passed on another side."""
+        touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
+        return any(multipliers.values.any() for multipliers in touched)
+
     def try_detours(self) -> None:
-        """Finish plans from paths to the sides, if the best touches a constraint that may be passed on another side."""
-        problem, tried = self._problem, {name for name, _ in self._named}
-        if self._settings.start is not None or not self.best[0].second_order or self._guided:
-            return
-        touched = itertools.compress(self.best[1].multipliers, passable(problem))
-        if not any(multipliers.values.any() for multipliers in touched):
-            return
-        for name, trajectory in multistart.detours(problem, self._settings.starts).items():
+        """Finish plans from paths to the sides."""
+        tried = {name for name, _ in self._named}
+        for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
             if name not in tried and not self._budget.stop.due:
                 self._try(name, trajectory)
 
@@ -549,8 +556,6 @@ class Search:
         """Begin with motions that change states that miss their goal and that no control changes, as of a box: pushes
         by one control at a time, and approaches to a body that nothing touches.
         """
-        if not (self._default and self.may_go_on and self._unmoved()):
-            return
         problem, before, places = self._problem, self.best[1], self._unmoved()
         self._still = before, places
         plans = list[tuple[bool, float, str, InitialGuess]]()
@@ -611,15 +616,12 @@ class Search:
             self._unmoved_of = best, places
         return self._unmoved_of[1]
 
-    def keep_given(self) -> None:
+    def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
-        (run, best), given = self.best, self._given
-        if given is None:
-            return
+        run, best = self.best
         still = reach.differ(best, given, self._unmoved())
-        if not (still or run.is_worse(best, given) or reach.goal_left(self._problem, best, given)):
-            return
-        if not self._budget.stop.due:
+        worsened = still or run.is_worse(best, given) or reach.goal_left(self._problem, best, given)
+        if worsened and not self._budget.stop.due:
             run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
             wanted = run.is_worse(best, given) or (still and other.cost < best.cost) or other.rank < best.rank
@@ -632,9 +634,6 @@ class Search:
 
     def retry_without_risk(self) -> None:
         """Where the risk was too high for an intermediate plan, solve without risk, and continue from that plan."""
-        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
-        if not (self._problem.risk > 0 and too_high and self.may_go_on):
-            return
         riskless = replace(self._problem, risk=0.0)
         with self._problem.dynamics.solving(self._solving):
             runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
@@ -656,11 +655,8 @@ class Search:
         are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
         less: for the softest contacts, it would leave the body alone again.
         """
-        problem, moved, best = self._problem, self._best_nearer, self.best[1]
-        alone = moved is not None and not self._comes_nearer(best)
-        if not (self._default and self.may_go_on and (alone or not best.success)):
-            return
-        begin = best if moved is None else moved[1]
+        problem, moved = self._problem, self._best_nearer
+        begin = self.best[1] if moved is None else moved[1]
         self._soft = [
             (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
         ]
@@ -684,8 +680,6 @@ class Search:
         Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
         again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
         """
-        if self.best[1].success or not self.may_go_on:
-            return
         optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
         for _ in range(ROUNDS):
             before = self._cheapest
@@ -702,15 +696,16 @@ class Search:
             if not optimum.cost < before.cost - FELL * abs(before.cost):
                 return
 
-    def leave_contact_modes(self) -> None:
-        """Descend from a best plan that ended within its contact modes, if a plan beside it is cheaper, out of them."""
+    @property
+    def has_cheaper_beside(self) -> bool:
+        """Whether the best plan ended within its contact modes, and a plan beside it, out of them, is cheaper."""
         run, best = self.best
         contacts = None if best.certificate is None else best.certificate.contacts
-        if best.success or contacts is None or not self.may_go_on:
-            return
-        if not max(contacts.across, contacts.sampled) > run.final:
-            return
-        run = self._add(guess_from(best, "the best plan"), "the best plan, out of its contact modes")
+        return contacts is not None and max(contacts.across, contacts.sampled) > run.final
+
+    def leave_contact_modes(self) -> None:
+        """Descend from the best plan, out of its contact modes."""
+        run = self._add(guess_from(self.best[1], "the best plan"), "the best plan, out of its contact modes")
         with self._problem.dynamics.solving(self._solving), run.budget.limited(SOFT):
             result = self._finish(run, refine)
         self._offer(run, result, better=self._is_better(result))
