@@ -290,9 +290,9 @@ class Search:
 
     def make_attempts(self, *, trees: bool) -> None:
         """Make all attempts in turn, as far as they are called for; `trees` if they may grow."""
-        self.choose_start()
-        # Some also solve problems with other dynamics, for which they set the number of threads themselves.
+        # The attempts after this block also solve problems with other dynamics, and set the number of threads for each.
         with self._problem.dynamics.solving(self._solving):
+            self.choose_start()
             if trees and self.may_go_on and self.is_barred:
                 self.grow_trees()
             if self._settings.start is None and self._exact and not self._guided and self.touches_passable:
@@ -315,19 +315,18 @@ class Search:
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
-        with self._problem.dynamics.solving(self._solving):
-            self.finish_promising()
-            lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
-            if lost and self._problem.start is not None and not self._budget.stop.due:
-                self.try_finite()
-            if self.needs_others and self.is_barred:
-                self.try_past_constraints()
-            if self.needs_others and self._guided:
-                self.try_reweighted()
-            if self.needs_others and not self._guided and self.is_without_plan:
-                self.try_elsewhere()
-            if self.needs_others and not self._guided:
-                self.try_sinusoidal_controls()
+        self.finish_promising()
+        lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
+        if lost and self._problem.start is not None and not self._budget.stop.due:
+            self.try_finite()
+        if self.needs_others and self.is_barred:
+            self.try_past_constraints()
+        if self.needs_others and self._guided:
+            self.try_reweighted()
+        if self.needs_others and not self._guided and self.is_without_plan:
+            self.try_elsewhere()
+        if self.needs_others and not self._guided:
+            self.try_sinusoidal_controls()
         return self.best
 
     def finish_promising(self) -> None:
@@ -848,7 +847,9 @@ class Search:
     def _searched(self, problem: Problem) -> tuple[SolveRun, RunResult]:
         """The best run of a search for another problem, as far as the choice of a start."""
         starts = [(name, self._another(resolve(start, problem), problem)) for name, start in guides(problem, None)]
-        return Search(starts).choose_start()
+        search = Search(starts)
+        with problem.dynamics.solving(search._solving):
+            return search.choose_start()
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
