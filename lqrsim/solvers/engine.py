@@ -191,7 +191,7 @@ class SolveRun:
     # The phases of a run.
 
     def run_to_end(self, *, return_best: bool = True) -> RunResult:
-        """Smooth; near an optimum take Newton's steps; if the method fails, take the safeguard's steps.
+        """Smooth, unless that has ended; near an optimum take Newton's steps; if the method fails, the safeguard's.
 
         With `return_best`, a stopped run returns its best plan, which needs another pass for a policy.
         """

@@ -9,7 +9,8 @@ and leave the last command out of a plan with a `control_rate` (`control_rates.p
      (`SolveRun.run_to_end`). If controls have limits: the interior point if controls stay at them, or all else fails.
   with constraints: the interior point from one plan after another (`constrained.py`).
   with `finish=None`, `stop="cost"` or noise and constraints: smoothing, and the augmented Lagrangian for constraints
-     (`augmented_lagrangian.py`). Without constraints, the dynamics of an MJCF are left to smoothing, too.
+     (`augmented_lagrangian.py`). Without constraints, the dynamics of an MJCF are left to smoothing, too, which begins
+     in `Search.smooth_or_follow_a_line` for an arm, say: if it fails, a line of states may take the place of the start.
 
 The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified
 (`certify.py`).
@@ -338,7 +339,7 @@ class Search:
         # Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
         plain = not problem.constraints and self._default and not self._exact
         if driven and known and plain and self._settings.safeguard:
-            chosen = self._smooth_or_follow_a_line(chosen)
+            chosen = self.smooth_or_follow_a_line(chosen)
         self._offer(chosen, self._finish(chosen))
         if not problem.constraints:
             return
@@ -350,7 +351,7 @@ class Search:
                 break
             self._offer(run, self._finish(run))
 
-    def _smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
+    def smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
         """If smoothing fails for an arm, say, whose every joint has a motor, the run from a line of states, if cheaper.
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
