@@ -24,8 +24,9 @@ def functions_of(problem: Problem) -> list[UserFunction]:
     return [function for part in _parts(problem) for function in part.functions]
 
 
-def check_functions(problem: Problem, x: Array, u: Array) -> None:
-    """Call each function that is no formula once, which raises InputError for an unsuitable result."""
+def check_functions(problem: Problem, u: Array) -> None:
+    """Call each function that is no formula once at the start, which raises InputError for an unsuitable result."""
+    x = problem._start_or_zero
     for part in _parts(problem):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))

@@ -381,6 +381,11 @@ class Problem(OneVersion):
         return None if reference is None else reference.about
 
     @property
+    def _start_or_zero(self) -> Array:
+        """A copy of the start, (n,), at which a solve without one begins at zero."""
+        return np.zeros(len(self.dynamics.state_coordinates)) if self.start is None else self.start.copy()
+
+    @property
     def goal(self) -> Array | None:
         """The state (n,) that the final cost and GoalStates specify; None if none of them does."""
         reference = self._only_reference(self.final_cost)

@@ -450,8 +450,8 @@ def smooth_continuous(
         )
     tolerances = Tolerances(rtol=rtol, atol=atol)
     control, prior = _initial_guess(problem, start)
-    state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-    check_functions(problem, state, control)
+    state = problem._start_or_zero
+    check_functions(problem, control)
     check_start(problem, state, control)
 
     functions = functions_of(problem)

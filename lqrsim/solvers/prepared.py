@@ -117,8 +117,7 @@ class PreparedSolver(OneVersion):
         return f"PreparedSolver({n} states, {m} controls, {steps} steps)"
 
     def _compile(self) -> None:
-        n, guess = len(self.problem.dynamics.state_coordinates), resolve(None, self.problem)
-        state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
+        guess, state = resolve(None, self.problem), self.problem._start_or_zero
         run = SolveRun(self.problem, self.settings, guess, state, Budget(self.settings.max_iterations))
         run.roll_out()
         compiled.rollout(self.problem, guess.gain, guess.offset, state)

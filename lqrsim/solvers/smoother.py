@@ -303,10 +303,9 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
         guess = resolve(settings.start, problem)
         if guess.prior is not None:  # a function may return one
             raise InputError(_NO_PRIOR)
-        start = problem.start.copy()
-        check_functions(problem, start, guess.offset[0].copy())
+        check_functions(problem, guess.offset[0].copy())
         options = SmootherSettings(stop=settings.stop, tolerance=settings.tolerance, finish=None)
-        run = SolveRun(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
+        run = SolveRun(problem, options, InitialGuess(guess.gain, guess.offset), problem.start.copy(), budget, "ilqr")
         run.work.fixed = True  # if by the initial cost alone
     with stop.reporting("ilqr"):
         ending = run.ilqr()
@@ -370,8 +369,7 @@ def _solve_all(
     for i, problem in enumerate(problems):
         try:
             check(problem, settings)
-            start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
-            check_functions(problem, start, resolve(settings.start, problem).offset[0])
+            check_functions(problem, resolve(settings.start, problem).offset[0])
             compiled.core(problem, getattr(settings, "form", "dual"))
             compiled.arguments(problem)  # this compiles numba functions
         except InputError as error:

@@ -129,11 +129,10 @@ def _search(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: 
     """The answer of a search among starts, for constraints as they are."""
     with stop.not_counting():  # compiling
         starts = [(CALLERS_START, settings.start)] if settings.start is not None else guides(problem, settings.starts)
-        start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
         first = resolve(starts[0][1], problem).penalised(problem, settings.penalty)
-        check_functions(problem, start, first.offset[0].copy())
+        check_functions(problem, first.offset[0].copy())
         runs = [
-            SolveRun(problem, settings, guess, start, Budget(settings.max_iterations, stop))
+            SolveRun(problem, settings, guess, problem._start_or_zero, Budget(settings.max_iterations, stop))
             for guess in (first, *(resolve(choice, problem) for _, choice in starts[1:]))
         ]
     is_plan = settings.start is not None and first.prior is None and first.interior is None
@@ -165,9 +164,8 @@ def outlined(
     free = problem.with_constraints([constraint for constraint in problem.constraints if not constraint._rough])
     with stop.not_counting():  # compiling
         guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
-        start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-        check_functions(free, start, guess.offset[0].copy())
-        run = SolveRun(free, rough, guess, start, budget)
+        check_functions(free, guess.offset[0].copy())
+        run = SolveRun(free, rough, guess, free._start_or_zero, budget)
     budget.report_to(stop.callback)
     with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
         run.smooth(OUTLINED)

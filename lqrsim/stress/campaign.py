@@ -130,9 +130,8 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
             possible = ", ".join(name for name in policies.CAMPAIGN_POLICIES if name not in impossible)
             raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
     policies.check_used(given, campaign.policies)
-    n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
-    start = np.zeros(n) if problem.start is None else problem.start
-    standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
+    states, m = np.tile(problem._start_or_zero, (problem.steps + 1, 1)), len(problem.control_coordinates)
+    standing = Trajectory(states, np.zeros((problem.steps, m)), problem.dt)
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
