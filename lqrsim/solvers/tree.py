@@ -107,7 +107,7 @@ def grow(problem: Problem, *, seed: int, extensions: int = EXTENSIONS, stop: Sto
 def _ends(problem: Problem) -> tuple[Array, Array] | None:
     """Start and goal between which trees can grow; None if the problem has none, or none that they can."""
     start, goal = problem.start, problem.weighed_goal
-    if problem.dynamics.discrete or problem.dynamics.by_mujoco or problem.moving or start is None or goal is None:
+    if problem.dynamics.discrete or problem.moving or start is None or goal is None:
         return None
     return start, np.where(np.isnan(goal), start, goal)
 

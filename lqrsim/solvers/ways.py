@@ -122,7 +122,7 @@ def _other_axes(problem: Problem, line: Array) -> Iterator[Way]:
 def _rates(problem: Problem) -> list[tuple[int, int]]:
     """States and the states that are their rates, at the start or at the goal."""
     dynamics, pairs = problem.dynamics, set[tuple[int, int]]()
-    h = problem.dt if dynamics.discrete or dynamics.by_mujoco else SHORT * problem.dt
+    h = problem.dt if dynamics.discrete else SHORT * problem.dt
     units = dynamics.state_coordinates.units
     for state in (problem.start, problem.goal):
         if state is None:
@@ -141,7 +141,7 @@ def _headings(problem: Problem) -> Headings:
     angles, place = list(space.angles), list(space.position)
     if not angles or start is None or len(place) != 2:
         return Headings([], 0.0)
-    h = problem.dt if dynamics.discrete or dynamics.by_mujoco else SHORT * problem.dt
+    h = problem.dt if dynamics.discrete else SHORT * problem.dt
     low, high = (np.clip(side, -1.0, 1.0) for side in (controls.low, controls.high))
     c, s = np.cos(TURNED), np.sin(TURNED)
     directions = []
