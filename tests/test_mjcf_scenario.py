@@ -40,7 +40,7 @@ def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> Non
     assert isinstance(velocities, ls.QuadraticCost)
     np.testing.assert_array_equal(np.diag(velocities.weight), [0, 0, 1e-3, 1e-3])
     assert isinstance(limits, LimitCost)
-    assert problem.control_limits == ((-1.0,), (1.0,))
+    assert (problem.control_coordinates.low, problem.control_coordinates.high) == ((-1.0,), (1.0,))
     assert scenario.name == "cart"
 
 

@@ -401,7 +401,7 @@ class MjcfRobot(Robot):
         return Problem(
             dynamics=dynamics, dt=period, steps=steps, initial=FixedState(start), stage_cost=cost,
             final_cost=QuadraticCost(self._final_weights(weights, start, goal), about=goal), constraints=constraints,
-            control_limits=(controls.low, controls.high), control_rate=control_rate,
+            control_rate=control_rate,
         )  # fmt: skip
 
     def _warn_of_near(self, ends: Array, clearance: float) -> None:
