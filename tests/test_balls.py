@@ -125,7 +125,7 @@ def test_clearance(margin: Any) -> None:
         [WORLD.distances(place) - radius - margins[t] for place, radius in zip(in_numpy(state), RADII, strict=True)]
         for t, state in enumerate(states)
     ]
-    costs, constraints = compiled.costs_module(problem), compiled.arguments(problem).stage.constraints
+    costs, constraints = compiled.costs_module(problem), compiled.compile_problem(problem).stage.constraints
     values = (np.empty(36),)
     costs.evaluate_constraints(3, states, controls, constraints, values)
     np.testing.assert_allclose(values[0], np.ravel(wanted), rtol=0, atol=1e-12)

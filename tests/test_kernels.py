@@ -515,7 +515,7 @@ class TestSolvers:
                 2.0,
             )
             replay(source_of(iterations), SIZES, "tighten", DAMPED_STEPS, memory[0])
-        model = compiled.arguments(problem(noise=ls.Noise(0.1 * np.eye(3))))
+        model = compiled.compile_problem(problem(noise=ls.Noise(0.1 * np.eye(3))))
         for good, risk in ((True, 0.0), (False, 0.0), (True, 1.0)):
             model.noise.risk[1] = risk
             replay(source_of(iterations), SIZES | {"NOISY": 1}, "failure", good, model)
@@ -1056,7 +1056,7 @@ class TestParts:
             source = term.code
             policy, costs = Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.1)), np.zeros(2)
             draws = np.random.default_rng(0).normal(size=(6, 2))
-            replay(source, SIZES, "noisy_costs", 2, 3, X.copy(), policy, compiled.arguments(one), draws, costs)
+            replay(source, SIZES, "noisy_costs", 2, 3, X.copy(), policy, compiled.compile_problem(one), draws, costs)
             from lqrsim.kernels.records import NextStep
 
             ahead = NextStep(np.eye(3, 5), X, 2 * np.eye(3), -X)
@@ -1110,7 +1110,7 @@ class TestParts:
                 3,
                 again,
                 plan,
-                compiled.arguments(problem()),
+                compiled.compile_problem(problem()),
                 found,
             )
 
@@ -1227,7 +1227,7 @@ class TestParts:
 
     def test_sums_of_costs_of_many(self) -> None:
         one = problem(constraints=[ls.Clearance(WORLD, radius=0.1)], steps=3)
-        model, source = compiled.arguments(one), source_of(model_functions)
+        model, source = compiled.compile_problem(one), source_of(model_functions)
         plans = Motion(np.tile(X, (8, 1)), np.tile(U, (6, 1)))
         replay(source, SIZES, "costs_of", 2, 3, plans, model, np.zeros(2))
         replay(source, SIZES, "cost_of_each", 2, 1, plans, model.stage, np.zeros(2))

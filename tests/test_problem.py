@@ -159,7 +159,7 @@ def test_weights_of_any_number_of_controls_are_printed(size: int) -> None:
 def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> None:
     """Gradient by central differences of the value, step 1e-6: 1e-5 of gradients of order ten."""
     problem = quadrotor.problem
-    costs, stage = compiled.costs_module(problem), compiled.arguments(problem).stage
+    costs, stage = compiled.costs_module(problem), compiled.compile_problem(problem).stage
     rng, h = np.random.default_rng(0), 1e-6
     for _ in range(20):
         z = rng.uniform(-1, 1, size=16)

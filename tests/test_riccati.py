@@ -281,6 +281,6 @@ def _project(matrix: Array) -> Array:
         final_cost=ls.QuadraticCost(np.ones(3), about=np.zeros(3)),
     )
     hessian, gradient = np.zeros((4, 4)), np.zeros(4)
-    costs, stage = compiled.costs_module(problem), compiled.arguments(problem).stage
+    costs, stage = compiled.costs_module(problem), compiled.compile_problem(problem).stage
     costs.cost_of_order(np.zeros(3), np.zeros(1), 1, stage, 0.0, hessian, gradient)
     return hessian - np.diag([0.0, 0.0, 0.0, 1.0])  # less the control cost, which is convex and added as it is

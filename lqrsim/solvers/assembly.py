@@ -297,7 +297,7 @@ def remedy_of(
 def _flat_controls(problem: Problem, result: RunResult) -> list[str]:
     """The controls in which the stage cost is not curved at the first step of a plan."""
     n, names = result.states.shape[1], problem.control_coordinates.names
-    stage = compiled.arguments(problem).stage
+    stage = compiled.compile_problem(problem).stage
     _, _, hessian = compiled.quadratic_at(problem, stage, result.states[0], result.controls[0], 0)
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 

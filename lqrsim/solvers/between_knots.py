@@ -63,9 +63,9 @@ def between_knots(problem: Problem, plan: Trajectory) -> BetweenKnots:
 def _within(problem: Problem, plan: Motion, parts: int, *, again: bool = True) -> Array:
     """The states (T, parts, n) at the ends of equal parts of each period; see `kernels/model_functions.py`."""
     steps, n = len(plan.controls), plan.states.shape[1]
-    states = np.empty((steps * parts, n))
+    states, model = np.empty((steps * parts, n)), compiled.compile_problem(problem)
     with problem.dynamics.quiet():
-        compiled.costs_module(problem).states_within(steps, parts, again, plan, compiled.arguments(problem), states)
+        compiled.costs_module(problem).states_within(steps, parts, again, plan, model, states)
     return states.reshape(steps, parts, n)
 
 
@@ -124,7 +124,7 @@ def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:
     acting = [compiled.ConstraintMultipliers(problem, term) for term in terms]
     for multipliers in acting:
         multipliers.array[FIRST] = 0.0  # a fixed start cannot change, but what follows can
-    constraints = compiled.arguments(problem, multipliers=acting).stage.constraints
+    constraints = compiled.compile_problem(problem, multipliers=acting).stage.constraints
     results: list[Array] = [np.empty((steps, states.shape[1], term.rows)) for term in terms]
     for j in range(states.shape[1]):
         at_begins, at_ends = (

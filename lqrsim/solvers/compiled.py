@@ -62,12 +62,12 @@ def structure(problem: Problem) -> tuple[Any, ...]:
     return problem.dynamics.step_source, tuple(_sizes(problem.dynamics).items()), costs, constraints, noise
 
 
-def arguments(
+def compile_problem(
     problem: Problem, *, multipliers: Sequence["ConstraintMultipliers"] = (), second_order: bool = False
 ) -> ProblemModel:
-    """The arguments of the passes; compiles the problem's functions if they are new.
+    """Compile the functions of a problem that are new; returns the problem as an argument of the passes.
 
-    Without multipliers no constraint acts. With `second_order` they have second derivatives of the dynamics.
+    Without multipliers no constraint acts. With `second_order` there are second derivatives of the dynamics.
     """
     acting = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
     space, term = problem.control_coordinates, problem.noise_term
@@ -155,7 +155,7 @@ def noisy_costs(problem: Problem, start: Array, policy: Policy, draws: Array) ->
     costs, steps = np.empty(len(draws)), problem.steps
     flat = draws.reshape(-1, draws.shape[2])
     module = _noise_module(problem, problem.noise_term)
-    module.noisy_costs(len(draws), steps, start, policy, arguments(problem), flat, costs)
+    module.noisy_costs(len(draws), steps, start, policy, compile_problem(problem), flat, costs)
     return costs
 
 
@@ -169,7 +169,7 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     """Stage and final costs (K,) of K trajectories with states (K, T+1, n) and controls (K, T, m)."""
     costs = np.empty(len(states))
     flat = (in_c_order(array).reshape(-1, array.shape[2]) for array in (states, controls))
-    costs_module(problem).costs_of(len(states), problem.steps, Motion(*flat), arguments(problem), costs)
+    costs_module(problem).costs_of(len(states), problem.steps, Motion(*flat), compile_problem(problem), costs)
     return costs
 
 
@@ -189,7 +189,7 @@ class CostsByStep:
     """Evaluates a problem's costs one step at a time."""
 
     def __init__(self, problem: Problem) -> None:
-        self._module, self._steps, self._model = costs_module(problem), problem.steps, arguments(problem)
+        self._module, self._steps, self._model = costs_module(problem), problem.steps, compile_problem(problem)
 
     def stage(self, t: int, states: Array, controls: Array) -> Array:
         """Stage costs (K,) of step t in states (K, n) under controls (K, m)."""
@@ -207,7 +207,7 @@ class CostsByStep:
 
 def rollout(problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None) -> Motion:
     """Roll out the policy u_t = gain_t x + offset_t from a state; gains (T, m, n), offsets (T, m)."""
-    model = arguments(problem)
+    model = compile_problem(problem)
     model = model if dt is None else model._replace(dt=float(dt))
     steps = len(gain)
     plan = Motion(np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1])))

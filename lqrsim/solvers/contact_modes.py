@@ -75,7 +75,7 @@ class ModeModel:
         n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
         self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
         self.points, self.motions = np.hstack([states[:-1], controls]), np.empty((steps, n + m, size))
-        data, quadratic = compiled.arguments(problem), partial(compiled.quadratic_at, problem)
+        data, quadratic = compiled.compile_problem(problem), partial(compiled.quadratic_at, problem)
         self.stages = [quadratic(data.stage, states[t], controls[t], t)[1:] for t in range(steps)]
         _, slope, curve = quadratic(data.final, states[steps], np.zeros(m), steps)
         self.last = slope[:n], curve[:n, :n]
@@ -457,7 +457,7 @@ def optimality_in_mode(
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]
-    data, space = compiled.arguments(problem), problem.control_coordinates
+    data, space = compiled.compile_problem(problem), problem.control_coordinates
     cost, rate, joint = compiled.quadratic_at(problem, data.final, states[steps], np.zeros(m), steps)
     ahead, costate, lagrangian, decrease = joint[:n, :n].copy(), rate[:n], rate[:n], 0.0
     hessians, slopes, constants = [ahead], [costate], [cost]

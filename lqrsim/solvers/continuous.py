@@ -494,7 +494,7 @@ class _Smoother:
     def __init__(
         self, problem: Problem, state: Array, control: Array, prior: InitialPrior | None, tolerances: Tolerances
     ) -> None:
-        costs, data, dynamics = compiled.costs_module(problem), compiled.arguments(problem), problem.dynamics
+        costs, data, dynamics = compiled.costs_module(problem), compiled.compile_problem(problem), problem.dynamics
         self._n, self._m = n, m = len(state), len(control)
         self._dt, self._steps, self.horizon = problem.dt, problem.steps, problem.steps * problem.dt
         self._tolerances, self._data, self._none = tolerances, data, np.zeros(m)

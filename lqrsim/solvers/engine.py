@@ -163,7 +163,7 @@ class SolveRun:
         self._valley = VALLEY if self.second_order and has_curvature(problem) else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
         self._fractions = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
-        self._loop = self.work.laid_out(self.work.core, entry, *self._arguments(0, 0, self._rows))
+        self._loop = self.work.compiled_call(self.work.core, entry, *self._arguments(0, 0, self._rows))
 
     def give_back(self) -> None:
         """Let later runs have the memory."""
@@ -672,8 +672,8 @@ class Workspace:
         self.start, self.trial = self.arrays.start, zeros_of(Motion, **sizes)
         self.best, self.last = self.arrays.best, self.arrays.last
 
-    def laid_out(self, module: CompiledModule, name: str, *arguments: Any) -> Call:
-        """The call of a compiled function, whose arguments are laid out once."""
+    def compiled_call(self, module: CompiledModule, name: str, *arguments: Any) -> Call:
+        """The call of a function, which is compiled if it is new; its arguments are laid out once."""
         if name not in self._calls:
             self._calls[name] = module.lay_out(name, *arguments)
         return self._calls[name]
@@ -694,7 +694,7 @@ class Workspace:
         ]
         for multipliers, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
             multipliers.penalty, multipliers.values[...] = known.penalty, known.values.ravel()
-        self.model = compiled.arguments(problem, multipliers=self.multipliers, second_order=self._exact)
+        self.model = compiled.compile_problem(problem, multipliers=self.multipliers, second_order=self._exact)
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # All other memory is written before it is read.
         self.memory_rows[...] = 0.0
@@ -762,7 +762,7 @@ class Workspace:
         plan = Motion(np.empty_like(self.last.states), np.empty_like(self.last.controls))
         of = self._problem.steps, in_c_order(state), Policy(*map(in_c_order, policy)), self.model, plan
         with self._problem.dynamics.quiet():
-            self.laid_out(self.core, "rollout", *of)(*of)
+            self.compiled_call(self.core, "rollout", *of)(*of)
         return plan
 
     def constraint_values(self, plan: Motion) -> list[Array]:
@@ -770,7 +770,7 @@ class Workspace:
         values = [np.empty_like(multipliers.values) for multipliers in self.multipliers]
         if values:
             of = self._problem.steps, *map(in_c_order, plan), self.model.stage.constraints, tuple(values)
-            self.laid_out(self._costs, "evaluate_constraints", *of)(*of)
+            self.compiled_call(self._costs, "evaluate_constraints", *of)(*of)
         return [numbers.reshape(self._problem.steps + 1, -1) for numbers in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:

@@ -64,7 +64,7 @@ def goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
 
 def _final_cost(problem: Problem, state: Array) -> tuple[float, Array, Array]:
     """The final cost, its gradient (n,) and its Hessian (n, n)."""
-    n, final = len(state), compiled.arguments(problem).final
+    n, final = len(state), compiled.compile_problem(problem).final
     no_control = np.zeros(len(problem.nominal_control))
     value, gradient, hessian = compiled.quadratic_at(problem, final, state, no_control, problem.steps)
     return value, gradient[:n], hessian[:n, :n]

@@ -371,7 +371,7 @@ def _solve_all(
             check(problem, settings)
             check_functions(problem, resolve(settings.start, problem).offset[0])
             compiled.core(problem, getattr(settings, "form", "dual"))
-            compiled.arguments(problem)  # this compiles numba functions
+            compiled.compile_problem(problem)
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None
     functions = [function for problem in problems for function in functions_of(problem)]

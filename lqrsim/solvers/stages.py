@@ -100,7 +100,7 @@ class Stages:
         fixed, steps, terms = isinstance(problem.initial, FixedState), problem.steps, problem.constraint_terms
         acting = [compiled.ConstraintMultipliers(problem, term) for term in terms]
         # Without noise, of which stages know nothing: memory of problems with and without it would differ.
-        model = compiled.arguments(problem, multipliers=acting, second_order=True)._replace(noise=())
+        model = compiled.compile_problem(problem, multipliers=acting, second_order=True)._replace(noise=())
         self.low, self.high = model.limits
         *_, lower, upper = self._shape
         self.limits = [(1.0, i, self.low[i]) for i in lower] + [(-1.0, i, self.high[i]) for i in upper]
