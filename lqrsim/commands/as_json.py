@@ -11,7 +11,7 @@ Object = dict[str, Any]
 
 def text_of(value: object) -> str:
     """The JSON text of a result in one line, with numbers at full precision."""
-    from lqrsim.results.archive import plain  # with NumPy, which help does without
+    from lqrsim.results.archive import plain  # imports NumPy, which `--help` should not wait for
 
     return json.dumps(plain(value), allow_nan=False)
 
@@ -59,7 +59,7 @@ def of_solution(solution: "ls.Solution") -> Object:
 
 
 def of_rollout(rollout: "ls.Rollout", problem: "ls.Problem | None" = None) -> Object:
-    """The outcomes of a rollout's trials, as in a stress test; without a problem of its horizon there are no costs."""
+    """The outcomes of a rollout's trials. Costs are left out unless a problem with the same steps and dt is given."""
     from lqrsim.stress.analysis import outcomes
 
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
@@ -104,7 +104,7 @@ def _fields(record: object, names: str) -> Object:
 
 
 def rows_of(columns: Mapping[str, Any]) -> list[Object]:
-    """The rows of a table of columns, by the names of these."""
+    """A table as a list of rows: column name -> value."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
