@@ -38,6 +38,7 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 
 LOST_AFTER = 3  # control periods without a state after which the controller stops
+KEPT = 10  # commands that a reader keeps until they are received
 WAIT_SLICE = 0.05  # s, the interval at which a wait checks for signals
 AXES = "xyz"
 # The states in an Odometry message, by name: velocities along the world's axes, rates along the body's.
@@ -107,24 +108,26 @@ def run(
       patience: time in s to wait for the other program to appear, and for the first state.
       domain: domain of DDS; by default ROS_DOMAIN_ID, or 0.
     """
-    law, dt, steps, nominal = _law_of(controller)
-    states, controls = law.coordinates
+    live = isinstance(controller, LiveReplanner)
+    controller, dt, steps, nominal = _controller_of(controller)
+    states, controls = controller.coordinates
     safe = check_array("safe", safe, (len(controls),))
     if (safe < controls.low).any() or (safe > controls.high).any():
         raise InputError(f"safe: got {excerpt(safe.tolist())}, want numbers from {controls.low} to {controls.high}")
     longest = lost_after or (patience if lockstep else LOST_AFTER * dt)
     if seconds is not None:
         steps = math.ceil(seconds / dt - 1e-9)
-    needed = law.policy.measured_coordinates.names if isinstance(law, OutputFeedback) else states.names
+    filtered = isinstance(controller, OutputFeedback)
+    needed = controller.policy.measured_coordinates.names if filtered else states.names
     node, commands = _Node(domain), _checked_topic(commands)
     inlet = _Inlet(node, _topics(commands, odometry, joints), states, needed, names, reliable=lockstep)
     _wait(inlet.matched, patience, inlet.lacking)
     outlet = node.writer(commands, "Float64MultiArray")  # seeing this writer means that its states are heard
     _wait(outlet.get_matched_subscriptions, patience, lambda: f"commands: got no reader of {commands}")
-    if not isinstance(controller, LiveReplanner):  # a LiveReplanner would begin to solve
-        law.start(1).control(0, nominal[None])  # loads compiled code before the first period
+    if not live:  # a LiveReplanner would begin to solve
+        controller.start(1).control(0, nominal[None])  # loads compiled code before the first period
     _wait(inlet.complete, patience, inlet.lacking)
-    running, sent, response, late = law.start(1), list[Array](), list[float](), list[float]()
+    running, sent, response, late = controller.start(1), list[Array](), list[float](), list[float]()
     held, reason, begun = 0, "", time.monotonic()
     try:
         for step in range(steps):
@@ -150,7 +153,7 @@ def run(
     finally:
         outlet.write(node.numbers(safe))
         with contextlib.suppress(AttributeError):  # cyclonedds 11.0 raises it if a reader hangs or is gone
-            outlet.wait_for_acks(node.second)
+            outlet.wait_for_acks(node.one_second)
     return Bridged(
         completed=not reason, reason=reason, commands=np.array(sent).reshape(len(sent), len(controls)), held=held,
         refused=inlet.refused, response=np.array(response), late=np.array(late),
@@ -166,6 +169,10 @@ class SimulatedRobot:
 
     It publishes the measured state of each control period and waits for a command. With a bridge in lockstep, the
     simulation runs as fast as both programs allow. With a bridge that runs by a clock, it runs as fast as the clock.
+    A simulation that falls behind skips the commands that arrived meanwhile.
+
+    One robot can serve several runs, one after the other. A time that is not after the last one begins a run, which
+    waits for a controller.
 
     The other arguments are as in `run`.
 
@@ -174,6 +181,7 @@ class SimulatedRobot:
 
     Attributes:
       round_trips: times in s from publishing each state to the arrival of its command.
+      unanswered: number of states after the end of the controller; its last command stayed in force.
     """
 
     _prefix = ""
@@ -197,9 +205,11 @@ class SimulatedRobot:
         self._names, node = _renamed(policy.state_coordinates, names), _Node(domain)
         self._turns_about = _turns_about(policy.state_coordinates, self._names)
         self._outlets = {kind: node.writer(topic, kind) for kind, topic in topics.items()}
+        self._topic = commands
         self._inlet: _Reader | None = node.reader(commands, "Float64MultiArray")
         self._node: _Node | None = node
-        self._met, self.round_trips = False, list[float]()
+        self._t, self._command = math.inf, None  # time and command of the last state
+        self.round_trips, self.unanswered = list[float](), 0
 
     def __enter__(self) -> Self:
         return self
@@ -212,27 +222,46 @@ class SimulatedRobot:
         node, inlet = self._node, self._inlet
         if node is None or inlet is None:
             raise InputError("SimulatedRobot: got a state after its end, want it within `with SimulatedRobot(...)`")
-        if not self._met:
-            everyone = [inlet.writers, *(outlet.get_matched_subscriptions for outlet in self._outlets.values())]
-            _wait(lambda: all(matched() for matched in everyone), self._patience, lambda: "got no controller")
-            self._met = True
         values = dict(zip(self._names, vectors_of("state", state, len(self._names)).tolist(), strict=True))
-        begun = time.monotonic()
+        if begins := t <= self._t:
+            everyone = [inlet.writers, *(outlet.get_matched_subscriptions for outlet in self._outlets.values())]
+            lacking = f"commands: got no controller on {self._topic}"
+            _wait(lambda: all(matched() for matched in everyone), self._patience, lambda: lacking)
+        commands = [self._command, *(message.data for message in inlet.receive(most=KEPT))]  # for earlier states
+        self._command = None if begins else commands[-1]
+        writers, answer = inlet.writers(), list[Any]()
+        self._t, begun = t, time.monotonic()
         for kind, outlet in self._outlets.items():
-            of_odometry = kind == "Odometry"
-            outlet.write(node.odometry(values, t, self._turns_about) if of_odometry else node.joints(values, t))
-        _wait(lambda: inlet.wait(WAIT_SLICE), self._patience, lambda: "got no command")
-        self.round_trips.append(time.monotonic() - begun)
-        (message,) = inlet.receive()
-        return check_array("command", message.data, (len(self._controls),))
+            is_odometry = kind == "Odometry"
+            outlet.write(node.odometry(values, t, self._turns_about) if is_odometry else node.joints(values, t))
+
+        def answered_or_ended() -> bool:
+            ended = set(writers).isdisjoint(inlet.writers())  # before receiving what it last sent
+            if not ended:
+                inlet.wait(WAIT_SLICE)
+            answer.extend(inlet.receive())
+            return bool(answer) or ended
+
+        _wait(answered_or_ended, self._patience, lambda: f"commands: got no command on {self._topic}")
+        if answer:
+            self.round_trips.append(time.monotonic() - begun)
+            self._command = answer[0].data
+        elif self._command is None:  # the controller of an earlier run was still there: wait for the next one
+            return self(state, t)
+        else:
+            self.unanswered += 1
+        return check_array("command", self._command, (len(self._controls),))
 
     def summary(self) -> str:
-        return f"state to command and back: {_quantiles(self.round_trips)}" if self.round_trips else "no command"
+        lines = [f"state to command and back: {_quantiles(self.round_trips)}" if self.round_trips else "no command"]
+        if self.unanswered:
+            lines.append(f"states after the controller's end, with its last command: {self.unanswered}")
+        return "\n".join(lines)
 
 
 def _quantiles(seconds: npt.ArrayLike) -> str:
     middle, high, most = 1e3 * np.quantile(np.asarray(seconds), [0.5, 0.99, 1.0])
-    return f"median {middle:.3f} ms, 99 % {high:.3f} ms, most {most:.3f} ms"
+    return f"median {middle:.3f} ms, 99th percentile {high:.3f} ms, maximum {most:.3f} ms"
 
 
 def _wait(until: Callable[[], Any], patience: float, lacking: Callable[[], str]) -> None:
@@ -244,7 +273,7 @@ def _wait(until: Callable[[], Any], patience: float, lacking: Callable[[], str])
         time.sleep(1e-3)
 
 
-def _law_of(source: Bridgeable) -> tuple[Controller, float, int, Array]:
+def _controller_of(source: Bridgeable) -> tuple[Controller, float, int, Array]:
     """The controller, its control period in s, the periods of its horizon, and the nominal state at its start (n,)."""
     if isinstance(source, LiveReplanner):
         policy, problem = source.active.plan.policy, source.problem
@@ -256,9 +285,9 @@ def _law_of(source: Bridgeable) -> tuple[Controller, float, int, Array]:
     plan = source.plan if isinstance(source, Controller) else source
     wanted = "a plan, a policy, a Controller with a plan, or a live re-planner"
     policy = check_kind("controller", plan, Plan, wanted).policy
-    law = source if isinstance(source, Controller) else Feedback(policy)
-    law._check_reads_states()
-    return law, policy.dt, policy.steps, policy.nominal[0]
+    controller = source if isinstance(source, Controller) else Feedback(policy)
+    controller._check_reads_states()
+    return controller, policy.dt, policy.steps, policy.nominal[0]
 
 
 def _checked_topic(topic: object) -> str:
@@ -268,7 +297,7 @@ def _checked_topic(topic: object) -> str:
 
 
 def _topics(commands: str, odometry: str | None, joints: str | None) -> dict[str, str]:
-    """The topics of states by their kind of message. Raises InputError if one name is of two topics."""
+    """The topics of states by their kind of message. Raises InputError if two arguments name the same topic."""
     topics = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
     if not topics:
         raise InputError("odometry: got none, want a topic of states in odometry=, in joints=, or in both")
@@ -348,8 +377,8 @@ class _Inlet:
         for kind, reader in self._readers.items():
             for message in reader.receive():
                 try:
-                    of_odometry = kind == "Odometry"
-                    values = _of_odometry(message, self._turns_about) if of_odometry else _of_joints(message)
+                    is_odometry = kind == "Odometry"
+                    values = _parse_odometry(message, self._turns_about) if is_odometry else _parse_joints(message)
                     used = values.keys() & self._wanted.keys()
                     self._known[kind] |= used
                     if missing := self._known[kind] - used:
@@ -366,7 +395,7 @@ class _Inlet:
         return self.arrived == now
 
 
-def _of_odometry(message: Any, turns_about: str | None = None) -> dict[str, float]:
+def _parse_odometry(message: Any, turns_about: str | None = None) -> dict[str, float]:
     """The states in the message. Raises ValueError if they are invalid."""
     pose, twist = message.pose.pose, message.twist.twist
     place, turned = pose.position, pose.orientation
@@ -383,7 +412,7 @@ def _of_odometry(message: Any, turns_about: str | None = None) -> dict[str, floa
     return dict(zip(ODOMETRY, map(float, numbers), strict=True))
 
 
-def _of_joints(message: Any) -> dict[str, float]:
+def _parse_joints(message: Any) -> dict[str, float]:
     """The states in the message, for the joints that it lists. Raises ValueError if they are invalid."""
     states: dict[str, float] = {}
     for field, suffix in (("position", ""), ("velocity", "_velocity")):
@@ -405,7 +434,7 @@ class _Node:
                 raise InputError(f"ROS_DOMAIN_ID: got {excerpt(setting)}, want a number")
             domain = int(setting)
         self._participant = self._ros.domain.DomainParticipant(check_count("domain", domain, at_least=0, at_most=232))
-        self.second = self._ros.util.duration(seconds=1)
+        self.one_second = self._ros.util.duration(seconds=1)
 
     def reader(self, topic: str, kind: str, *, reliable: bool = True) -> "_Reader":
         return _Reader(self._ros, self._participant, self._topic(topic, kind), self._quality(reliable, kind))
@@ -417,36 +446,37 @@ class _Node:
         return self._ros.topic.Topic(self._participant, f"rt{_checked_topic(topic)}", self._ros.messages[kind])
 
     def _quality(self, reliable: bool, kind: str) -> Any:
-        """Of states only the newest counts, of commands every one. A reliable writer also serves unreliable readers.
+        """Readers keep only the newest state, but all of the last ten commands.
 
-        The representation is the first version of CDR, as in ROS 2.
+        A reliable writer also serves unreliable readers. The representation is the first version of CDR, as in ROS 2.
         """
         core, policy = self._ros.core, self._ros.core.Policy
-        history = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
-        sure = policy.Reliability.Reliable(self.second) if reliable else policy.Reliability.BestEffort
-        return core.Qos(sure, history, policy.DataRepresentation(use_cdrv0_representation=True))
+        history = policy.History.KeepLast(KEPT if kind == "Float64MultiArray" else 1)
+        reliability = policy.Reliability.Reliable(self.one_second) if reliable else policy.Reliability.BestEffort
+        return core.Qos(reliability, history, policy.DataRepresentation(use_cdrv0_representation=True))
 
     def numbers(self, numbers: Array) -> Any:
-        make = self._ros.messages
-        layout = make["MultiArrayLayout"](dim=[], data_offset=0)
-        return make["Float64MultiArray"](layout=layout, data=[float(number) for number in numbers])
+        types = self._ros.messages
+        layout = types["MultiArrayLayout"](dim=[], data_offset=0)
+        return types["Float64MultiArray"](layout=layout, data=[float(number) for number in numbers])
 
     def odometry(self, values: Mapping[str, float], t: float, turns_about: str | None = None) -> Any:
-        make, of = self._ros.messages, {name: values.get(name, 0.0) for name in ODOMETRY}
-        rotation = np.array([of["rx"], of["ry"], of["rz"] + of["heading"]])
+        types, numbers = self._ros.messages, {name: values.get(name, 0.0) for name in ODOMETRY}
+        rotation = np.array([numbers["rx"], numbers["ry"], numbers["rz"] + numbers["heading"]])
         turned = rotations.quaternion(rotation, turns_about=turns_about)
         w, x, y, z = turned.tolist()
-        linear = map(float, rotations.rotate(-rotations.rotation_vector(turned), [of["vx"], of["vy"], of["vz"]]))
-        place = make["Point"](x=of["x"], y=of["y"], z=of["z"])
-        pose = make["Pose"](position=place, orientation=make["Quaternion"](x=x, y=y, z=z, w=w))
-        moving = make["Twist"](
-            linear=make["Vector3"](**dict(zip(AXES, linear, strict=True))),
-            angular=make["Vector3"](x=of["wx"], y=of["wy"], z=of["wz"]),
+        velocity = [numbers["vx"], numbers["vy"], numbers["vz"]]
+        linear = map(float, rotations.rotate(-rotations.rotation_vector(turned), velocity))
+        place = types["Point"](x=numbers["x"], y=numbers["y"], z=numbers["z"])
+        pose = types["Pose"](position=place, orientation=types["Quaternion"](x=x, y=y, z=z, w=w))
+        moving = types["Twist"](
+            linear=types["Vector3"](**dict(zip(AXES, linear, strict=True))),
+            angular=types["Vector3"](x=numbers["wx"], y=numbers["wy"], z=numbers["wz"]),
         )
-        return make["Odometry"](
+        return types["Odometry"](
             header=self._header(t, "odom"), child_frame_id="base_link",
-            pose=make["PoseWithCovariance"](pose=pose, covariance=[0.0] * 36),
-            twist=make["TwistWithCovariance"](twist=moving, covariance=[0.0] * 36),
+            pose=types["PoseWithCovariance"](pose=pose, covariance=[0.0] * 36),
+            twist=types["TwistWithCovariance"](twist=moving, covariance=[0.0] * 36),
         )  # fmt: skip
 
     def joints(self, values: Mapping[str, float], t: float) -> Any:
@@ -477,9 +507,9 @@ class _Reader:
         """Wait for a message until the time is over. Returns whether a message is there."""
         return self._waits.wait(self._ros.util.duration(seconds=seconds)) > 0
 
-    def receive(self) -> list[Any]:
-        """The oldest message, in a list; an empty list if there is none."""
-        return self._reader.take(N=1)
+    def receive(self, most: int = 1) -> list[Any]:
+        """New messages, the oldest first. The end of a writer can leave a sample without a message."""
+        return [sample for sample in self._reader.take(N=most) if sample.sample_info.valid_data]
 
     def writers(self) -> list[Any]:
         return self._reader.get_matched_publications()

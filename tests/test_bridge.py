@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -128,7 +128,7 @@ def test_odometry_of_turns_and_tilts(axis: str) -> None:
     turned = Rotation.from_rotvec(list(turn.values())) * Rotation.from_rotvec(list(tilt.values()))
     found = [getattr(message.pose.pose.orientation, name) for name in "xyzw"]
     np.testing.assert_allclose(Rotation.from_quat(found).as_matrix(), turned.as_matrix(), atol=1e-14)
-    again = bridge._of_odometry(message, turns_about=axis)
+    again = bridge._parse_odometry(message, turns_about=axis)
     np.testing.assert_allclose([again[name] for name in values], list(values.values()), atol=1e-14)
 
 
@@ -144,9 +144,9 @@ def test_odometry_is_read_in_its_frames(seed: int) -> None:
     np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), turned.as_matrix(), atol=1e-14)
     seen = turned.apply([getattr(twist.linear, name) for name in "xyz"])
     np.testing.assert_allclose(seen, [values[name] for name in ("vx", "vy", "vz")], atol=1e-14)
-    again = bridge._of_odometry(message)
+    again = bridge._parse_odometry(message)
     np.testing.assert_allclose([again[name] for name in values], list(values.values()), atol=1e-14)
-    yawed = bridge._of_odometry(node.odometry({"heading": 2.5}, 0.0))
+    yawed = bridge._parse_odometry(node.odometry({"heading": 2.5}, 0.0))
     assert yawed["heading"] == pytest.approx(2.5, abs=1e-15)
 
 
@@ -183,7 +183,7 @@ def test_two_programs_run_as_one(
     np.testing.assert_allclose(rollout.states, alone.states, rtol=0, atol=close)
     np.testing.assert_allclose(rollout.commanded, alone.commanded, rtol=0, atol=close)
     assert len(robot.round_trips) == plan.trajectory.steps
-    assert "99 %" in robot.summary()
+    assert "99th percentile" in robot.summary()
 
 
 def test_by_the_clock_commands_are_those_of_the_law(topics: dict[str, Any]) -> None:
@@ -200,6 +200,69 @@ def test_by_the_clock_commands_are_those_of_the_law(topics: dict[str, Any]) -> N
     np.testing.assert_allclose(ran[0].commands, [law(states[0], k * law.dt) for k in range(9)], rtol=0, atol=1e-15)
     np.testing.assert_array_equal(got, [*ran[0].commands, [-1.5]])
     assert (ran[0].late >= 0).all()
+
+
+def test_the_controller_of_each_run_answers_its_states(topics: dict[str, Any]) -> None:
+    """One robot runs several times in lockstep, each time with a new controller; safe commands are no answers."""
+    law, states = policy(), np.random.default_rng(6).normal(size=(3, 10, 2))
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": PATIENCE}
+    with bridge.SimulatedRobot(law, **where) as robot:
+        for run in states:
+            thread, ran = meanwhile(lambda: bridge.run(law, safe=[-1.5], lockstep=True, **where))
+            got = [robot(state, k * law.dt) for k, state in enumerate(run)]
+            thread.join(PATIENCE)
+            wanted = [law(state, k * law.dt) for k, state in enumerate(run)]
+            np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-15)
+            np.testing.assert_array_equal(got, ran[0].commands)
+    assert (len(robot.round_trips), robot.unanswered) == (30, 0)
+
+
+def test_a_controller_that_ends_before_it_answers_is_not_the_one_of_a_run(topics: dict[str, Any]) -> None:
+    law, node = policy(), bridge._Node(None)
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": PATIENCE}
+    silent, inlet = node.writer(where["commands"], "Float64MultiArray"), node.reader(where["joints"], "JointState")
+    with bridge.SimulatedRobot(law, **where) as robot:
+        thread, got = meanwhile(lambda: robot([0.1, 0.2], 0.0))
+        assert inlet.wait(PATIENCE)
+        del silent, inlet
+        ran = bridge.run(law, safe=[-1.5], lockstep=True, seconds=law.dt, **where)
+        thread.join(PATIENCE)
+    np.testing.assert_array_equal(got, ran.commands)
+    assert (len(robot.round_trips), robot.unanswered) == (1, 0)
+
+
+@pytest.mark.parametrize("slow", [range(12), [3]])
+def test_by_the_clock_a_slow_simulation_gets_no_old_commands(slow: Sequence[int], topics: dict[str, Any]) -> None:
+    """If it is late at each state, or at one. The controller ends before it; then the safe command stays in force."""
+    law, states = policy(steps=12, dt=0.03), np.random.default_rng(7).normal(size=(12, 2))
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": PATIENCE}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[-1.5], lost_after=PATIENCE, **where))
+    with bridge.SimulatedRobot(law, **where) as robot:
+        got = []
+        for j, state in enumerate(states):
+            got.append(robot(state, j * law.dt)[0])
+            time.sleep(3.5 * law.dt if j in slow else 0.0)
+        thread.join(PATIENCE)
+    answered, safe = len(robot.round_trips), got.index(-1.5)
+    for j, command in enumerate(got[:safe]):  # a command may be on its way when its robot publishes the next state
+        fresh = [law(state, k * law.dt)[0] for state in states[max(j - 1, 0) : j + 1] for k in range(12)]
+        assert np.abs(np.array(fresh) - command).min() < 1e-15
+    assert ran[0].completed
+    assert got[safe:] == [-1.5] * (12 - safe)
+    assert safe <= answered <= safe + 1
+    assert answered + robot.unanswered == 12
+    assert f"controller's end, with its last command: {robot.unanswered}" in robot.summary()
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_a_robot_that_ends_is_lost(lockstep: bool, topics: dict[str, Any]) -> None:
+    law = policy(steps=1000, dt=0.05)
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": PATIENCE}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[-1.5], lockstep=lockstep, lost_after=0.15, **where))
+    with bridge.SimulatedRobot(law, **where) as robot:
+        robot([0.1, 0.2], 0.0)
+    thread.join(PATIENCE)
+    assert re.match(r"no state for [\d.]+ s, after \d+ periods", ran[0].reason)
 
 
 def test_it_stops_when_states_stay_away(topics: dict[str, Any]) -> None:
@@ -235,7 +298,7 @@ def test_an_orientation_that_is_none_is_not_used() -> None:
     message = bridge._Node(None).odometry({}, 0.0)
     message.pose.pose.orientation.w = 0.0
     with pytest.raises(ValueError, match="no unit quaternion but of length 0"):
-        bridge._of_odometry(message)
+        bridge._parse_odometry(message)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
@@ -356,6 +419,15 @@ def test_what_is_not_there_is_named(topics: dict[str, Any], monkeypatch: pytest.
         bridge.run(policy(), safe=[0.0], patience=0.1, **where)
     assert silent.get_matched_subscriptions() is not None
     assert not listening.receive()
+    with bridge.SimulatedRobot(policy(), patience=0.1, **where) as robot:
+        with pytest.raises(ls.InputError, match=r"commands: got no controller on /test_.* within 0.1 s"):
+            robot([0.0, 0.0], 0.0)
+        outlet, inlet = node.writer(where["commands"], "Float64MultiArray"), node.reader(where["joints"], "JointState")
+        there = 1
+        with pytest.raises(ls.InputError, match=r"commands: got no command on /test_.* within 0.1 s"):
+            robot([0.0, 0.0], 0.0)
+        assert outlet.get_matched_subscriptions()
+        assert inlet.writers()
 
 
 def test_a_message_without_a_joint_that_was_there_is_not_used(topics: dict[str, Any]) -> None:
