@@ -24,6 +24,7 @@ from lqrsim.errors import InputError, check_path, excerpt, free_name, without_ad
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
+from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
@@ -76,7 +77,11 @@ def run_campaign(
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(files.sole_writer(folder))
         stack.enter_context(_resumable(folder, campaign.scenario))
-        _write_or_check_manifest(campaign, folder, deterministic)
+        specification = _specification(campaign)
+        if os.path.exists(folder / files.NAME):
+            _check_same_campaign(specification, files.read_manifest(folder), folder)
+        else:
+            _begin(campaign, specification, _solve(campaign), folder, deterministic)
         results = Results(folder, scenario=campaign.scenario)
         results.campaign = campaign  # `results.trials` then runs its trials, with the solutions of the folder
         unfinished = _unfinished(results)
@@ -169,10 +174,10 @@ def _is_packaged(kind: type[Disturbance]) -> bool:
     return kind.__module__.partition(".")[0] == "lqrsim"
 
 
-def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: list[tuple[str, float]]) -> None:
-    """Solve for the policies, store them, and write the manifest; or check an existing manifest."""
+def _specification(campaign: Campaign) -> dict[str, Any]:
+    """The fields of the manifest that need no solve; they stay the same when the campaign is resumed."""
     scenario, given = campaign.resolved, campaign.given
-    specification: dict[str, Any] = {
+    return {
         "campaign": campaign.as_json(),
         "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
@@ -180,13 +185,23 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
         "solution": None if given is None else files.digest_of_solution(given),
         "code": _code(campaign),
     }
-    if os.path.exists(folder / files.NAME):
-        _check_same_campaign(specification, files.read_manifest(folder), folder)
-        return
-    design, hashes = campaign.design_disturbances, {}
-    solutions = policies.solve_policies(campaign.policies, scenario, design, given)
+
+
+def _solve(campaign: Campaign) -> dict[str, Solution]:
+    """The solution that each policy runs."""
+    scenario, design = campaign.resolved, campaign.design_disturbances
+    solutions = policies.solve_policies(campaign.policies, scenario, design, campaign.given)
     for policy in {*policies.DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
         policies.make_controller(policies.POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
+    return solutions
+
+
+def _begin(
+    campaign: Campaign, specification: dict[str, Any], solutions: dict[str, Solution], folder: Path,
+    deterministic: list[tuple[str, float]],
+) -> None:  # fmt: skip
+    """Write the solutions and, at last, the manifest, with which the folder is that of a campaign."""
+    scenario, given, hashes = campaign.resolved, campaign.given, dict[str, dict[str, str]]()
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         hashes[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
@@ -197,12 +212,11 @@ def _write_or_check_manifest(campaign: Campaign, folder: Path, deterministic: li
     missing = "; ".join(f"{name}, {impossible[name]}" for name in policies.DEFAULT_POLICIES if name in impossible)
     # Policies that were chosen leave out others on purpose.
     by_default = {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*impossible}
-    specification |= {
+    files.write_manifest(folder, specification | {
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",
         "deterministic": [list(pair) for pair in deterministic],
-    }  # fmt: skip
-    files.write_manifest(folder, specification)
+    })  # fmt: skip
 
 
 def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
