@@ -12,7 +12,7 @@ import itertools
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from copy import copy
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors, policies
 from lqrsim.stress.results import Results
-from lqrsim.stress.study import Campaign, Shard
+from lqrsim.stress.study import Campaign, Cell, Shard
 from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
@@ -68,7 +68,7 @@ def run_campaign(
     campaign, folder = copy(campaign), check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
-    deterministic = _check_runnable(campaign)
+    _check_runnable(campaign)
     if os.path.isdir(folder) and not os.path.exists(folder / files.NAME):
         names = (name for name in os.listdir(folder) if not name.startswith(".unfinished-"))
         if others := sorted({*names} - _CAMPAIGN_FILES):
@@ -81,7 +81,7 @@ def run_campaign(
         if os.path.exists(folder / files.NAME):
             _check_same_campaign(specification, files.read_manifest(folder), folder)
         else:
-            _begin(campaign, specification, _solve(campaign), folder, deterministic)
+            _begin(campaign, specification, _solve(campaign), folder)
         results = Results(folder, scenario=campaign.scenario)
         results.campaign = campaign  # `results.trials` then runs its trials, with the solutions of the folder
         unfinished = _unfinished(results)
@@ -122,11 +122,8 @@ def _resumable(folder: Path, scenario: str) -> Iterator[None]:
         raise
 
 
-def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
-    """Raise InputError for errors that would occur in every trial, before anything is solved or written.
-
-    Return the sweeps and strengths whose disturbances are lqrsim's own and draw nothing. Others may draw during a run.
-    """
+def _check_runnable(campaign: Campaign) -> None:
+    """Raise InputError for errors that would occur in every trial, before anything is solved or written."""
     scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()
     impossible = policies.impossible_policies(scenario, given)
@@ -135,28 +132,15 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
             possible = ", ".join(name for name in policies.CAMPAIGN_POLICIES if name not in impossible)
             raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
     policies.check_used(given, campaign.policies)
-    states, m = np.tile(problem._start_or_zero, (problem.steps + 1, 1)), len(problem.control_coordinates)
-    standing = Trajectory(states, np.zeros((problem.steps, m)), problem.dt)
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
-    deterministic = list[tuple[str, float]]()
-    for cell in {(cell.sweep, cell.strength): cell for cell in campaign.cells}.values():
-        drew_nothing = True
+    for cell in _conditions(campaign):
         for disturbance in campaign.disturbances(cell):
-            generator = np.random.default_rng(campaign.seed)
-            untouched, known = generator.bit_generator.state, _is_packaged(type(disturbance))
             try:
-                disturbance.check(plant)
-                disturbance.start(plant, standing, [generator])
+                _may_draw(campaign, disturbance)
             except InputError as error:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
-            except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
-                _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
-                known = False
-            drew_nothing &= known and generator.bit_generator.state == untouched
-        if drew_nothing:
-            deterministic.append((cell.sweep, cell.strength))
     if {*policies.DESIGNED} & {*campaign.policies}:
         policies.design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
@@ -167,7 +151,32 @@ def _check_runnable(campaign: Campaign) -> list[tuple[str, float]]:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
-    return deterministic
+
+
+def _conditions(campaign: Campaign) -> Iterable[Cell]:
+    """A cell of each sweep and strength."""
+    return {(cell.sweep, cell.strength): cell for cell in campaign.cells}.values()
+
+
+def _may_draw(campaign: Campaign, disturbance: Disturbance) -> bool:
+    """Whether trials may draw numbers for a disturbance: lqrsim's own do so as they start, others perhaps during a run.
+
+    Raises InputError if the disturbance does not fit the robot.
+    """
+    problem, plant = campaign.resolved.problem, campaign.resolved.plant()
+    states, m = np.tile(problem._start_or_zero, (problem.steps + 1, 1)), len(problem.control_coordinates)
+    standing = Trajectory(states, np.zeros((problem.steps, m)), problem.dt)
+    generator = np.random.default_rng(campaign.seed)
+    untouched = generator.bit_generator.state
+    try:
+        disturbance.check(plant)
+        disturbance.start(plant, standing, [generator])
+    except InputError:
+        raise
+    except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
+        _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
+        return True
+    return not _is_packaged(type(disturbance)) or generator.bit_generator.state != untouched
 
 
 def _is_packaged(kind: type[Disturbance]) -> bool:
@@ -196,10 +205,7 @@ def _solve(campaign: Campaign) -> dict[str, Solution]:
     return solutions
 
 
-def _begin(
-    campaign: Campaign, specification: dict[str, Any], solutions: dict[str, Solution], folder: Path,
-    deterministic: list[tuple[str, float]],
-) -> None:  # fmt: skip
+def _begin(campaign: Campaign, specification: dict[str, Any], solutions: dict[str, Solution], folder: Path) -> None:
     """Write the solutions and, at last, the manifest, with which the folder is that of a campaign."""
     scenario, given, hashes = campaign.resolved, campaign.given, dict[str, dict[str, str]]()
     for policy, solution in solutions.items():
@@ -215,7 +221,11 @@ def _begin(
     files.write_manifest(folder, specification | {
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",
-        "deterministic": [list(pair) for pair in deterministic],
+        "deterministic": [
+            [cell.sweep, cell.strength]
+            for cell in _conditions(campaign)
+            if not any(_may_draw(campaign, disturbance) for disturbance in campaign.disturbances(cell))
+        ],
     })  # fmt: skip
 
 
