@@ -33,6 +33,7 @@ from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors, policies
 from lqrsim.stress.results import Results
 from lqrsim.stress.study import Campaign, Cell, Shard
+from lqrsim.stress.trials import Trials
 from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
@@ -83,14 +84,14 @@ def run_campaign(
         else:
             _begin(campaign, specification, _solve(campaign), folder)
         results = Results(folder, scenario=campaign.scenario)
-        results.campaign = campaign  # `results.trials` then runs its trials, with the solutions of the folder
         unfinished = _unfinished(results)
+        if unfinished and (others := changed(results.manifest["versions"])):
+            want = f"the versions of {folder}, or another folder"
+            raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
+        trials = Trials(campaign, {policy: results.solution(policy) for policy in campaign.policies})
         if unfinished:
-            if others := changed(results.manifest["versions"]):
-                want = f"the versions of {folder}, or another folder"
-                raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
-            results.trials.warm_up()  # done here first, so that the workers find everything compiled
-        job = executors.Job.of(results.trials, results.manifest, batch)
+            trials.warm_up()  # done here first, so that the workers find everything compiled
+        job = executors.Job.of(trials, results.manifest, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
         tell(done, total)
@@ -99,7 +100,7 @@ def run_campaign(
         elif workers:
             work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = ((shard, job.work(shard, results.trials)) for shard in unfinished)
+            work = ((shard, job.work(shard, trials)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             files.write(contents, results.path(shard))
             done += shard.count
@@ -107,6 +108,8 @@ def run_campaign(
         for cell in results.cells:
             if (counted := results.tally(cell).total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
+    # What was run is what is replayed, also where a function makes another scenario each time.
+    results.campaign, results.trials = campaign, trials
     return results
 
 

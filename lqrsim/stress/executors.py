@@ -31,8 +31,8 @@ from lqrsim.errors import InputError, format_error
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress.campaign_files import pack
-from lqrsim.stress.results import Trials, failed_rows
 from lqrsim.stress.study import Campaign, Shard
+from lqrsim.stress.trials import Trials, failed_rows
 from lqrsim.versions import versions
 
 FinishedShards = Generator[tuple[Shard, bytes]]
