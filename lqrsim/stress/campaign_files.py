@@ -89,9 +89,9 @@ class Damaged(Exception):
     """The exception for a file that differs from what was written."""
 
 
-def pack(table: Columns, shard: Shard, campaign: str) -> bytes:
-    """Encode a table as a file; `campaign` is the digest of its campaign."""
-    about = _about(shard, campaign)
+def pack(table: Columns, shard: Shard, digest: str) -> bytes:
+    """Encode a table as a file; `digest` is that of its campaign."""
+    about = _about(shard, digest)
     meta = json.dumps(about | {"sha256": _digest(table, about)}).encode()
     arrow = pa.table({name: pa.array(column) for name, column in table.items()}).replace_schema_metadata({_KEY: meta})
     file = io.BytesIO()
@@ -99,9 +99,9 @@ def pack(table: Columns, shard: Shard, campaign: str) -> bytes:
     return file.getvalue()
 
 
-def unpack(contents: bytes, shard: Shard, campaign: str) -> Columns:
+def unpack(contents: bytes, shard: Shard, digest: str) -> Columns:
     """Decode a table. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
-    about = _about(shard, campaign)
+    about = _about(shard, digest)
     try:
         groups = _chunks(contents)
         rows = [[count for _, count in group] for group in groups]
@@ -134,7 +134,7 @@ def write(contents: bytes, path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def read(path: Path, shard: Shard, campaign: str) -> Columns:
+def read(path: Path, shard: Shard, digest: str) -> Columns:
     """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
     if not os.path.isfile(path):
         raise Damaged("it is no regular file")
@@ -144,11 +144,11 @@ def read(path: Path, shard: Shard, campaign: str) -> Columns:
         contents = path.read_bytes()
     except OSError as error:
         raise Damaged(f"it cannot be read ({error.strerror or error})") from None
-    return unpack(contents, shard, campaign)
+    return unpack(contents, shard, digest)
 
 
-def _about(shard: Shard, campaign: str) -> dict[str, Any]:
-    return {"campaign": campaign, "cell": shard.cell, "first": shard.first, "count": shard.count}
+def _about(shard: Shard, digest: str) -> dict[str, Any]:
+    return {"campaign": digest, "cell": shard.cell_number, "first": shard.first, "count": shard.count}
 
 
 def _texts(column: pa.ChunkedArray) -> npt.NDArray[np.str_]:

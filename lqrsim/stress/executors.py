@@ -355,5 +355,5 @@ def _task(job: Job, shard: Shard) -> bytes:
 
     with _lock:
         worker = get_worker()
-        worker.log_event(job.run, [worker.address, [shard.cell, shard.first, shard.count]])
+        worker.log_event(job.run, [worker.address, [shard.cell_number, shard.first, shard.count]])
         return job.work(shard)

@@ -87,7 +87,8 @@ class Results:
     def missing(self) -> list[tuple[Cell, int, int]]:
         """The trials that have not been run: cell, first trial, count."""
         on_disk = self.shards_on_disk()
-        return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in on_disk]
+        missing = (shard for shard in self.shards() if shard not in on_disk)
+        return [(self.cells[shard.cell_number], shard.first, shard.count) for shard in missing]
 
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
         """The outcomes of a cell's trials, in order; with `partial` also if the cell is not finished."""
@@ -259,8 +260,8 @@ class Results:
     @checked
     def path(self, shard: Shard) -> Path:
         """The path of a shard's file."""
-        if shard.cell >= len(self.cells):
-            raise InputError(f"shard: cell: got {shard.cell}, want a whole number from 0 to {len(self.cells) - 1}")
+        if shard.cell_number > (last := len(self.cells) - 1):
+            raise InputError(f"shard: cell: got {shard.cell_number}, want a whole number from 0 to {last}")
         return self.folder / "shards" / shard.file
 
     @checked
@@ -275,7 +276,7 @@ class Results:
         path = self.path(shard)
         if not path.is_file():
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
-            raise InputError(f"cell: got {self.cells[shard.cell]} without trials {trials}, run: {self.command}")
+            raise InputError(f"cell: got {self.cells[shard.cell_number]} without trials {trials}, run: {self.command}")
         try:
             return read(path, shard, self.manifest["digest"])
         except Damaged as error:

@@ -76,14 +76,14 @@ class Cell:
 class Shard:
     """Consecutive trials of a cell that are run together and stored in one file."""
 
-    cell: Index
+    cell_number: Index
     first: Index
     count: Count
 
     @property
     def file(self) -> str:
         """The name of its file: the numbers of the cell and of the first trial."""
-        return f"{self.cell:04d}-{self.first:09d}.parquet"
+        return f"{self.cell_number:04d}-{self.first:09d}.parquet"
 
 
 @checked

@@ -47,7 +47,7 @@ class Trials:
 
     def table(self, shard: Shard, batch: int) -> Columns:
         """The rows of a shard, simulated in batches. If a batch fails, its trials are run again one by one."""
-        cell = self.campaign.cells[shard.cell]
+        cell = self.campaign.cells[shard.cell_number]
         last = shard.first + shard.count
         parts: list[Columns] = []
         for first in range(shard.first, last, batch):
