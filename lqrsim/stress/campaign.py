@@ -301,7 +301,7 @@ def _is_intact(results: Results, shard: Shard) -> bool:
     """Whether a shard's file is as it was written; if it is not, it is moved aside."""
     path = results.path(shard)
     try:
-        files.read(path, shard, results.manifest["digest"])
+        files.read_table(path, shard, results.manifest["digest"])
     except files.Damaged as error:
         folder = results.folder / "damaged"
         try:

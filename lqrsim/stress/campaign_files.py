@@ -134,7 +134,7 @@ def write(contents: bytes, path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def read(path: Path, shard: Shard, digest: str) -> Columns:
+def read_table(path: Path, shard: Shard, digest: str) -> Columns:
     """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
     if not os.path.isfile(path):
         raise Damaged("it is no regular file")

@@ -21,7 +21,7 @@ from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.analysis import Outcomes, outcomes
-from lqrsim.stress.campaign_files import SOLUTION_FILE, Columns, Damaged, digest_of_solution, read, read_manifest
+from lqrsim.stress.campaign_files import SOLUTION_FILE, Columns, Damaged, digest_of_solution, read_manifest, read_table
 from lqrsim.stress.data_table import DataTable, Entry, fraction_format
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
 from lqrsim.stress.statistics import CONFIDENCE
@@ -278,7 +278,7 @@ class Results:
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
             raise InputError(f"cell: got {self.cells[shard.cell_number]} without trials {trials}, run: {self.command}")
         try:
-            return read(path, shard, self.manifest["digest"])
+            return read_table(path, shard, self.manifest["digest"])
         except Damaged as error:
             raise InputError(f"shard: got {path}, which is damaged ({error}), run: {self.command}") from None
 
