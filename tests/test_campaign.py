@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +30,9 @@ from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import executors
 from lqrsim.stress.campaign import run_campaign
-from lqrsim.stress.campaign_files import Damaged, unpack
+from lqrsim.stress.campaign_files import Columns, Damaged, unpack
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.study import Campaign, Cell
+from lqrsim.stress.study import Campaign, Cell, Shard
 from lqrsim.stress.trials import Trials
 
 OWN = """
@@ -729,6 +730,49 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert (again.first_trial, again.outcome) == (collided, ("collided",))
     assert again.frames.shape[1] > 100
     assert main(["stress", "quadrotor", "--resume", "--workers", "0", "--out", str(folder)]) == 0
+
+
+@pytest.mark.parametrize("command", ["stress", "report --out a.html --videos 0", "report --out a.csv"])
+def test_a_table_is_read_once(command: str, own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a run, too, which says what is on disk; and where trials were stopped, whose reasons are told."""
+    monkeypatch.chdir(tmp_path)
+    campaign = troubled(own, "raise")
+    read, first = Counter[Shard](), unpack
+
+    def counted(contents: bytes, shard: Shard, digest: str) -> Columns:
+        read[shard] += 1
+        return first(contents, shard, digest)
+
+    if command != "stress":
+        run_campaign(campaign, "out", workers=0)
+    monkeypatch.setattr("lqrsim.stress.campaign_files.unpack", counted)
+    if command == "stress":
+        options = "--sweep scenario --strengths 1 --policies smooth --trials 24 --shard 8 --workers 0 --out out --json"
+        assert main(["stress", campaign.scenario, *options.split()]) == 1
+    else:
+        what, *options = command.split()
+        assert main([what, "out", "--scenario", campaign.scenario, *options, "--json"]) == 0
+    assert read == dict.fromkeys(Results("out").shards(), 1)
+
+
+def test_what_was_read_does_not_hide_what_is_written_later(reference: Results, tmp_path: Path) -> None:
+    folder, later = tmp_path / "copy", tmp_path / "later"
+    shutil.copytree(reference.folder, folder)
+    later.mkdir()
+    for shard in [*reference.shards()][1:-2]:
+        Results(folder).path(shard).rename(later / shard.file)
+    part = Results(folder)
+
+    def done() -> list[int]:
+        return [ends.total() for _, ends, _ in part.cell_successes()]
+
+    assert done() == [4, 6]
+    for path in later.iterdir():
+        before = sum(done())
+        path.rename(folder / "shards" / path.name)
+        assert sum(done()) > before
+    assert part.rates().columns == reference.rates().columns
+    assert part.summary() == reference.summary()
 
 
 def test_a_replay_says_how_often_it_planned_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,7 @@ class Stress(SetupOptions):
         console.say(f"\nnext:\n  {results.command_of('report')}")
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
-        return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0
+        return 1 if any(ends["error"] for _, ends, _ in results.cell_successes()) else 0
 
 
 OwnScenario = Annotated[

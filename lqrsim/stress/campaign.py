@@ -105,8 +105,8 @@ def run_campaign(
             files.write(contents, results.path(shard))
             done += shard.count
             tell(done, total)
-        for cell in results.cells:
-            if (counted := results.tally(cell).total()) != campaign.trials:
+        for cell, ends, _ in results.cell_successes():
+            if (counted := ends.total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     # What was run is what is replayed, also where a function makes another scenario each time.
     results.campaign, results.trials = campaign, trials

@@ -3,7 +3,8 @@
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -39,6 +40,16 @@ _METHOD = {
 }
 
 
+@dataclass(frozen=True)
+class _SoFar:
+    """What a summary says of a cell, by the shards that it has: small, unlike their rows."""
+
+    shards: list[Shard]
+    ends: Counter[str]
+    reasons: Counter[str]
+    success: analysis.Success | None
+
+
 class Results:
     """The folder of a campaign, finished or not.
 
@@ -59,6 +70,7 @@ class Results:
         self.manifest = read_manifest(self.folder)
         self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
         self._scenario = scenario
+        self._known = dict[Cell, _SoFar]()
         reference = self.manifest["campaign"]["scenario"]
         if scenario is not None:
             named, known = (os.path.normpath(from_anywhere(text)) for text in (scenario, reference))
@@ -90,31 +102,38 @@ class Results:
         missing = (shard for shard in self.shards() if shard not in on_disk)
         return [(self.cells[shard.cell_number], shard.first, shard.count) for shard in missing]
 
+    @checked
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
         """The outcomes of a cell's trials, in order; with `partial` also if the cell is not finished."""
-        tables = list(self.tables(cell, partial=partial))
+        shards = self._to_read(cell, partial)
+        tables = [self.table(shard) for shard in shards]
         if not tables:
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
         names = [name for name in tables[0] if name != "reason"]
         columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
         deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest["deterministic"]
-        return Outcomes(**columns, deterministic=deterministic)
+        found = Outcomes(**columns, deterministic=deterministic)
+        reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
+        self._known[cell] = _SoFar(shards, Counter(found.outcome.tolist()), reasons, analysis.success(cell, found))
+        return found
+
+    def _so_far(self, cell: Cell) -> _SoFar:
+        """What the shards of a cell say. They never change, so they are read again only if there are others."""
+        if not (shards := self._to_read(cell, partial=True)):
+            return _SoFar([], Counter(), Counter(), None)
+        if cell not in self._known or self._known[cell].shards != shards:
+            self.outcomes(cell, partial=True)
+        return self._known[cell]
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
         """The number of trials of each outcome of a cell, which need not be finished if `partial`."""
         return Counter(end for table in self.tables(cell, partial=partial) for end in table["outcome"].tolist())
 
-    def _tallies(self) -> dict[Cell, Counter[str]]:
-        return {cell: self.tally(cell, partial=True) for cell in self.cells}
-
     def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], analysis.Success | None]]:
         """Each cell with its outcomes so far and its success rate, None if no trial has been run."""
         for cell in self.cells:
-            if not any(self.path(shard).is_file() for shard in self.shards(cell)):
-                yield cell, Counter(), None
-                continue
-            found = self.outcomes(cell, partial=True)
-            yield cell, Counter(found.outcome.tolist()), analysis.success(cell, found)
+            known = self._so_far(cell)
+            yield cell, known.ends, known.success
 
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
@@ -124,9 +143,7 @@ class Results:
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
         head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
         lines = [head + "".join(f" {name:>9}" for name in others)]
-        tallies = dict[Cell, Counter[str]]()
         for cell, ends, success in self.cell_successes():
-            tallies[cell] = ends
             if success is None:
                 continue
             exact, reached = success.exact, f"{success.reached}/{success.trials}"
@@ -137,7 +154,7 @@ class Results:
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
         lines += [*self.manifest["remarks"], *designs, *self.plans()]
-        lines += [*self.came_to_nothing(tallies), *self.hints(tallies)]
+        lines += [*self.came_to_nothing(), *self.hints()]
         return "\n".join(lines)
 
     def rates(self) -> DataTable:
@@ -185,21 +202,20 @@ class Results:
                 designs[policy] = "designed anew for the disturbances of each cell, at their strength"
         return designs
 
-    def came_to_nothing(self, tallies: Mapping[Cell, Counter[str]] | None = None) -> list[str]:
+    def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or diverged."""
         reasons: Counter[str] = Counter()
-        for cell, ends in (tallies or self._tallies()).items():
-            if ends["error"] or ends["diverged"]:  # no other table is read again
-                reasons.update(self.reasons(cell).values())
+        for cell in self.cells:
+            reasons.update(self._so_far(cell).reasons)
         return [f"{count} trials were stopped: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
-    def hints(self, tallies: Mapping[Cell, Counter[str]] | None = None) -> list[str]:
+    def hints(self) -> list[str]:
         """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance.
 
         Trials that ended with an error do not count.
         """
         reached: Counter[str] = Counter()
-        for cell, ends in (tallies or self._tallies()).items():
+        for cell, ends, _ in self.cell_successes():
             if cell.strength > 0 and ends["error"] < ends.total():
                 reached[cell.sweep] += ends["reached"]
         sweeps = self.manifest["campaign"]["sweeps"]
@@ -267,9 +283,10 @@ class Results:
     @checked
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[Columns]:
         """The tables of a cell, shard by shard: name -> column. If `partial`, shards that are missing are skipped."""
-        for shard in self.shards(cell):
-            if self.path(shard).is_file() or not partial:
-                yield self.table(shard)
+        yield from map(self.table, self._to_read(cell, partial))
+
+    def _to_read(self, cell: Cell, partial: bool) -> list[Shard]:
+        return [shard for shard in self.shards(cell) if not partial or self.path(shard).is_file()]
 
     def table(self, shard: Shard) -> Columns:
         """The rows of a shard."""

@@ -43,7 +43,6 @@ HOOKS |= {"with_added_state", "off_place", "times", "moved_to", "final_states", 
 HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
 HOOKS |= {"TrialScore.failure"}  # a field, whose default is a function
 HOOKS |= {"settled"}  # an earlier name
-HOOKS |= {"Results.came_to_nothing", "Results.hints"}  # with the tallies that a summary has counted
 
 RAISES = {"Results.read": (Damaged,)}
 
