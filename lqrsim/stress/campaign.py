@@ -12,7 +12,7 @@ import itertools
 import logging
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from copy import copy
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors, policies
 from lqrsim.stress.results import Results
-from lqrsim.stress.study import Campaign, Cell, Shard
+from lqrsim.stress.study import Campaign, Shard
 from lqrsim.stress.trials import Trials
 from lqrsim.versions import changed, other_lqrsim, versions
 
@@ -138,12 +138,13 @@ def _check_runnable(campaign: Campaign) -> None:
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
-    for cell in _conditions(campaign):
-        for disturbance in campaign.disturbances(cell):
+    for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths):
+        for disturbance in campaign.sweeps[sweep]:
+            scaled = disturbance.scaled(strength)
             try:
-                _may_draw(campaign, disturbance)
+                _may_draw(campaign, scaled)
             except InputError as error:
-                raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
+                raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
     if {*policies.DESIGNED} & {*campaign.policies}:
         policies.design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
@@ -154,11 +155,6 @@ def _check_runnable(campaign: Campaign) -> None:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
-
-
-def _conditions(campaign: Campaign) -> Iterable[Cell]:
-    """A cell of each sweep and strength."""
-    return {(cell.sweep, cell.strength): cell for cell in campaign.cells}.values()
 
 
 def _may_draw(campaign: Campaign, disturbance: Disturbance) -> bool:
@@ -225,9 +221,9 @@ def _begin(campaign: Campaign, specification: dict[str, Any], solutions: dict[st
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",
         "deterministic": [
-            [cell.sweep, cell.strength]
-            for cell in _conditions(campaign)
-            if not any(_may_draw(campaign, disturbance) for disturbance in campaign.disturbances(cell))
+            [sweep, strength]
+            for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths)
+            if not any(_may_draw(campaign, disturbance.scaled(strength)) for disturbance in campaign.sweeps[sweep])
         ],
     })  # fmt: skip
 
