@@ -199,12 +199,11 @@ def test_the_distance_of_a_corner_that_is_nowhere_is_not_a_number(kind: str, cou
         lost = corners.copy()
         lost[k] = np.nan
         found = hull_distances(ls.World([one, rock]), lost[None], [count])[0]
-        assert not np.isfinite(found).any()
-        assert np.isnan(found[..., 1]).all()
+        assert np.isnan(found).all()
         displaced = np.zeros((1, 3, 3))
         displaced[0, k % 3] = np.nan
         world = ls.World([rock, one, rock])
-        assert not np.isfinite(signed_distance(world, corners[:1], displaced)).any()
+        assert np.isnan(signed_distance(world, corners[:1], displaced)).all()
 
 
 SIZES = {

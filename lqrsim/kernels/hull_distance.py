@@ -3,7 +3,7 @@
 Let M be the set of all differences of a point of the robot and a point of the obstacle. The signed distance is that of
 the origin to M: apart, the length of M's shortest vector, by the method of Gilbert, Johnson and Keerthi; for an
 overlap, the depth below M's nearest face, by an expanding polytope within M. That is the shortest move that ends the
-overlap. Both know M by its *supports*, its farthest points in a direction.
+overlap. Both methods evaluate only *supports* of M, its farthest points in a direction.
 
 An infinite obstacle makes M a prism without ends, whose faces are edges of its projection. In a plane all are infinite.
 """
@@ -11,13 +11,13 @@ An infinite obstacle makes M a prism without ends, whose faces are edges of its 
 from math import copysign, inf, isnan, nan, sqrt
 
 from lqrsim.kernels.declarations import compact, outline, stack, zeros
-from lqrsim.kernels.signed_distance import signed_distance_derivatives
+from lqrsim.kernels.signed_distance import BOX, CAPSULE, CYLINDER, PLANE, SPHERE, signed_distance_derivatives
 
 STEPS = 60  # largest number of supports; corners need fewer, the rim of a cylinder some 20
-MESH = 5  # the kind of an obstacle that is a hull of corners, of which its row says where they are, and how many
-POINTS, FACES = 64, 256  # largest numbers of a polytope within M
+MESH = 5  # kind of an obstacle that is the convex hull of corners; its row has their number and where they begin
+POINTS, FACES = 64, 256  # largest numbers of points and of faces of the polytope within M
 ROUNDING = 1e-14  # error of a distance, relative to the size of M
-TOUCHING = 1e-12  # distance, relative to the size of M, below which both touch
+TOUCHING = 1e-12  # distance, relative to the size of M, below which robot and obstacle touch
 SHORT = 1e-6  # length, relative to the size of M, below which a difference has lost its direction
 CORNER = 3  # index in a point of M, after its coordinates: the number of the robot's corner
 
@@ -30,15 +30,15 @@ def hull_distance(data, row, corners, first, count, gradient) -> float:
       corners: the robot's corners, from the one numbered `first` on, in any order.
     """
     simplex, weights, normal, axis, curve = zeros(4, 4), zeros(4), stack(3), zeros(3), stack(3, 3)
-    if count == 1 and data[row] != MESH:
-        x, y, z = corners[3 * first], corners[3 * first + 1], corners[3 * first + 2]
-        return signed_distance_derivatives(data, row, x, y, z, gradient, curve)
     for k in range(3 * count):
         gradient[k] = 0.0
     for k in range(3 * count):
         if isnan(corners[3 * first + k]):
             return nan
-    if data[row] == 0:
+    if count == 1 and data[row] != MESH:
+        x, y, z = corners[3 * first], corners[3 * first + 1], corners[3 * first + 2]
+        return signed_distance_derivatives(data, row, x, y, z, gradient, curve)
+    if data[row] == PLANE:
         return distance_to_plane(data, row, corners, first, count, gradient)
     write_axis(data, row, axis)
     distance = shortest(data, row, corners, first, count, axis, simplex, weights, normal)
@@ -70,22 +70,22 @@ def shortest(data, row, corners, first, count, axis, simplex, weights, normal):
 
     Write the points of M of which the vector is a mean, at most 4, and their weights; the other weights are 0.
     """
-    v, size, square, reach = stack(3), 0, inf, 0.0
+    v, size, square, square_extent = stack(3), 0, inf, 0.0
     for i in range(3):
         v[i] = corners[3 * first + i] - data[row + 1 + i]
     for _ in range(STEPS):
         write_support(data, row, corners, first, count, axis, -v[0], -v[1], -v[2], simplex[size])
-        reach = max(reach, dot(simplex[size], simplex[size]))
-        if square < inf and square - dot(v, simplex[size]) <= ROUNDING * sqrt(square * reach):
+        square_extent = max(square_extent, dot(simplex[size], simplex[size]))
+        if square < inf and square - dot(v, simplex[size]) <= ROUNDING * sqrt(square * square_extent):
             break
         left = reduce(simplex, size, square, weights, v)
         if left == 0:
             break
         size, square = left, dot(v, v)
-        if size == 4 or square <= TOUCHING * TOUCHING * reach:  # M has the origin within four points: to rounding
+        if size == 4 or square <= TOUCHING * TOUCHING * square_extent:  # the origin is in M, to rounding
             return 0.0
     prism = dot(axis, axis) > 0
-    if square <= SHORT * SHORT * reach and size == (2 if prism else 3):
+    if square <= SHORT * SHORT * square_extent and size == (2 if prism else 3):
         write_normal(simplex, prism, axis, normal)
         scale = copysign(1.0, dot(normal, v))
     else:
@@ -99,8 +99,8 @@ def shortest(data, row, corners, first, count, axis, simplex, weights, normal):
 def reduce(simplex, size, square, weights, v):
     """Reduce a simplex, with a point added at `size`, to the face with the point nearest to the origin.
 
-    Write that point to v, and its weights; return the number of points. Return 0 if none is nearer than the square of
-    the distance so far says.
+    Write that point to v, and its weights; return the number of points. Return 0 if no face is nearer than before;
+    `square` is the squared distance so far.
     """
     which, trial, nearest = stack(4), stack(4), stack(3)
     best, kept, faces = square, 0, 1 if size == 0 else 2 if size == 1 else 4 if size == 2 else 8
@@ -126,7 +126,10 @@ def reduce(simplex, size, square, weights, v):
 
 
 def write_face(face, size, which):
-    """Write the points of a face: the one at `size`, and those before it that the face's bits say; their number."""
+    """Write the indices of a face's points: the new point `size`, then each point k < size whose bit is set in `face`.
+
+    Return how many.
+    """
     which[0], number, bits = float(size), 1, face
     for k in range(size):
         if bits % 2 == 1:
@@ -189,16 +192,16 @@ def nearest_face(data, row, corners, first, count, axis, simplex, weights, norma
     Write the points of the nearest face, and their weights. If M is flat, the depth is 0, and both stay.
     """
     points, faces, normals, depths = stack(POINTS, 4), stack(FACES, 3), stack(FACES, 3), stack(FACES)
-    reach, total, size, face, prism = 0.0, 0, 4, 0, dot(axis, axis) > 0
-    reach = write_seed(data, row, corners, first, count, axis, points, normal)
-    if reach == 0:
+    extent, total, size, face, prism = 0.0, 0, 4, 0, dot(axis, axis) > 0
+    extent = write_seed(data, row, corners, first, count, axis, points, normal)
+    if extent == 0:
         return 0.0
     if prism:  # the third point of each face is the direction of the axis
         points[3, 0], points[3, 1], points[3, 2], points[3, CORNER] = axis[0], axis[1], axis[2], 0.0
     for k in range(3 if prism else 4):
         one, two = ((k + 1) % 3, 3) if prism else ((k + 1 + k % 2) % 4, (k + 2 - k % 2) % 4)
         total = add_face(points, k, one, two, prism, faces, normals, depths, total)
-    within = ROUNDING * reach
+    within = ROUNDING * extent
     while True:
         for k in range(total):
             if k == 0 or depths[k] < depths[face]:
@@ -211,7 +214,7 @@ def nearest_face(data, row, corners, first, count, axis, simplex, weights, norma
             break
         total = add_point(points, size, face, prism, within, faces, normals, depths, total)
         size, face = size + 1, 0
-    return -choose(points, face, within, prism, faces, normals, depths, total, simplex, weights, normal)
+    return -choose_face(points, face, within, prism, faces, normals, depths, total, simplex, weights, normal)
 
 
 @compact
@@ -269,8 +272,8 @@ def has_side(faces, visible, total, one, two):
 
 
 @compact
-def choose(points, face, within, prism, faces, normals, depths, total, simplex, weights, normal):
-    """Of the faces in the nearest one's plane write that below which the origin is; return the depth."""
+def choose_face(points, face, within, prism, faces, normals, depths, total, simplex, weights, normal):
+    """Of the faces of a flat side write the one that contains the origin's projection; return the depth."""
     trial, number, best = stack(4), 2 if prism else 3, -inf
     for k in range(total):
         alike = dot(normals[k], normals[face]) > 1 - TOUCHING and depths[k] <= depths[face] + within
@@ -291,7 +294,7 @@ def write_seed(data, row, corners, first, count, axis, points, normal):
 
     Return 0 if M is flat, and write the normal.
     """
-    basis, off, trial, known, reach = zeros(4, 3), stack(3), stack(4), 1 if dot(axis, axis) > 0 else 0, 0.0
+    basis, off, trial, known, extent = zeros(4, 3), stack(3), stack(4), 1 if dot(axis, axis) > 0 else 0, 0.0
     for i in range(3):
         basis[0, i] = axis[i]
     write_support(data, row, corners, first, count, axis, 1.0, 0.5, 0.25, points[0])
@@ -300,7 +303,7 @@ def write_seed(data, row, corners, first, count, axis, points, normal):
         for side in range(6):
             for i in range(3):
                 off[i] = (1.0 if side < 3 else -1.0) if i == side % 3 else 0.0
-            length = remove(basis, known + k - 1, off)
+            length = orthogonalize(basis, known + k - 1, off)
             if length > 0.5:  # of three directions, one is this far from those before
                 write_support(data, row, corners, first, count, axis, off[0], off[1], off[2], trial)
                 if widest < 0:
@@ -308,25 +311,25 @@ def write_seed(data, row, corners, first, count, axis, points, normal):
                     widest = 0.0
                 for i in range(3):
                     off[i] = trial[i] - points[0, i]
-                length = remove(basis, known + k - 1, off)
+                length = orthogonalize(basis, known + k - 1, off)
                 if length > widest:
                     widest = length
                     for i in range(4):
                         points[k, i] = trial[i]
                     for i in range(3):
                         basis[known + k - 1, i] = off[i] / length
-        reach = max(reach, widest)
-        if widest <= TOUCHING * reach:
+        extent = max(extent, widest)
+        if widest <= TOUCHING * extent:
             return 0.0
     cross(basis[known], basis[known + 1], off)
     if (dot(off, basis[0]) if known == 1 else -dot(off, basis[2])) < 0:
         for i in range(4):
             points[1, i], points[2, i] = points[2, i], points[1, i]
-    return reach
+    return extent
 
 
 @compact
-def remove(basis, known, vector):
+def orthogonalize(basis, known, vector):
     """Remove the parts of a vector along the first directions of a basis; return the length of what is left."""
     for k in range(known):
         part = dot(basis[k], vector)
@@ -370,12 +373,12 @@ def write_obstacle_support(data, row, x, y, z, point):
     a = data[row + 4] * x + data[row + 7] * y + data[row + 10] * z
     b = data[row + 5] * x + data[row + 8] * y + data[row + 11] * z
     c = data[row + 6] * x + data[row + 9] * y + data[row + 12] * z
-    if (kind == 2 or kind == 3) and half < inf:
+    if (kind == CAPSULE or kind == CYLINDER) and half < inf:
         local[2] = copysign(half, c)
         across = sqrt(a * a + b * b)
-        if kind == 3 and across > 0:
+        if kind == CYLINDER and across > 0:
             local[0], local[1] = a / across * data[row + 13], b / across * data[row + 13]
-    elif kind == 4:
+    elif kind == BOX:
         local[0] = copysign(data[row + 13], a) if data[row + 13] < inf else 0.0
         local[1] = copysign(data[row + 14], b) if data[row + 14] < inf else 0.0
         local[2] = copysign(data[row + 15], c) if data[row + 15] < inf else 0.0
@@ -394,14 +397,15 @@ def write_obstacle_support(data, row, x, y, z, point):
 def rounding_radius(data, row):
     """The radius by which an obstacle goes beyond its supports."""
     kind = data[row]
-    return data[row + 13] if kind == 1 or kind == 2 or (kind == 3 and data[row + 14] == inf) else 0.0
+    endless = kind == CYLINDER and data[row + 14] == inf
+    return data[row + 13] if kind == SPHERE or kind == CAPSULE or endless else 0.0
 
 
 def write_axis(data, row, axis):
     """Write the direction in which an obstacle is infinite, to an array of zeros."""
     for k in range(3):
-        long = data[row + 14] == inf and k == 2 and (data[row] == 2 or data[row] == 3)
-        if long or (data[row + 13 + k] == inf and data[row] >= 4):
+        long = data[row + 14] == inf and k == 2 and (data[row] == CAPSULE or data[row] == CYLINDER)
+        if long or (data[row + 13 + k] == inf and data[row] >= BOX):
             for i in range(3):
                 axis[i] = data[row + 4 + 3 * i + k]
 

@@ -7,6 +7,8 @@ from math import inf, sqrt
 
 from lqrsim.kernels.declarations import inline, stack
 
+PLANE, SPHERE, CAPSULE, CYLINDER, BOX = 0, 1, 2, 3, 4  # kinds of obstacles, as in `KINDS` of `world.py`
+
 
 @inline
 def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
@@ -14,17 +16,17 @@ def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
     kind = data[row]
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
     c = data[row + 6] * dx + data[row + 9] * dy + data[row + 12] * dz
-    if kind == 0:
+    if kind == PLANE:
         return c
     radius, half = data[row + 13], data[row + 14]
-    if kind == 1:
+    if kind == SPHERE:
         return sqrt(dx * dx + dy * dy + dz * dz) - radius
     a = data[row + 4] * dx + data[row + 7] * dy + data[row + 10] * dz
     b = data[row + 5] * dx + data[row + 8] * dy + data[row + 11] * dz
-    if kind == 2:
+    if kind == CAPSULE:
         c -= min(max(c, -half), half)
         return sqrt(a * a + b * b + c * c) - radius
-    if kind == 3:
+    if kind == CYLINDER:
         side, end = sqrt(a * a + b * b) - radius, abs(c) - half
         return sqrt(side * side + end * end) if side > 0 and end > 0 else max(side, end)
     a, b, c = abs(a) - data[row + 13], abs(b) - data[row + 14], abs(c) - data[row + 15]
@@ -45,21 +47,21 @@ def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gr
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
     nx, ny, nz = data[row + 6], data[row + 9], data[row + 12]  # the axis, or a plane's normal
     along = nx * dx + ny * dy + nz * dz
-    if kind == 4:
+    if kind == BOX:
         return box_derivatives(data, row, dx, dy, dz, gradient, hessian)
-    if kind == 0:
+    if kind == PLANE:
         return flat_derivatives(along, 1.0, nx, ny, nz, gradient, hessian)
     radius, half = data[row + 13], data[row + 14]
     # The nearest point of the axis is at `shift`; a side is flat along the axis.
     shift, flat = 0.0, 0.0
-    if kind == 2:
+    if kind == CAPSULE:
         shift = min(max(along, -half), half)
         flat = 1.0 if abs(along) < half else 0.0
-    elif kind == 3:
+    elif kind == CYLINDER:
         shift, flat = along, 1.0
     vx, vy, vz = dx - shift * nx, dy - shift * ny, dz - shift * nz
     length = sqrt(vx * vx + vy * vy + vz * vz)
-    if kind == 3:
+    if kind == CYLINDER:
         side, end = length - radius, abs(along) - half
         sign = 1.0 if along > 0 else -1.0
         if side > 0 and end > 0:
