@@ -165,7 +165,7 @@ DIVIDED = {
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
     "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "follow_step",
-    "measure_optimality", "value_functions_at_plan", "convex_value_functions", "optimality", "roll_out_and_keep",
+    "measure_optimality", "value_functions_at_plan", "convex_value_functions", "optimality_of", "roll_out_and_keep",
 )  # fmt: skip
 
 

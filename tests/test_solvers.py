@@ -226,6 +226,22 @@ def scalar_problem(*, paid: float = 0.0, about: float = 1.0, **rate: float) -> l
 POLE = {"pole": 1.0, "at": 1.0}  # where it begins
 
 
+def creased(steep: float) -> ls.Problem:
+    """Two controls whose cost has a crease where they are equal, along which it falls to zero."""
+
+    def cost(x, u, p):
+        from sympy import Piecewise
+
+        across = u.a - u.b
+        return (u.a**2 + u.b**2) / 2 + p.steep * Piecewise((across, across >= 0), (-across, True))
+
+    return ls.Problem(
+        dynamics=ls.Dynamics(lambda x, u, p: [u.a - u.b], states={"x": "m"}, controls={"a": "m/s", "b": "m/s"}),
+        dt=0.1, steps=5, initial=ls.FixedState([0.0]), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+        stage_cost=ls.SymbolicCost(cost, parameters={"steep": steep}, convex=True),
+    )  # fmt: skip
+
+
 class TestEndings:
     """A hard problem never raises; its status is true and says what to do."""
 
@@ -269,6 +285,23 @@ class TestEndings:
         assert solution.status is Status.MAX_ITERATIONS
         assert len(solution.iterations) == 2
         assert np.isfinite(solution.optimality)
+
+    @pytest.mark.parametrize("stop", ["cost", "optimal"])
+    @pytest.mark.parametrize("seed", range(4))
+    def test_a_plan_that_no_step_improves_has_not_converged(self, seed: int, stop: str) -> None:
+        """On a crease the step is steeply up the other side, however short it is: far above the least cost, of zero.
+
+        Where the plan is optimal, no step lowers its cost either.
+        """
+        rng = np.random.default_rng(seed)
+        at, ratio = rng.uniform(0.1, 10.0), rng.uniform(1.5, 20.0)
+        solution = ls.ilqr(creased(ratio * at), start=[at, at], stop=stop)
+        assert solution.status is Status.STALLED
+        assert solution.cost == pytest.approx(5 * at**2)
+        assert solution.optimality > 0.1
+        flat = scalar_problem(about=rng.normal())
+        again = ls.ilqr(flat, start=ls.ilqr(flat), stop=stop)
+        assert again.status is (Status.COST_CONVERGED if stop == "cost" else Status.CONVERGED)
 
     def test_the_cost_test_alone_is_not_called_converged(self, differential_drive: ls.Scenario) -> None:
         solution = ls.smooth(differential_drive.problem, stop="cost", tolerance=0.5)

@@ -1,6 +1,6 @@
 """Iterations of LQR smoothing and of iLQR, and a descent, all in compiled code.
 
-`smoother_iterations`, `ilqr_iterations` and `descend` run the iterations `first` to `last` - 1, and can be called again
+`smoother_iterations`, `ilqr_iterations` and `descend` run the iterations `first` to `stop` - 1, and can be called again
 to continue, because their state is in their arrays. The log gets a row per iteration. They return four values: the
 number of iterations so far, the outcome (a name in `declarations.py`), whether a failed pass was the backward one, and
 the step at which it failed, or -1.
@@ -90,11 +90,12 @@ NEWTON_STEPS = Descent(
 SHORTEST = 1e-8
 RISE = 1e-12  # rise of the merit, relative to it, that counts as rounding
 NEAR = 0.25  # least reach above 0
-# Part of a weight on changes of the controls that helped which is tried next; the weight that can be left out.
-FADE, FORGOTTEN = 0.1, 1e-6
+# After a success, the weight on changes of the controls is multiplied by WEIGHT_DECAY, and dropped once it is at most
+# NEGLIGIBLE_WEIGHT.
+WEIGHT_DECAY, NEGLIGIBLE_WEIGHT = 0.1, 1e-6
 PATIENCE = 50  # number of steps at a reach above 0 after which iLQR's are tried
 ROUNDING = 1e-11  # relative improvement that may be rounding
-MORE = 3  # largest number of further steps of Newton's method while the smoothed states are not at the plan
+MAX_EXTRA_STEPS = 3  # largest number of further steps of Newton's method while the smoothed states are not at the plan
 
 
 def relative_improvement(old, cost, negligible):
@@ -107,14 +108,15 @@ def relative_improvement(old, cost, negligible):
     return 0.0 if old == cost else (old - cost) / max(abs(cost), negligible)
 
 
-def smoother_iterations(first, last, settings, model, work, memory, log):
+def smoother_iterations(first, stop, settings, model, work, memory, log):
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy in each iteration.
 
-    It ends where, asked in this order,
+    It ends with the first of these that holds:
       1. a pass fails;
-      2. the gap is below `settings.valley`: IN_VALLEY;
-      3. cost and gap have settled: COST_CONVERGED, or CONVERGED if the rollout is optimal, too;
-      4. there were `settings.max_iterations`: MAX_ITERATIONS, or DIVERGED without a finite cost;
+      2. the gap is below `settings.valley`, the cost did not rise, and more iterations may follow: IN_VALLEY;
+      3. the cost has settled: COST_CONVERGED without `settings.optimal`; with it CONVERGED, if the gap has, too, and
+         the rollout is optimal;
+      4. `settings.max_iterations` are done: MAX_ITERATIONS, or DIVERGED without a finite cost;
       5. the costs repeat, CYCLING; or, if `memory.watched`, they no longer fall, or the gap does not: NO_PROGRESS.
 
     Args:
@@ -123,7 +125,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         last complete iteration, and before any those of the first policy. `best` is the rollout of lowest cost so far,
         the first policy's included, and `memory.plan_cost` its cost: for the safeguard.
 
-    With `last` of 0, only the first policy is rolled out.
+    With `stop` of 0, only the first policy is rolled out.
     """
     no_weight, steps, fixed, x_hat = zeros(N), settings.steps, settings.fixed, work.x_hat
     scaled = ProblemModel(
@@ -135,7 +137,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         copy(work.start, N, x_hat)
         if settings.guided and not fixed:
             copy(work.given.states[0], N, x_hat)
-    for done in range(first, last):
+    for done in range(first, stop):
         if fixed:  # whatever ran before, each pass begins at the given start
             copy(work.start, N, x_hat)
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
@@ -156,22 +158,22 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         met = gap < settings.gap_tolerance or not settings.optimal
         cost_converged = abs(improvement) < settings.tolerance and met
         full = done + 1 == settings.max_iterations
-        left, residual = nan, nan
+        optimality, residual = nan, nan
         if gap < settings.valley and improvement >= 0 and not full:
-            write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
+            write_row(log[done], cost, improvement, gap, optimality, residual, SMOOTH)
             return done + 1, IN_VALLEY, False, -1
         if cost_converged or full:
-            left = optimality(settings, work.last, model, cost, negligible)
+            optimality = optimality_of(settings, work.last, model, cost, negligible)
             residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.last.states)
-        write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
-        outcome = outcome_of(cost_converged, settings, left, cost, full)
+        write_row(log[done], cost, improvement, gap, optimality, residual, SMOOTH)
+        outcome = outcome_of(cost_converged, settings, optimality, cost, full)
         if outcome == RUNNING and cycling(log, done):
             outcome = CYCLING
         if outcome == RUNNING and memory.watched > 0 and (no_progress(log, done) or lingering(log, done, settings)):
             outcome = NO_PROGRESS
         if outcome != RUNNING:
             return done + 1, outcome, False, -1
-    return last, RUNNING, False, -1
+    return stop, RUNNING, False, -1
 
 
 def roll_out_and_keep(steps, start, model, work, memory):
@@ -249,20 +251,20 @@ def lingering(log, done, settings):
     return log[done].gap > 0.5 * log[done - LINGER].gap
 
 
-def optimality(settings, plan, model, cost, negligible):
+def optimality_of(settings, plan, model, cost, negligible):
     """The decrease that iLQR's model about a trajectory predicts, relative to its cost; infinite if its pass fails."""
     policy, to_go = Policy(stack(1, M, N), stack(1, M)), CostToGo(stack(1, N, N), stack(1, N), stack(1))
     shift = stack(N)
-    failed, _, left = ddp_pass(settings.steps, plan, model, ModelOrder(0.0, 0.0, to_go), 0, policy, to_go)
+    failed, _, decrease = ddp_pass(settings.steps, plan, model, ModelOrder(0.0, 0.0, to_go), 0, policy, to_go)
     if not settings.fixed:
-        left += initial_step(plan.states[0], model, 0.0, to_go, shift)
-    return relative_optimality(failed, left, cost, negligible)
+        decrease += initial_step(plan.states[0], model, 0.0, to_go, shift)
+    return relative_optimality(failed, decrease, cost, negligible)
 
 
-def write_row(row, cost, improvement, gap, left, residual, method):
+def write_row(row, cost, improvement, gap, optimality, residual, method):
     """Write a row of the log."""
     row.cost, row.improvement, row.gap = cost, improvement, gap
-    row.optimality, row.residual, row.method = left, residual, method
+    row.optimality, row.residual, row.method = optimality, residual, method
 
 
 def relative_optimality(failed, decrease, cost, negligible):
@@ -272,18 +274,18 @@ def relative_optimality(failed, decrease, cost, negligible):
     return decrease / max(abs(cost), negligible, 1e-300)
 
 
-def outcome_of(cost_converged, settings, left, cost, full):
+def outcome_of(cost_converged, settings, optimality, cost, full):
     """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last."""
     if cost_converged and not settings.optimal:
         return COST_CONVERGED
-    if cost_converged and left < settings.tolerance:
+    if cost_converged and optimality < settings.tolerance:
         return CONVERGED
     if full:
         return MAX_ITERATIONS if abs(cost) < inf else DIVERGED
     return RUNNING
 
 
-def ilqr_iterations(first, last, settings, model, work, memory, log):
+def ilqr_iterations(first, stop, settings, model, work, memory, log):
     """Iterative LQR: a backward pass about a feasible trajectory and a line search in each iteration.
 
     Far outside an arena costs reach 1e20, and rounding makes the backward pass's matrices indefinite. Only then do
@@ -303,7 +305,7 @@ def ilqr_iterations(first, last, settings, model, work, memory, log):
         if not abs(cost) < inf:
             return 0, NO_START, False, -1
     cost, damping = memory.plan_cost, memory.weight
-    for done in range(first, last):
+    for done in range(first, stop):
         damping *= 0.1
         failed, good, _ = ilqr_pass(steps, plan, model, damping, policy, to_go)
         while failed >= 0 and good and damping < 1e25:
@@ -321,28 +323,30 @@ def ilqr_iterations(first, last, settings, model, work, memory, log):
             copy_plan(steps, work.last, plan)
         improvement = relative_improvement(old, cost, 0.0)
         cost_converged = abs(improvement) < settings.tolerance
-        left = nan
+        optimality = nan
         if cost_converged or done + 1 == settings.max_iterations:
-            failed, _, left = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
+            failed, _, decrease = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
-            left = relative_optimality(failed, left, cost, 0.0)
+            optimality = relative_optimality(failed, decrease, cost, 0.0)
         memory.plan_cost, memory.weight = cost, damping
-        write_row(log[done], cost, improvement, 0.0, left, 0.0, ILQR)
-        outcome = outcome_of(cost_converged, settings, left, cost, done + 1 == settings.max_iterations)
+        write_row(log[done], cost, improvement, 0.0, optimality, 0.0, ILQR)
+        if fraction == 0 and not optimality < settings.tolerance:  # the cost did not change for want of a step
+            cost_converged = False
+        outcome = outcome_of(cost_converged, settings, optimality, cost, done + 1 == settings.max_iterations)
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED
         if outcome != RUNNING:
-            if isnan(left):  # policy and cost-to-go are not yet computed about the trajectory that was found
+            if isnan(optimality):  # policy and cost-to-go are not yet computed about the trajectory that was found
                 failed, _, _ = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
-    return last, RUNNING, False, -1
+    return stop, RUNNING, False, -1
 
 
 # A descent.
 
 
-def descend(first, last, settings, model, work, memory, log):
+def descend(first, stop, settings, model, work, memory, log):
     """Iterations from the plan: a step, a line search and, once the cost has settled, a pass that judges the plan.
 
     They end where the plan is optimal, CONVERGED or COST_CONVERGED; where nothing is left to try, or the merit falls by
@@ -355,7 +359,7 @@ def descend(first, last, settings, model, work, memory, log):
       memory: row of MEMORY, after `Workspace.begin_descent`.
     """
     how, damped, plan = settings.descent, settings.descent.method == DAMPED, work.best
-    for done in range(first, last):
+    for done in range(first, stop):
         reach, known = memory.reach, memory.known > 0
         if damped:
             good = smoothing_step(settings, model, work, memory)
@@ -398,14 +402,14 @@ def descend(first, last, settings, model, work, memory, log):
                 outcome = STALLED if exhausted else MAX_ITERATIONS
             if outcome != RUNNING:
                 return done + 1, outcome, memory.failed >= 0, int(memory.failed)
-    return last, RUNNING, False, -1
+    return stop, RUNNING, False, -1
 
 
 def smoothing_step(settings, model, work, memory):
     """Find a step by both passes of smoothing: write its policy, relative to the plan, and where it begins to `x_hat`.
 
-    If a pass fails, `memory.failed` is the step at which it did, else -1. Returns whether all numbers there were
-    finite.
+    If a pass fails, `memory.failed` is the step at which it did, else -1. Returns whether all numbers in the
+    passes were finite.
     """
     copy(work.start if settings.fixed else work.best.states[0], N, work.x_hat)
     about, negligible = Linearization(work.best, True, memory.reach, memory.weight, work.prior), 0.0
@@ -421,12 +425,13 @@ def smoothing_step(settings, model, work, memory):
 
 
 def newton_step(settings, model, work, memory):
-    """The same by a pass about the plan: the first on the ladder of regularisation that has a minimum.
+    """Find a step by a pass about the plan, with the least regularisation that gives a minimum.
 
-    The ladder has the shares of second-order terms, from the memory's down to none, and then the weights on changes of
-    the controls. The second-order cost-to-go takes the place of the cost-to-come.
+    The rest is as in `smoothing_step`. The ladder of regularisation has the shares of second-order terms, from the
+    memory's down to none, and then the weights on changes of the controls. The second-order cost-to-go takes the place
+    of the cost-to-come.
     """
-    how, failed, good, left, second_order, size = settings.descent, -1, True, nan, 0.0, 0.0
+    how, failed, good, decrease, second_order, size = settings.descent, -1, True, nan, 0.0, 0.0
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
     if NOISY:  # the cost of noise is weighed with the cost-to-go of smoothing
         order = ModelOrder(0.0, 0.0, work.to_go)
@@ -443,8 +448,8 @@ def newton_step(settings, model, work, memory):
             damping = max(how.factor * damping, lightest)
         if second_order <= memory.second_order:
             order = ModelOrder(damping, second_order, work.to_go)
-            failed, good, left = pass_about_plan(settings, order, model, work, work.policy, second)
-            if failed < 0 and isnan(left) and not settings.fixed:  # the start has no minimum
+            failed, good, decrease = pass_about_plan(settings, order, model, work, work.policy, second)
+            if failed < 0 and isnan(decrease) and not settings.fixed:  # the start has no minimum
                 failed = 0
             if failed < 0 or not good:
                 break
@@ -452,8 +457,9 @@ def newton_step(settings, model, work, memory):
     memory.second_order, memory.damping = second_order, damping
     for t in range(settings.steps + 1):
         size = max(size, abs(second.constant[t]))
-    memory.negligible, memory.decrease = settings.rounding * size, 2 * left
-    memory.relative_decrease = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
+    memory.negligible, memory.decrease = settings.rounding * size, 2 * decrease
+    negligible = max(memory.negligible, memory.least)
+    memory.relative_decrease = relative_optimality(failed, decrease, memory.merit, negligible)
     return good
 
 
@@ -465,13 +471,13 @@ def pass_about_plan(settings, order, model, work, policy, to_go):
       NaN if the start has no minimum.
     """
     plan, shift = work.best, stack(N)
-    failed, good, left = ddp_pass(settings.steps, plan, model, order, 1, policy, to_go)
+    failed, good, decrease = ddp_pass(settings.steps, plan, model, order, 1, policy, to_go)
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     if failed < 0 and not settings.fixed:
-        left += initial_step(plan.states[0], model, order.second_order, to_go, shift)
+        decrease += initial_step(plan.states[0], model, order.second_order, to_go, shift)
         for i in range(N):
             work.x_hat[i] += shift[i]
-    return failed, good, left
+    return failed, good, decrease
 
 
 def update_plan_cost(steps, model, work, memory):
@@ -495,7 +501,7 @@ def relax(how, memory, fraction):
     """Regularise less after an iteration that lowered the merit with that fraction of its step."""
     memory.second_order, memory.known = how.second_order, 0.0
     if memory.weight > 0:
-        memory.weight = FADE * memory.weight if memory.weight > FORGOTTEN else 0.0
+        memory.weight = WEIGHT_DECAY * memory.weight if memory.weight > NEGLIGIBLE_WEIGHT else 0.0
     elif memory.reach > 0:
         if fraction == 1:
             memory.reach = min(2 * memory.reach, 1.0)
@@ -531,19 +537,20 @@ def turn_to_ilqr(memory):
 def measure_optimality(settings, cost_converged, ending, model, work, memory, row):
     """Measure the plan's optimality; compute policy and value functions about it. CONVERGED if optimal, else RUNNING.
 
-    Newton's pass that measures it is the next step's, and value functions are computed at its end alone: as in
-    smoothing, without second-order terms. They are convex, so that the minimum of their sum is at the plan. If it is
-    not, up to MORE further steps follow: in flat directions a plan may be far off although the predicted decrease is
-    small.
+    For Newton's method, the pass that measures it also provides the next step. Value functions are computed only when
+    the method ends, without second-order terms, so that they are convex. The minimum of their sum should then be at the
+    plan. If it is not, up to MAX_EXTRA_STEPS further steps follow, because in flat directions a plan may be far off
+    although the predicted decrease is small.
     """
     how = settings.descent
     if how.method == DAMPED:
         order = ModelOrder(0.0, 0.0, work.to_go)
-        failed, _, left = pass_about_plan(settings, order, model, work, work.policy, work.to_go)
+        failed, _, decrease = pass_about_plan(settings, order, model, work, work.policy, work.to_go)
         if NOISY and failed < 0:
             update_plan_cost(settings.steps, model, work, memory)
         memory.failed = failed
-        memory.relative_decrease = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
+        negligible = max(memory.negligible, memory.least)
+        memory.relative_decrease = relative_optimality(failed, decrease, memory.merit, negligible)
     elif memory.known == 0:
         newton_step(settings, model, work, memory)
     if memory.failed >= 0:
@@ -554,8 +561,8 @@ def measure_optimality(settings, cost_converged, ending, model, work, memory, ro
         value_functions_at_plan(settings, model, work, memory, row)
     elif optimal or ending:
         convex_value_functions(settings, model, work, memory, row)
-        if not ending and not memory.final_gap < settings.gap_tolerance and memory.more < MORE:
-            memory.more += 1
+        if not ending and not memory.final_gap < settings.gap_tolerance and memory.extra_steps < MAX_EXTRA_STEPS:
+            memory.extra_steps += 1
             newton_step(settings, model, work, memory)
             optimal = False
     if not optimal:

@@ -592,11 +592,11 @@ def _row(*names: str) -> np.dtype[np.void]:
 # iLQR's, how many remain, how many there will be the next time, and how many others there were since.
 # Of passes about the plan: known: 1 if the next step's was made; its fraction of second_order terms, weight on changes
 # of the controls (damping), predicted slope of the merit (decrease) and predicted decrease, relative to the merit
-# (relative_decrease). more: number of steps that followed an optimal plan.
+# (relative_decrease). extra_steps: number of steps that followed an optimal plan.
 MEMORY = _row(
     "plan_cost", "merit", "started", "watched", "small_changes", "idle", "failed", "negligible", "least", "final_gap",
     "reach", "weight", "ilqr_left", "ilqr_next", "since_ilqr", "known", "second_order", "damping", "decrease",
-    "relative_decrease", "more",
+    "relative_decrease", "extra_steps",
 )  # fmt: skip
 
 # The state of an interior point between calls. cost, stationarity, violation, gap, complementarity: the measures of the

@@ -727,7 +727,8 @@ class Workspace:
         """
         memory = self.memory
         memory["merit"], memory["least"] = memory["plan_cost"] + added, least
-        memory["reach"], memory["second_order"], memory["known"], memory["more"] = how.reach, how.second_order, 0.0, 0.0
+        memory["reach"], memory["second_order"] = how.reach, how.second_order
+        memory["known"], memory["extra_steps"] = 0.0, 0.0
         memory["weight"], memory["small_changes"], memory["idle"] = 0.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
 
