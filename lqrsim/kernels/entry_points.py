@@ -45,14 +45,15 @@ from lqrsim.kernels.stages import read_rows as read_rows
 from lqrsim.kernels.stages import write_models as write_models
 
 
-def smoother(task, first, last, settings, model, work, memory, log):
-    """Run undamped iterations, or a descent; or do something else with a plan.
+def smoother(task, first, stop, settings, model, work, memory, log):
+    """Run one task of the smoother: iterate, descend, or linearise, certify or measure a plan.
 
     Args:
       task: one of ITERATE, DESCEND; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
-        to certify the last policy and rollout with the Hessians of the cost-to-go; or EVALUATE, the same with Hessians
-        of the policy itself, which overwrite them; or CURVE, to measure the curvature of the cost about that rollout.
-      first, last: iterations to run, `last` excluded. The rest are records.
+        to certify the last policy and rollout with the Hessians of the cost-to-go; EVALUATE, the same with the Hessians
+        of the cost of following the policy, which replace those of the cost-to-go; or CURVE, to measure the curvature
+        of the cost about the last rollout.
+      first, stop: iterations to run, `stop` excluded. The rest are records.
     """
     if task == CURVE:
         reduced_curvature(settings, work.last, model, work.certificate[0])
@@ -64,32 +65,37 @@ def smoother(task, first, last, settings, model, work, memory, log):
         measure_optimality(settings, False, False, model, work, memory[0], log[0])
         return 0, RUNNING, memory[0].failed >= 0, int(memory[0].failed)
     if task == DESCEND:
-        return descend(first, last, settings, model, work, memory[0], log)
-    return smoother_iterations(first, last, settings, model, work, memory[0], log)
+        return descend(first, stop, settings, model, work, memory[0], log)
+    return smoother_iterations(first, stop, settings, model, work, memory[0], log)
 
 
-def ilqr(task, first, last, settings, model, work, memory, log):
-    """Run iterations of iLQR; or linearise about the plan, or certify a plan, as `smoother` does."""
+def ilqr(task, first, stop, settings, model, work, memory, log):
+    """Run iterations of iLQR; or linearise about the plan, or certify a plan, as `smoother` does.
+
+    DESCEND and CURVE are not among its tasks.
+    """
     if task >= CERTIFY:
         certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == LINEARIZE:
-        failed, _, left = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
-        log[0].optimality = relative_optimality(failed, left, memory[0].plan_cost, 0.0)
+        failed, _, decrease = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        log[0].optimality = relative_optimality(failed, decrease, memory[0].plan_cost, 0.0)
         return 0, RUNNING, failed >= 0, failed
-    return ilqr_iterations(first, last, settings, model, work, memory[0], log)
+    return ilqr_iterations(first, stop, settings, model, work, memory[0], log)
 
 
-def lq_passes(steps, dynamics, inverse, stages, constants, work):
+def lq_passes(steps, dynamics, forward_steps, stages, constants, work):
     """Both passes of a linear-quadratic problem, and its smoothed states.
 
     Args:
-      dynamics: LinearStep, [A B] (T, N, W) and c (T, N). inverse: the steps that the form's forward pass takes.
+      dynamics: LinearStep, [A B] (T, N, W) and c (T, N).
+      forward_steps: steps of the forward pass: inverse steps in the primal form, `dynamics` in the dual form.
       stages: QuadraticStage, (T, W, W) and (T, W). constants: (T,).
       work: RiccatiArrays, with the cost-to-go at T and the cost-to-come at 0.
 
     Returns:
-      The step that failed, or -1; and 0 if it was in the backward pass, 1 in the forward pass, 2 in their sum.
+      The step that failed, or -1; and 0 if it was in the backward pass, 1 in the forward pass, 2
+      where the two value functions were added.
     """
     stage, costate, anywhere = QuadraticStage(stack(W, W), stack(W)), stack(N), zeros(N)
     limits = Limits(stack(M), stack(M))
@@ -102,7 +108,7 @@ def lq_passes(steps, dynamics, inverse, stages, constants, work):
             return t, 0
     for t in range(steps):
         copy_stage(t, stages, stage)
-        step = LinearStep(inverse.jacobian[t], inverse.offset[t])
+        step = LinearStep(forward_steps.jacobian[t], forward_steps.offset[t])
         if not riccati_forward(t, step, stage, constants[t], work.to_come, work.smoothing):
             return t, 1
     for t in range(steps + 1):
