@@ -1262,7 +1262,7 @@ class TestControl:
         measure, slope = module.addresses("measure", "measure_slope")
         sensor, dynamics = SensorModel(measure, slope, np.array([1.5])), compiled.dynamics_model(CART)
         z, d, p = 3 + lag + 2, 2, 1
-        source = source_of(feedback, LAG=lag, D=d, Y=2, P=p, Z=z, V=p + 4, NUMBERS=2, HELD=d)
+        source = source_of(feedback, LAG=lag, D=d, Y=2, P=p, Z=z, V=p + 4, NUMBERS=2, PADDED_D=d)
         rng, k = np.random.default_rng(1), 3
         estimates, turning = rng.normal(size=(k, z)), turning_of(CART.state_coordinates)
         states, controls = rng.normal(size=(k, 3)), rng.normal(size=(k, 2))

@@ -255,7 +255,8 @@ class PlanModel:
         unknown = len(self.parameters)
         source = source_of(
             feedback, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
-            V=unknown + 2 * self.m, NUMBERS=len(self.compiled_dynamics.parameters), HELD=max(len(self.transition), 1),
+            V=unknown + 2 * self.m, NUMBERS=len(self.compiled_dynamics.parameters),
+            PADDED_D=max(len(self.transition), 1),
         )  # fmt: skip
         label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
         return module_of(source, label, N=self.n, M=self.m, W=self.n + self.m)

@@ -1,8 +1,8 @@
 """Feedback for many trials at once: a policy, and the steps of a Kalman filter. `AffinePolicy` does the first in NumPy.
 
 An estimate is one row of Z numbers: the state x (N), the actuators' lagging controls (LAG: M numbers, or none), and the
-states of the unknowns' model (D). `output` times these are the unknowns: of P parameters of the dynamics, and of the
-gain and the offset of each control (V = P + 2 M).
+states of the unknowns' model (D). `output` maps these D states to the V = P + 2 M unknowns: changes of P parameters of
+the dynamics, and of the gain and the offset of each control.
 """
 
 from math import floor, nan, pi, sqrt
@@ -13,7 +13,7 @@ from lqrsim.kernels.riccati import limited_control
 
 LAG, D, Y = 0, 1, 1  # counts of lagging controls, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
-NUMBERS, HELD = 1, 1  # number of parameters of the dynamics; D, but at least 1
+NUMBERS, PADDED_D = 1, 1  # number of parameters of the dynamics; D, but at least 1
 FAR = 1e9  # an entry of an estimate beyond this has diverged, whatever its unit
 
 
@@ -36,12 +36,12 @@ def slopes_along(steps, states, controls, dynamics, dt, arrived, jacobian):
         call(dynamics.step_jacobian, states[t], controls[t], dynamics.parameters, dt, arrived[t], jacobian[t])
 
 
-def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slopes):
+def parameter_slopes(steps, states, controls, dynamics, dt, parameter_indices, changes, slopes):
     """Write the derivatives (steps, N, P) of the steps of a plan in parameters, by differences with `changes` (P,)."""
     p, q, more, less = dynamics.parameters, stack(NUMBERS), stack(N), stack(N)
     copy(p, NUMBERS, q)
     for j in range(P):
-        k, h = int(which[j]), changes[j]
+        k, h = int(parameter_indices[j]), changes[j]
         for t in range(steps):
             q[k] = p[k] + h
             call(dynamics.advance, states[t], controls[t], q, dt, more)
@@ -52,28 +52,31 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
         q[k] = p[k]
 
 
-def correct(count, shown, lost, nominal, gain, limit, wider, sensor, angular, estimates, innovations):
+def correct(count, measured, lost, nominal, gain, limit, limit_factors, sensor, angular, estimates, innovations):
     """Update estimates (count, Z) with measurements, except where these were lost.
 
     Args:
-      shown: (count, N) measured states, replaced by the representatives nearest to the estimates.
+      measured: (count, N) measured states, of which the representatives nearest to the estimates count.
       lost: (count,) 1 where a measurement was lost, else 0.
       nominal: (N,) a state; the estimates are first replaced by the representatives nearest to it. gain: (Z, Y).
       limit: (D,) largest corrections of the unknowns' states; if one is exceeded, all of these are scaled down.
-      wider: (count,) factors of the limit. They double where it is exceeded, and are 1 again where it is not.
+      limit_factors: (count,) factors on the limit, doubled where it is exceeded, and 1 again after the next correction
+        within it.
       innovations: (count, Y) measurements minus expectations, written; NaN where the measurement was lost.
     """
     for k in range(count):
         z, innovation = estimates[k], innovations[k]
-        fraction = correct_one(shown[k], lost[k], nominal, gain, limit, wider[k], sensor, angular, z, innovation)
+        fraction = correct_one(
+            measured[k], lost[k], nominal, gain, limit, limit_factors[k], sensor, angular, z, innovation
+        )
         if fraction < 1.0:
-            wider[k] *= 2.0
+            limit_factors[k] *= 2.0
         elif lost[k] == 0.0:
-            wider[k] = 1.0
+            limit_factors[k] = 1.0
 
 
 @outline
-def correct_one(shown, lost, nominal, gain, limit, wider, sensor, angular, z, innovation):
+def correct_one(measured, lost, nominal, gain, limit, limit_factor, sensor, angular, z, innovation):
     """Update the estimate z (Z,) of one trial. Returns the fraction of the unknowns' correction that was made."""
     x, seen, expected, corrected = stack(N), stack(Y), stack(Y), stack(Z)
     fraction = 1.0
@@ -81,7 +84,7 @@ def correct_one(shown, lost, nominal, gain, limit, wider, sensor, angular, z, in
     if lost != 0.0:
         fill(innovation, Y, nan)
         return fraction
-    copy(shown, N, x)
+    copy(measured, N, x)
     to_nearest(x, z, angular)
     call(sensor.measure, x, sensor.data, seen)
     call(sensor.measure, z, sensor.data, expected)
@@ -94,8 +97,8 @@ def correct_one(shown, lost, nominal, gain, limit, wider, sensor, angular, z, in
         corrected[i] = total
     for i in range(D):
         change = abs(corrected[N + LAG + i] - z[N + LAG + i])
-        if change * fraction > wider * limit[i]:
-            fraction = wider * limit[i] / change
+        if change * fraction > limit_factor * limit[i]:
+            fraction = limit_factor * limit[i] / change
     for i in range(Z):
         if fraction < 1.0 and i >= N + LAG:
             z[i] += fraction * (corrected[i] - z[i])
@@ -113,8 +116,8 @@ def predict(count, controls, predictor, estimates):
 @outline
 def predict_one(control, predictor, z):
     """Predict the estimate z (Z,) of one trial."""
-    p, places, lag = predictor.dynamics.parameters, predictor.places, predictor.lag
-    q, v, after, value, next_states = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
+    p, parameter_indices, lag = predictor.dynamics.parameters, predictor.parameter_indices, predictor.lag
+    q, v, after, value, next_states = stack(NUMBERS), stack(M), stack(N), stack(V), stack(PADDED_D)
     for i in range(V):
         total = 0.0
         for j in range(D):
@@ -122,7 +125,7 @@ def predict_one(control, predictor, z):
         value[i] = total
     copy(p, NUMBERS, q)
     for i in range(P):
-        q[int(places[i])] += value[i]
+        q[int(parameter_indices[i])] += value[i]
     for i in range(M):
         u = control[i]
         if LAG > 0:
@@ -201,20 +204,21 @@ def to_nearest(x, nominal, angular):
 
 
 def nearest_rotation(x, nominal, first, turn):
-    """Replace the rotation vector at x[first] by the nearest to the nominal among (angle + 2 pi k) axis, which are all
-    the same rotation; without its entry `turn`, 0 to 2, if that is an angle. See coordinates.py.
+    """Replace the rotation vector at x[first] by the equivalent (angle + 2 pi k) axis that is nearest to the nominal.
+
+    If `turn` is 0 to 2, that entry is a separate angle and is left alone; -1 if there is none. See coordinates.py.
     """
-    axis, reference, square, length, along = stack(3), stack(3), 0.0, 0.0, 0.0
+    axis, reference, square, reference_square, along = stack(3), stack(3), 0.0, 0.0, 0.0
     for i in range(3):
         axis[i], reference[i] = 0.0, 0.0
         if i != turn:
             axis[i], reference[i] = x[first + i], nominal[first + i]
         square += axis[i] * axis[i]
-        length += reference[i] * reference[i]
-    angle, distance = sqrt(square), sqrt(length)
+        reference_square += reference[i] * reference[i]
+    angle, reference_length = sqrt(square), sqrt(reference_square)
     for i in range(3):
         if angle < 1e-12:  # the identity has every axis
-            axis[i] = reference[i] / distance if distance > 0.0 else 0.0
+            axis[i] = reference[i] / reference_length if reference_length > 0.0 else 0.0
         else:
             axis[i] /= angle
         along += axis[i] * reference[i]

@@ -555,7 +555,7 @@ class Predictor(NamedTuple):
 
     dynamics: DynamicsModel
     dt: float
-    places: Arrays  # (P,) indices of the unknown parameters
+    parameter_indices: Arrays  # (P,) of the unknowns
     lag: Arrays  # (2,) what is left of the difference to a command at the end of a period, and on average over it
     transition: Arrays  # (D, D), for the unknowns' states
     output: Arrays  # (V, D), from these to the unknowns
