@@ -1,7 +1,7 @@
 """Small dense linear algebra.
 
-Innermost loops have constant length, so LLVM unrolls and vectorises them. Matrices are (N, N) or, for states and
-controls joined, (W, W). Of symmetric matrices the upper triangle is read.
+Loops over rows and columns have constant length where possible, so LLVM unrolls and vectorises them. Matrices are
+(N, N) or, for states and controls joined, (W, W). `cholesky` reads the upper triangle only.
 """
 
 from math import inf, sqrt
@@ -97,9 +97,9 @@ def cholesky(a, size):
         for j in range(k + 1, size):
             a[k, j] *= inverse
         for i in range(k + 1, size):
-            factor = a[k, i]
+            multiplier = a[k, i]
             for j in range(i, size):
-                a[i, j] -= factor * a[k, j]
+                a[i, j] -= multiplier * a[k, j]
     return True
 
 
@@ -107,9 +107,9 @@ def cholesky_solve(a, size, b):
     """Solve U'U y = b in place, given the factor."""
     for i in range(size):
         b[i] *= a[i, i]
-        factor = b[i]
+        multiplier = b[i]
         for j in range(i + 1, size):
-            b[j] -= a[i, j] * factor
+            b[j] -= a[i, j] * multiplier
     for i in range(size - 1, -1, -1):
         total = b[i]
         for j in range(i + 1, size):
@@ -118,16 +118,16 @@ def cholesky_solve(a, size, b):
 
 
 def about_origin(hessian, gradient, x, u, value):
-    """Turn a quadratic about (x, u) into one about the origin: its gradient in place; return its constant. Eq. (27)."""
+    """Shift a quadratic from (x, u) to the origin: change the gradient in place, and return the constant. Eq. (27)."""
     constant = value
     for i in range(W):
-        curved = 0.0
+        row_product = 0.0
         for j in range(N):
-            curved += hessian[i, j] * x[j]
+            row_product += hessian[i, j] * x[j]
         for j in range(M):
-            curved += hessian[i, N + j] * u[j]
-        constant += (0.5 * curved - gradient[i]) * entry(x, u, i)
-        gradient[i] -= curved
+            row_product += hessian[i, N + j] * u[j]
+        constant += (0.5 * row_product - gradient[i]) * entry(x, u, i)
+        gradient[i] -= row_product
     return constant
 
 
@@ -167,8 +167,8 @@ def quadratic_at(z, v, c):
     """The value `1/2 c'zc + v'c`; z (N, N), v and c (N,)."""
     total = 0.0
     for i in range(N):
-        curved = 0.0
+        row_product = 0.0
         for j in range(N):
-            curved += z[i, j] * c[j]
-        total += (0.5 * curved + v[i]) * c[i]
+            row_product += z[i, j] * c[j]
+        total += (0.5 * row_product + v[i]) * c[i]
     return total
