@@ -32,9 +32,9 @@ from lqrsim.kernels.riccati import limited_control, minimize_control
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     """Write the cost-to-come at 0, given c_0 quadratised at x; return its constant, and whether it exists. Eq. (18).
 
-    If c_0 has no curvature, there is no covariance. In the dual form it then gets a small curvature about x, relative
-    to each state's own curvature, or to the cost-to-go's. An optimum remains an optimum, and the next iteration moves x
-    further.
+    If the Hessian of c_0 is nearly singular or indefinite, it has no usable inverse. The dual form then adds a small
+    curvature about x, relative to each state's own curvature or the cost-to-go's. It vanishes at x, so an optimum stays
+    a fixed point; other starts are reached over several iterations.
     """
     if PRIMAL:
         copy(q, N, to_come.vector[0])
@@ -51,11 +51,11 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
         for j in range(N):
             scale = column[i] * column[j]
             factor[i, j] = Q[i, j] / scale if scale > 0 else 0.0
-    curved = cholesky(factor, N)
+    definite = cholesky(factor, N)
     for i in range(N):
-        curved = curved and factor[i, i] < 1e6  # the reciprocal of the root of a pivot
+        definite = definite and factor[i, i] < 1e6  # the reciprocal of the root of a pivot
     copy_matrix(Q, N, N, factor)
-    if not curved:
+    if not definite:
         for i in range(N):
             little = 1e-6 * max(abs(Q[i, i]), S[i, i])
             if not little > 0:
@@ -84,11 +84,11 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
 
 
 @inline
-def linearize(x, u, model, arrived, step, spare):
-    """Write the next state (N,), and the linear step of `riccati_forward`; return the Jacobian (N, W) forwards.
+def linearize(x, u, model, arrived, step, forward_jacobian):
+    """Write the next state (N,), and the linear step of `riccati_forward`; return the forward Jacobian (N, W).
 
-    In the primal form the linear step is the inverse, linearised there: x = jacobian (x_next, u) + offset. The Jacobian
-    forwards is then computed, in `spare`, only if there is a risk; else it is undefined.
+    In the primal form the linear step is the inverse, linearised there: x = jacobian (x_next, u) + offset. The
+    forward Jacobian is then computed only if there is a risk, and written to `forward_jacobian`; else it is undefined.
     """
     if not PRIMAL:
         linearize_forward(x, u, model, arrived, step)
@@ -98,8 +98,8 @@ def linearize(x, u, model, arrived, step, spare):
     step_jacobian(arrived, u, model, -model.dt, x_back, step.jacobian)
     step_offset(step.jacobian, arrived, u, x_back, step.offset)
     if NOISY and model.noise.risk[0] != 0:
-        step_jacobian(x, u, model, model.dt, arrived, spare)
-    return spare
+        step_jacobian(x, u, model, model.dt, arrived, forward_jacobian)
+    return forward_jacobian
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
@@ -154,10 +154,10 @@ def primal_step(t, step, stage, constant, to_come, smoothing):
 def dual_step(t, step, stage, constant, to_come, smoothing):
     """`riccati_forward` by the step x_{t+1} = [A B] (x, u) + c."""
     jacobian, c, cost, slope = step.jacobian, step.offset, stage.hessian, stage.gradient
-    V0, x0, V, x = to_come.matrix[t], to_come.vector[t], to_come.matrix[t + 1], to_come.vector[t + 1]
+    V0, mean, V, next_mean = to_come.matrix[t], to_come.vector[t], to_come.matrix[t + 1], to_come.vector[t + 1]
     updated, gain, feedforward = smoothing.state[t], smoothing.control_gain[t], smoothing.control[t]
     factor, F, h, AT, BT = stack(M, M), stack(M, N), stack(M), stack(N, N), stack(M, N)
-    Q, q, size, slope0 = stack(N, N), stack(N), stack(N), stack(N)
+    Q, q, diagonal, slope_at_mean = stack(N, N), stack(N), stack(N), stack(N)
     # Products are formed in arrays of this function and then copied: without aliasing they become vector code.
     U, G = stack(N, N), stack(N, N)
     # Eliminate the control from the step and its stage.
@@ -173,7 +173,7 @@ def dual_step(t, step, stage, constant, to_come, smoothing):
         return False
     cholesky_solve(factor, M, h)
     for i in range(N):
-        q[i], size[i] = slope[i], abs(cost[i, i])
+        q[i], diagonal[i] = slope[i], abs(cost[i, i])
         for j in range(N):
             Q[i, j] = cost[i, j]
             AT[i, j] = jacobian[j, i]
@@ -191,20 +191,20 @@ def dual_step(t, step, stage, constant, to_come, smoothing):
     for k in range(M):
         value -= 0.5 * slope[N + k] * h[k]
     for i in range(N):
-        curved = 0.0
+        row_product = 0.0
         for j in range(N):
-            curved += Q[i, j] * x0[j]
+            row_product += Q[i, j] * mean[j]
             U[i, j] = V0[i, j]
-        slope0[i] = curved + q[i]
-        value += (0.5 * curved + q[i]) * x0[i]
-    if not update(U, Q, size):
+        slope_at_mean[i] = row_product + q[i]
+        value += (0.5 * row_product + q[i]) * mean[i]
+    if not update(U, Q, diagonal):
         return False
     for i in range(N):
         moved = 0.0
         for j in range(N):
-            moved += U[i, j] * slope0[j]
-        updated[i] = x0[i] - moved
-        value -= 0.5 * slope0[i] * moved
+            moved += U[i, j] * slope_at_mean[j]
+        updated[i] = mean[i] - moved
+        value -= 0.5 * slope_at_mean[i] * moved
     # Predict along the step, with the control as noise.
     for i in range(N):
         for j in range(N):
@@ -217,7 +217,7 @@ def dual_step(t, step, stage, constant, to_come, smoothing):
             total += AT[j, i] * updated[j]
         for k in range(M):
             total -= BT[k, i] * h[k]
-        x[i] = total
+        next_mean[i] = total
     forward_substitute(factor, BT)
     for i in range(N):
         for j in range(N):
@@ -267,24 +267,25 @@ def back_substitute(factor, rows):
             rows[i, j] *= factor[i, i]
 
 
-def update(V, Q, size):
+def update(V, Q, diagonal):
     """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if it does not exist.
 
-    With Q = sum of d f f', one term is used at a time: V - K f'V with K = d V f / (1 + d f'V f). If digits cancel, the
-    rest is computed in Joseph's form, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps V
-    semidefinite. It takes little time if Q has few entries, as for obstacles.
+    With Q = sum of d f f', V is updated by one rank-one term at a time: V - K f'V with K = d V f / (1 + d f'V f). If
+    1 + d f'V f is large, digits cancel. The update is then completed to Joseph's form, (I - K f') V (I - K f')' +
+    K K' / d: a sum of squares, which keeps V semidefinite. Zero rows of Q are skipped, so a cost of few states, as of
+    obstacles, is cheap.
 
     Args:
-      V: (N, N), overwritten. Q: (N, N), destroyed. size: (N,) diagonal of Q before the control was eliminated; much
-        smaller pivots are rounding errors.
+      V: (N, N), overwritten. Q: (N, N), destroyed.
+      diagonal: (N,) of Q before the control was eliminated, absolute; much smaller pivots are rounding errors.
     """
     f, w, gain = stack(N), stack(N), stack(N)
     scale = 0.0
     for i in range(N):
-        scale = max(scale, size[i])
+        scale = max(scale, diagonal[i])
     for i in range(N):
         d = Q[i, i]
-        if abs(d) <= 1e-14 * size[i]:  # then the row is also zero, unless Q is indefinite
+        if abs(d) <= 1e-14 * diagonal[i]:  # then the row is also zero, unless Q is indefinite
             for j in range(i + 1, N):
                 if not abs(Q[i, j]) <= 1e-6 * scale:
                     return False
@@ -322,8 +323,8 @@ def update(V, Q, size):
 def smoothed_state(t, to_go, to_come, costate, x):
     """Write the smoothed state (N,) at t, and the costate there, (N,); return whether it exists.
 
-    In the primal form they are x = -(S + Sbar)^-1 (s + sbar), Eq. (21), and S x + s; in the dual form x = x0 - V
-    costate, and (I + S V)^-1 (S x0 + s).
+    In the primal form they are x = -(S + Sbar)^-1 (s + sbar), Eq. (21), and S x + s; in the dual form x = mean - V
+    costate and (I + S V)^-1 (S mean + s), with V the covariance.
     """
     S, s, a = to_go.hessian[t], to_go.gradient[t], stack(N, N)
     if PRIMAL:
@@ -337,18 +338,18 @@ def smoothed_state(t, to_go, to_come, costate, x):
         cholesky_solve(a, N, x)
         affine(S, s, x, N, N, costate)
         return True
-    V, x0 = to_come.matrix[t], to_come.vector[t]
+    V, mean = to_come.matrix[t], to_come.vector[t]
     for i in range(N):
         for j in range(N):
             total = 1.0 if i == j else 0.0
             for k in range(N):
                 total += S[i, k] * V[k, j]
             a[i, j] = total
-    affine(S, s, x0, N, N, costate)
+    affine(S, s, mean, N, N, costate)
     if not solve(a, costate):
         return False
     for i in range(N):
-        total = x0[i]
+        total = mean[i]
         for j in range(N):
             total -= V[i, j] * costate[j]
         x[i] = total

@@ -56,7 +56,7 @@ def forward_pass(settings, model, about, work):
         which c_l was quadratised.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
-    arrived, costate, u, spare = stack(N), stack(N), stack(M), stack(N, W)
+    arrived, costate, u, forward_jacobian = stack(N), stack(N), stack(M), stack(N, W)
     steps, x_hat, to_go, to_come = settings.steps, work.x_hat, work.to_go, work.to_come
     good, _ = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
     if not good:
@@ -67,7 +67,7 @@ def forward_pass(settings, model, about, work):
             copy(about.plan.controls[t], M, u)
         else:
             limited_control(work.policy.gain[t], work.policy.offset[t], x_hat, model.limits, u)
-        jacobian = linearize(x_hat, u, model, arrived, step, spare)
+        jacobian = linearize(x_hat, u, model, arrived, step, forward_jacobian)
         next_step = NextStep(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x_hat, u, t, model, about, next_step, True, stage)
         constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
