@@ -1019,9 +1019,9 @@ class TestParts:
         source = source_of(collisions).filled(places=places.code, places_jacobian=places.code)
         data, n = numbers_of(places), len(x)  # pyright: ignore[reportArgumentType]
         states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}
-        replay(source, sizes, "centres_of", 2, states, data, np.zeros((2, coordinates)))
+        replay(source, sizes, "write_centres", 2, states, data, np.zeros((2, coordinates)))
         outputs = np.zeros((2, coordinates)), np.zeros((2, coordinates, n))
-        replay(source, sizes, "jacobians_of", 2, states, data, *outputs)
+        replay(source, sizes, "write_centres_and_jacobians", 2, states, data, *outputs)
 
     def test_constraints(self) -> None:
         of_constraint(ls.Clearance(WORLD, radius=0.1).bind(CART))

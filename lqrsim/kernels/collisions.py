@@ -9,18 +9,19 @@ from lqrsim.kernels.signed_distance import signed_distance
 MOST_CORNERS = 64  # of one hull of a robot; distances take time in proportion to its corners
 
 
-def hull_distances(obstacles, count, each, data, parts, size, corners, displaced, out, slopes):
-    """Write the distances (count parts obstacles,) of robots made of hulls, and their derivatives in the corners.
+def hull_distances(obstacles, count, per_displacement, data, parts, hull_count, corners, displaced, out, slopes):
+    """Write the distances (count hulls obstacles,) of robots made of hulls, and their derivatives in the corners.
 
     Args:
-      each: robots per trial. parts: each hull's first corner, and then the number B of all. size: that of hulls.
+      per_displacement: number of consecutive robots for which the obstacles are displaced alike.
+      parts: index of each hull's first corner, then the number B of corners. hull_count: number of hulls.
       corners: (count, 3 B). displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
-      slopes: (count parts obstacles, at least 3 for each corner of a hull).
+      slopes: (count hulls obstacles, at least 3 for each corner of a hull).
     """
     for i in range(count):
-        for part in range(size):
+        for part in range(hull_count):
             for k in range(obstacles):
-                at, moved = (i * size + part) * obstacles + k, obstacles * (i // each) + k
+                at, moved = (i * hull_count + part) * obstacles + k, obstacles * (i // per_displacement) + k
                 first, end = int(parts[part]), int(parts[part + 1])
                 out[at] = hull_distance_displaced(data, ROW * k, corners[i], first, end, displaced[moved], slopes[at])
 
@@ -28,47 +29,48 @@ def hull_distances(obstacles, count, each, data, parts, size, corners, displaced
 @outline
 def hull_distance_displaced(data, row, corners, first, end, displaced, gradient):
     """The distance of one hull to one obstacle that is displaced by (3,)."""
-    there = stack(3 * MOST_CORNERS)
+    relative = stack(3 * MOST_CORNERS)
     for k in range(end - first):
         for i in range(3):
-            there[3 * k + i] = corners[3 * (first + k) + i] - displaced[i]
-    return hull_distance(data, row, there, 0, end - first, gradient)
+            relative[3 * k + i] = corners[3 * (first + k) + i] - displaced[i]
+    return hull_distance(data, row, relative, 0, end - first, gradient)
 
 
-def nearest(obstacles, count, each, data, points, displaced, out):
+def nearest(obstacles, count, per_displacement, data, points, displaced, out):
     """Write the distances (count,) of points (count, 3) to the nearest of the obstacles.
 
     Args:
-      each: points per trial. displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
+      per_displacement: number of consecutive points for which the obstacles are displaced alike.
+      displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
     """
     for i in range(count):
-        out[i] = nearest_to(obstacles, data, points[i], displaced, obstacles * (i // each))
+        out[i] = nearest_to(obstacles, data, points[i], displaced, obstacles * (i // per_displacement))
 
 
 @outline
 def nearest_to(obstacles, data, point, displaced, first):
     """The distance of one point (3,) to the nearest obstacle. Obstacles are displaced by the rows from `first` on."""
-    least, there, corner_slopes = inf, stack(3), stack(3)
+    least, relative, corner_slopes = inf, stack(3), stack(3)
     for k in range(obstacles):
         for i in range(3):
-            there[i] = point[i] - displaced[first + k, i]
+            relative[i] = point[i] - displaced[first + k, i]
         if data[ROW * k] == MESH:
-            distance = hull_distance(data, ROW * k, there, 0, 1, corner_slopes)
+            distance = hull_distance(data, ROW * k, relative, 0, 1, corner_slopes)
         else:
-            distance = signed_distance(data, ROW * k, there[0], there[1], there[2])
+            distance = signed_distance(data, ROW * k, relative[0], relative[1], relative[2])
         if distance < least or isnan(distance):
             least = distance
     return least
 
 
-def centres_of(count, states, data, out):
+def write_centres(count, states, data, out):
     """Write the centres (count, 3 balls) at states (count, N)."""
     for i in range(count):
         centres_at(states[i], data, out[i])
 
 
-def jacobians_of(count, states, data, out, slopes):
-    """Write the centres, and their Jacobians (count, 3 balls, N), which the caller has set to zero."""
+def write_centres_and_jacobians(count, states, data, out, slopes):
+    """Write the centres, and their Jacobians (count, 3 balls, N) into arrays of zeros."""
     for i in range(count):
         jacobian_at(states[i], data, out[i], slopes[i])
 

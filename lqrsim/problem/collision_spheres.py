@@ -293,7 +293,7 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
     points = np.asarray(states, dtype=np.float64)
     flat = in_c_order(points.reshape(-1, points.shape[-1]))
     out = np.empty((len(flat), 3 * count))
-    _call(places, "centres_of", flat, out)
+    _call(places, "write_centres", flat, out)
     return out.reshape(*points.shape[:-1], count, 3)
 
 
@@ -301,7 +301,7 @@ def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[A
     """The same at states (K, n), and their derivatives in these, (K, count, 3, n)."""
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
-    _call(places, "jacobians_of", flat, out, slopes)
+    _call(places, "write_centres_and_jacobians", flat, out, slopes)
     return out.reshape(-1, count, 3), slopes.reshape(len(flat), count, 3, -1)
 
 
