@@ -1,7 +1,8 @@
 """Central differences, for functions that come without derivatives.
 
 The step for first derivatives is the cube root of the machine precision: truncation and rounding errors are then both
-about 1e-10 of the function's size. The step for second derivatives of values is its fourth root.
+about 1e-10 of the function's size. The step for second derivatives from values is the fourth root of the machine
+precision.
 """
 
 from lqrsim.kernels.declarations import M, N, W, noise_values, places, rate, stack, value, zeros
@@ -9,8 +10,8 @@ from lqrsim.kernels.linear_algebra import copy, entry, set_entry
 from lqrsim.kernels.records import WeightedStep
 from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
-FIRST, SECOND = 6e-6, 1.2e-4  # steps, relative to a number whose size counts as at least 1
-AXES = (0,)  # entries of (x, u) that the function depends on
+FIRST, SECOND = 6e-6, 1.2e-4  # steps, relative to max(1, |entry|)
+ACTIVE = (0,)  # entries of (x, u) that the function depends on
 BALLS = 1  # number of balls of `places`
 COLUMNS = 1  # number of columns of the noise matrix M
 
@@ -38,12 +39,12 @@ def rate_jacobian(x, u, p, out, fx, fu):
 
 
 def places_jacobian(x, data, out, slopes):
-    """Write the centres of balls, and their Jacobian (3 BALLS, N), which the caller has set to zero."""
+    """Write the centres of balls, and their Jacobian (3 BALLS, N) into an array of zeros."""
     y, above, below = stack(N), stack(3 * BALLS), stack(3 * BALLS)
     copy(x, N, y)
     places(x, data, out)
-    for a in range(len(AXES)):
-        j = AXES[a]
+    for a in range(len(ACTIVE)):
+        j = ACTIVE[a]
         h = FIRST * max(1.0, abs(x[j]))
         y[j] = x[j] + h
         places(y, data, above)
@@ -55,13 +56,13 @@ def places_jacobian(x, data, out, slopes):
 
 
 def noise_slopes(x, u, data, out, slopes):
-    """Write the noise matrix M (N, COLUMNS), and its derivatives (COLUMNS, N, any), one for each of AXES."""
+    """Write the noise matrix M (N, COLUMNS), and its derivatives (COLUMNS, N, any), one for each of ACTIVE."""
     y, v, above, below = stack(N), stack(M), stack(N, COLUMNS), stack(N, COLUMNS)
     copy(x, N, y)
     copy(u, M, v)
     noise_values(x, u, data, out)
-    for a in range(len(AXES)):
-        j = AXES[a]
+    for a in range(len(ACTIVE)):
+        j = ACTIVE[a]
         z = entry(x, u, j)
         h = FIRST * max(1.0, abs(z))
         set_entry(y, v, j, z + h)
@@ -75,19 +76,19 @@ def noise_slopes(x, u, data, out, slopes):
 
 
 def derivatives(x, u, t, data, hessian, gradient):
-    """Add the Hessian (W, W) and the gradient (W,) of a cost, and return the cost."""
+    """Add the Hessian (W, W) and gradient (W,) of the cost `value`, by differences of its values; return the cost."""
     h, above, below = stack(W), stack(W), stack(W)
     middle = value(x, u, t, data)
-    for a in range(len(AXES)):
-        i = AXES[a]
+    for a in range(len(ACTIVE)):
+        i = ACTIVE[a]
         h[i] = SECOND * max(1.0, abs(entry(x, u, i)))
         above[i] = value_near(x, u, t, data, i, h[i], i, 0.0)
         below[i] = value_near(x, u, t, data, i, -h[i], i, 0.0)
         gradient[i] += (above[i] - below[i]) / (2 * h[i])
         hessian[i, i] += (above[i] - 2 * middle + below[i]) / (h[i] * h[i])
-    for a in range(len(AXES)):
+    for a in range(len(ACTIVE)):
         for b in range(a):
-            i, j = AXES[a], AXES[b]
+            i, j = ACTIVE[a], ACTIVE[b]
             both = value_near(x, u, t, data, i, h[i], j, h[j]) + value_near(x, u, t, data, i, -h[i], j, -h[j])
             mixed = (both + 2 * middle - above[i] - below[i] - above[j] - below[j]) / (2 * h[i] * h[j])
             hessian[i, j] += mixed
@@ -106,9 +107,9 @@ def value_near(x, u, t, data, i, a, j, b):
 
 
 def curvature_from_values(x, u, p, h, weights, out, jacobian, hessian):
-    """Write a step and its Jacobian; add the Hessian (W, W) of its next state times weights (N,).
+    """Write a step and its Jacobian; add the Hessian (W, W) of weights' times the next state.
 
-    `value` is `weighted_step`, and AXES are all entries.
+    To be compiled with `weighted_step` as `value`, and with all entries of (x, u) ACTIVE.
     """
     gradient = zeros(W)
     step_jacobian(x, u, p, h, out, jacobian)

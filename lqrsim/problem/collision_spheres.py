@@ -253,7 +253,7 @@ class CollisionSpheres:
         )  # fmt: skip
         source = source_of(user_functions, BALLS=len(self), COORDINATES=size)
         if len(functions) == 1:
-            source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
+            source = source_of(differences, BALLS=len(self), ACTIVE=axes).filled(places=source)
         return SphereCenters(source, called.data, axes, size == 2, functions=functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:

@@ -345,7 +345,7 @@ class Dynamics:
     def _curvature_of_part(self) -> Source | None:
         """The same of one Runge-Kutta step."""
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
-        part, by_values = self._part_source, source_of(differences, AXES=axes)
+        part, by_values = self._part_source, source_of(differences, ACTIVE=axes)
         by_values = by_values.filled(**self._rates, advance=part, step_jacobian=part)
         by_jacobians = source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_jacobians"))
         if self.level != "symbolic" and self.jacobian is None:

@@ -316,7 +316,7 @@ class FunctionCost(OfFunction, Cost):
         )  # fmt: skip
         source = source_of(user_functions)
         if len(functions) == 1:
-            source = source_of(differences, AXES=axes).filled(value=source)
+            source = source_of(differences, ACTIVE=axes).filled(value=source)
         curved, uses_control = None if self.convex else axes, any(axis >= n for axis in axes)
         return CostTerm(source, self._data, nonconvex_in=curved, uses_control=uses_control, functions=functions)
 

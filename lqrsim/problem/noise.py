@@ -159,7 +159,7 @@ class Noise:
                 level=self.level, states=n, controls=len(names[1]), parameters=tuple(self.parameters),
             )  # fmt: skip
             user_source = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
-            source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=user_source)
+            source = source_of(differences, COLUMNS=self.size, ACTIVE=active).filled(noise_values=user_source)
             return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
         details = ("noise", *names, self.size, tuple(self.parameters))
         traced = symbolic.kept(self.function, details, lambda: self._trace(*names), source=str, rows=list, active=list)

@@ -277,5 +277,5 @@ class MjcfBalls(CollisionSpheres):
         memory = MjcfMemory.of(mjcf_dynamics)
         positions = tuple(range(mjcf_dynamics.physics.model.nv))
         data = np.concatenate([[len(self)], self._points.ravel()])
-        source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(kernel))
+        source = source_of(differences, BALLS=len(self), ACTIVE=positions).filled(places=source_of(kernel))
         return SphereCenters(source, data, positions, functions=(memory,))
