@@ -58,8 +58,8 @@ class NoiseTerm(Term):
         """The source of `kernels/noise.py` with this noise."""
         rows, active = len(self.rows), len(self.active)
         kernel = source_of(
-            noise_kernel, ROWS=self.rows, COUNT=rows, CONTIGUOUS=int(self.rows == tuple(range(rows))), SIZE=self.size,
-            ACTIVE=self.active, ACTIVE_COUNT=active, PADDED_COUNT=-4 * (active // -4),
+            noise_kernel, ROWS=self.rows, COUNT=rows, CONTIGUOUS=int(self.rows == tuple(range(rows))),
+            COLUMNS=self.size, ACTIVE=self.active, ACTIVE_COUNT=active, PADDED_ACTIVE_COUNT=-4 * (active // -4),
         )  # fmt: skip
         return kernel.filled(noise_values=self.source, noise_slopes=self.source)
 
@@ -147,7 +147,7 @@ class Noise:
         if self.matrix is not None:
             if len(self.matrix) != n:
                 raise InputError(f"Noise: function: got a matrix of {len(self.matrix)} rows, want {n}, one per state")
-            kernel = source_of(noise_kernel, COUNT=n, SIZE=self.size)
+            kernel = source_of(noise_kernel, COUNT=n, COLUMNS=self.size)
             source = kernel.filled(noise_values=(kernel, "constant_values"), noise_slopes=(kernel, "constant_slopes"))
             return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
