@@ -2,21 +2,24 @@
 
 States are tangent coordinates: a position for each degree of freedom, then the velocities, then the actuators' own
 states. The rotation of a ball or free joint is three numbers: a rotation vector, or a turn about an axis after a tilt,
-see `rotations.py`. `p` has the wrench on the body, then addresses and sizes, at the indices named below;
-`robots/mjcf_dynamics.py` writes it. Several threads may run these functions at once. Each takes a slot, an `MjData`
-that it owns for as long as it needs it. If bodies carry loads, a slot also has its own model.
+see `rotations.py`. `p` has the wrench on the body that `MjcfPhysics(body=...)` names, then addresses and sizes, at the
+indices named below; `robots/mjcf_dynamics.py` writes it. Several threads may run these functions at once. Each takes a
+slot, an `MjData` that it owns for as long as it needs it. If bodies carry loads, a slot also has its own model.
 
 A step and its helper functions are compiled separately. Functions that do arithmetic here are therefore `outline` and
 `exact`. Otherwise LLVM would reorder sums depending on where they are inlined, and bits would depend on the thread.
 
-For distances by `mj_geomDistance`, `data` has the address that is called p here, the numbers of rows and of pairs of
-geoms, the largest distance of interest, and for each pair: its row, the robot's geom and its body, the other geom,
-which is an obstacle's or on another body of the robot, the sum of the radii of their bounding spheres, whether the
-other is a plane, and its body if that moves, else 0. A row is the least distance of its pairs. Pairs whose bounding
-spheres are farther apart than the least distance so far are skipped.
+For distances by `mj_geomDistance`, `data` has:
+  0: the address of p. 1: number of rows. 2: number of pairs of geoms. 3: largest distance of interest.
+  Then for each pair: its row; the robot's geom, and its body; the other geom, an obstacle's or on another body of the
+  robot; the sum of the radii of their bounding spheres; 1 if the other is a plane, else 0; the other's body if that
+  moves, else 0.
 
-For balls, points fixed to bodies, it has that address, their number, and for each the number of its body and its place
-in the body's axes; `differences.py` has the derivatives.
+A row is the least distance of its pairs. Pairs whose bounding spheres are farther apart than the least distance so far
+are skipped.
+
+For balls, points fixed to bodies, `data` has the address of p, the number of balls, and for each the number of its body
+and its place in the body's axes; `differences.py` has the derivatives.
 """
 
 from math import atan2, cos, nan, pi, sin, sqrt
@@ -58,8 +61,8 @@ RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS = 21, 22,
 AXIS, TABLE = 29, 32
 
 # Addresses that a slot has for its MjData, and their number.
-DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
-OWN_MODEL, MASSES, SLOT = 12, 13, 14
+DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, XFRC_APPLIED, XPOS, XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
+GEOM_XPOS, GEOM_XMAT, OWN_MODEL, MASSES, SLOT = 10, 11, 12, 13, 14
 
 # The words that a team shares: whether it is in use, the next column, combined with the number of the job, the number
 # of finished columns, whether to stop, the number of helpers, and whether a signal came, after which all steps are NaN.
@@ -74,10 +77,10 @@ PATIENT = 2000  # number of looks at the ticket before a helper lets other threa
 WIDTH, CURVED = 1e-6, 1e-5
 
 FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
-LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are no valid state
+LARGEST = 1e10  # mjMAXVAL: MuJoCo treats larger numbers as an unstable simulation
 
 ROWS = 1  # number of rows of distances
-REACH, PAIRS, PAIR = 3, 4, 7  # indices of the largest distance and the pairs in data, and count of numbers per pair
+REACH, PAIRS, PAIR_LENGTH = 3, 4, 7  # indices of the largest distance and of the pairs in data; numbers of each pair
 TOUCHING = 1e-12  # m; the segment between two geoms that touch has no direction
 
 
@@ -123,7 +126,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
         if k == 0:
             copy_matrix(columns, N, W, jacobian)
         else:
-            follow(columns, jacobian)
+            chain(columns, jacobian)
         copy(arrived, N, z)
         copy(accelerations, N, before)
     if together:
@@ -171,8 +174,8 @@ def curved(z, p, side, addresses, accelerations, arrived, columns):
 
 @outline
 @exact
-def follow(columns, jacobian):
-    """Let a step with these columns, [A B], follow the steps of a Jacobian: A times it, plus B in the controls."""
+def chain(columns, jacobian):
+    """Chain a physics step [A B] to the Jacobian of the steps before: A times it, plus B in the controls' columns."""
     before = stack(N, W)
     copy_matrix(jacobian, N, W, before)
     for i in range(N):
@@ -247,7 +250,7 @@ def run(z, p, substeps, addresses, out):
     none = zeros(N)
     write_loads(p, addresses)
     write_to(z, p, addresses)
-    push(p, addresses)
+    apply_wrench(p, addresses)
     start_from(p, addresses, none)  # so that it is independent of earlier steps
     for _ in range(substeps):
         call(p[STEP], at(addresses[OWN_MODEL]), at(addresses[DATA]))
@@ -257,7 +260,7 @@ def run(z, p, substeps, addresses, out):
 def linearize_here(z, p, wrench, addresses, before, accelerations, arrived):
     """Bring the MjData of a slot to the stages of a physics step, from which columns keep what does not change."""
     write_loads(p, addresses)
-    push(wrench, addresses)
+    apply_wrench(wrench, addresses)
     step_from(z, z, p, addresses, before, 0, arrived)
     copy(at(addresses[QACC]), int(p[NV]), accelerations)
     step_from(z, z, p, addresses, accelerations, 2, arrived)
@@ -325,9 +328,9 @@ def write_positions(x, p, qpos):
             qpos[q] = x[d]
 
 
-def push(wrench, addresses):
-    """Apply the wrench to the body."""
-    copy_part(wrench, WRENCH, at(addresses[PUSH]), 0, 6)
+def apply_wrench(wrench, addresses):
+    """Apply the wrench to its body."""
+    copy_part(wrench, WRENCH, at(addresses[XFRC_APPLIED]), 0, 6)
 
 
 def write_loads(p, addresses):
@@ -413,7 +416,7 @@ def rotation_near(qpos, q, p, reference, first, out):
     # The quaternion without its turn is (scalar, tilt); the sign is such that the scalar is not negative.
     scalar = sqrt(qpos[q] * qpos[q] + along * along)
     cosine, sine = (qpos[q] / scalar, along / scalar) if scalar > 0 else (1.0, 0.0)
-    tilt, goal, square, inner, length = stack(3), stack(3), 0.0, 0.0, 0.0
+    tilt, goal, square, inner, goal_square = stack(3), stack(3), 0.0, 0.0, 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         across = p[AXIS + j] * qpos[q + 1 + k] - p[AXIS + k] * qpos[q + 1 + j]
@@ -421,12 +424,12 @@ def rotation_near(qpos, q, p, reference, first, out):
         goal[i] = (1.0 - p[AXIS + i]) * reference[first + i]
         square += tilt[i] * tilt[i]
         inner += tilt[i] * goal[i]
-        length += goal[i] * goal[i]
-    size, length = sqrt(square), sqrt(length)
+        goal_square += goal[i] * goal[i]
+    size, goal_length = sqrt(square), sqrt(goal_square)
     if size < 1e-150:
         # The identity has any axis; use the axis of `reference`.
-        turns = 2 * pi * nearest_whole(length / (2 * pi))
-        scale = turns / length if turns > 0 else 0.0
+        turns = 2 * pi * nearest_whole(goal_length / (2 * pi))
+        scale = turns / goal_length if turns > 0 else 0.0
         for i in range(3):
             out[first + i] = scale * goal[i] + turned * p[AXIS + i]
         return
@@ -447,30 +450,30 @@ def nearest_whole(number):
 def residual(x, data, out):
     """Write the least distance of each row, in metres; at most the largest distance of interest."""
     which, segments, nowhere = stack(ROWS), stack(ROWS, 6), stack(1)
-    find(x, nowhere, -1, data, 0, out, which, segments)
+    find_nearest(x, nowhere, -1, data, 0, out, which, segments)
 
 
 def residual_jacobian(x, data, out, slopes):
     """Write the distances and their derivatives in the states (any, N), which are zero on entry."""
     which, segments = stack(ROWS), stack(ROWS, 6)
-    find_with_slopes(x, data, 0, out, slopes, which, segments)
+    find_nearest_with_slopes(x, data, 0, out, slopes, which, segments)
 
 
-def distances_of(count, states, each, displaced, data, out, which, segments):
+def distances_of(count, states, per_displacement, displaced, data, out, which, segments):
     """Write the distances, row by row, at states (count, N).
 
-    For `each` consecutive states obstacles have the same displacements, three numbers per row.
+    For `per_displacement` consecutive states obstacles have the same displacements, three numbers per row.
     """
     rows = int(data[1])
     for i in range(count):
-        find(states[i], displaced, 3 * rows * (i // each), data, rows * i, out, which, segments)
+        find_nearest(states[i], displaced, 3 * rows * (i // per_displacement), data, rows * i, out, which, segments)
 
 
 def slopes_of(count, states, data, out, slopes, which, segments):
     """Write the distances and their derivatives (any, N), which are zero on entry, at states (count, N)."""
     rows = int(data[1])
     for i in range(count):
-        find_with_slopes(states[i], data, rows * i, out, slopes, which, segments)
+        find_nearest_with_slopes(states[i], data, rows * i, out, slopes, which, segments)
 
 
 def places(x, data, out):
@@ -497,20 +500,20 @@ def move_bodies(x, p, addresses):
 
 
 @outline
-def find(x, displaced, offset, data, first, out, which, segments):
+def find_nearest(x, displaced, offset, data, first, out, which, segments):
     """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
     p = at(data[0])
     slot = claim_slot(p)
     addresses = at(p[SLOTS] + 8 * SLOT * slot)
     move_bodies(x, p, addresses)
-    find_with_data(p, addresses, data, displaced, offset, first, out, which, segments)
+    find_nearest_with_data(p, addresses, data, displaced, offset, first, out, which, segments)
     store(p[FLAGS], slot, 0)
 
 
-def find_with_slopes(x, data, first, out, slopes, which, segments):
-    """The same, and the derivatives: the speed of the nearest point, against the direction to the other's.
+def find_nearest_with_slopes(x, data, first, out, slopes, which, segments):
+    """As `find_nearest`, with derivatives: minus the velocity of the robot's nearest point along the normal.
 
-    If the other moves too, it is the difference of both speeds.
+    The normal points to the other geom. If that moves, too, it is the relative velocity.
     """
     p = at(data[0])
     slot, nv = claim_slot(p), int(p[NV])
@@ -518,10 +521,10 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     moves, others, normal, there, nowhere = stack(3 * N), stack(3 * N), stack(3), stack(3), stack(1)
     move_bodies(x, p, addresses)
     call(p[COMPOS], at(p[MODEL]), at(addresses[DATA]))
-    find_with_data(p, addresses, data, nowhere, -1, first, out, which, segments)
+    find_nearest_with_data(p, addresses, data, nowhere, -1, first, out, which, segments)
     for row in range(int(data[1])):
         if which[row] >= 0:
-            pair = PAIRS + PAIR * int(which[row])
+            pair = PAIRS + PAIR_LENGTH * int(which[row])
             write_normal(addresses, int(data[pair + 1]), int(data[pair + 3]), out[first + row], segments[row], normal)
             call(p[JAC], at(p[MODEL]), at(addresses[DATA]), moves, 0, segments[row], int32(int(data[pair + 2])))
             if data[pair + 6] > 0:
@@ -536,8 +539,8 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
     store(p[FLAGS], slot, 0)
 
 
-def find_with_data(p, addresses, data, displaced, offset, first, out, which, segments):
-    """As `find`, of an MjData that has its positions.
+def find_nearest_with_data(p, addresses, data, displaced, offset, first, out, which, segments):
+    """As `find_nearest`, of an MjData that has its positions.
 
     If `offset` is not negative, obstacles are displaced by the three numbers from displaced[offset + 3 row] on.
     """
@@ -545,7 +548,7 @@ def find_with_data(p, addresses, data, displaced, offset, first, out, which, seg
     for row in range(int(data[1])):
         out[first + row], which[row] = data[REACH], -1.0
     for k in range(int(data[2])):
-        pair = PAIRS + PAIR * k
+        pair = PAIRS + PAIR_LENGTH * k
         row, own, other = int(data[pair]), 3 * int(data[pair + 1]), 3 * int(data[pair + 3])
         before_x, before_y, before_z = middles[other], middles[other + 1], middles[other + 2]
         if offset >= 0:

@@ -130,7 +130,7 @@ class MjcfPhysics:
         row = np.zeros(kernel.SLOT)
         fields = {
             kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
-            kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
+            kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.XFRC_APPLIED: data.xfrc_applied[body],
             kernel.XPOS: data.xpos, kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos,
             kernel.GEOM_XMAT: data.geom_xmat, kernel.MASSES: model.body_mass,
         }  # fmt: skip
