@@ -33,8 +33,8 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     """Write the cost-to-come at 0, given c_0 quadratised at x; return its constant, and whether it exists. Eq. (18).
 
     If the Hessian of c_0 is nearly singular or indefinite, it has no usable inverse. The dual form then adds a small
-    curvature about x, relative to each state's own curvature or the cost-to-go's. It vanishes at x, so an optimum stays
-    a fixed point; other starts are reached over several iterations.
+    curvature about x, relative to each state's own curvature or the cost-to-go's. Its value and gradient vanish at
+    x, so an optimum stays a fixed point; other starts are reached over several iterations.
     """
     if PRIMAL:
         copy(q, N, to_come.vector[0])
@@ -277,7 +277,7 @@ def update(V, Q, diagonal):
 
     Args:
       V: (N, N), overwritten. Q: (N, N), destroyed.
-      diagonal: (N,) of Q before the control was eliminated, absolute; much smaller pivots are rounding errors.
+      diagonal: (N,) absolute diagonal of Q before the control was eliminated; much smaller pivots are rounding errors.
     """
     f, w, gain = stack(N), stack(N), stack(N)
     scale = 0.0

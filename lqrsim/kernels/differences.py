@@ -107,7 +107,7 @@ def value_near(x, u, t, data, i, a, j, b):
 
 
 def curvature_from_values(x, u, p, h, weights, out, jacobian, hessian):
-    """Write a step and its Jacobian; add the Hessian (W, W) of weights' times the next state.
+    """Write a step and its Jacobian; add the Hessian (W, W) of weights (N,) times its next state.
 
     To be compiled with `weighted_step` as `value`, and with all entries of (x, u) ACTIVE.
     """
