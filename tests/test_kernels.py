@@ -487,7 +487,7 @@ class TestSolvers:
     def test_newton_to_its_end(self) -> None:
         """At once, where that is enough; and where a gap of nothing is asked for, after some more steps."""
         assert descended(problem(steps=3), tolerance=1e9) == declarations.CONVERGED
-        assert descended(problem(steps=3), tolerance=1e9, more=9.0) == declarations.CONVERGED
+        assert descended(problem(steps=3), tolerance=1e9, extra_steps=9.0) == declarations.CONVERGED
         assert descended(problem(steps=3), merit=-1e9) == declarations.STALLED
 
     def test_controls_without_a_minimum_get_a_weight_on_their_changes(self) -> None:
