@@ -89,10 +89,7 @@ class Caller:
         except Hang as error:
             return Verdict(number, name, "hang", what, where(error))
         except Exception as error:
-            own = (
-                isinstance(error, subject.raises)
-                or Path(traceback.extract_tb(error.__traceback__)[-1].filename).parent == HERE
-            )
+            own = Path(traceback.extract_tb(error.__traceback__)[-1].filename).parent == HERE
             return Verdict(number, name, "deliberate" if own else "raw", what, where(error))
         return Verdict(number, name, "raw" if addressed else "accepted", what, addressed)
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import lqrsim as ls
 from lqrsim import gym
-from lqrsim.stress.campaign_files import Damaged
 from robustness.of_gym import environments
 from robustness.of_policies import policies
 from robustness.of_problems import problems, results, solving
@@ -44,8 +43,6 @@ HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
 HOOKS |= {"TrialScore.failure"}  # a field, whose default is a function
 HOOKS |= {"settled"}  # an earlier name
 
-RAISES = {"Results.read": (Damaged,)}
-
 
 @dataclass(frozen=True)
 class Subject:
@@ -53,13 +50,11 @@ class Subject:
 
     Attributes:
       weight: how often it is called beside the others, 1 being often: what takes longer is called less.
-      raises: what it may raise besides InputError, as its docstring says.
     """
 
     call: Callable[..., Any]
     arguments: Mapping[str, Any]
     weight: float = 1.0
-    raises: tuple[type[Exception], ...] = ()
 
 
 def public() -> Iterator[tuple[str, Any]]:
@@ -121,5 +116,5 @@ def subjects(folder: Path) -> dict[str, Subject]:
                 call = getattr(arguments.pop("self", _offered(owner)), method)
             else:
                 call = getattr(_offered(owner), method) if method else _offered(owner)
-            found[name] = Subject(call, arguments, *weight, raises=RAISES.get(name, ()))
+            found[name] = Subject(call, arguments, *weight)
     return found
