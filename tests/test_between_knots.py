@@ -15,8 +15,8 @@ import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
 from lqrsim.problem.constraints import PlainTerm
-from lqrsim.problem.within_periods import TIMES, WithinPeriods
 from lqrsim.solvers import between_knots as solver
+from lqrsim.solvers.between_knots import TIMES, WithinPeriods
 
 TOLERANCE = between_knots.TOLERANCE
 

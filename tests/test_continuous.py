@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.linear_quadratic import Stage
 from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import continuous
 from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
+from lqrsim.solvers.linear_quadratic import Stage
 
 
 def measured_orders(errors: list[Any]) -> Array:

@@ -8,10 +8,10 @@ from scipy.integrate import quad, solve_bvp
 from scipy.linalg import expm, solve_continuous_are
 
 from lqrsim.errors import Array
-from lqrsim.problem.linear_quadratic import Stage
 from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.continuous import smooth_lq_continuous
+from lqrsim.solvers.linear_quadratic import Stage
 
 UNIT = Quadratic(np.eye(1), np.zeros(1), np.array(0.0))
 STAGE = Stage(A=[[0.0]], B=[[1.0]], R=[[1.0]])

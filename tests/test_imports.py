@@ -58,7 +58,7 @@ FLOORS_WITHIN = {
         ("user_functions",),
     ),
     "problem": (
-        ("dynamics", "linear_quadratic"),
+        ("dynamics",),
         ("collision_spheres", "noise", "residual"),
         ("collision_shape",),
         ("costs",),

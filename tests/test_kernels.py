@@ -90,12 +90,12 @@ from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.control_rate import LastCommand, RateCost, RateLimits
 from lqrsim.problem.state_bounds import LimitCost
-from lqrsim.problem.within_periods import WithinPeriods
 from lqrsim.results.archive import sha256
 from lqrsim.robots.force_limits import ForceLimit, ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
+from lqrsim.solvers.between_knots import WithinPeriods
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.certify import no_value
 from lqrsim.solvers.engine import SolveRun

@@ -28,14 +28,13 @@ from lqrsim.codegen.user_functions import UserFunction, interrupt_of, raised_by
 from lqrsim.errors import Array, InputError, check_array, check_function, excerpt, real
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
-from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import InitialPrior
-from lqrsim.solvers.linear_quadratic import WEIGH_MORE, definite
+from lqrsim.solvers.linear_quadratic import WEIGH_MORE, Stage, check_end, definite
 
 NO_MINIMUM, FLAT = "S + Sbar is not positive definite", "R is not positive definite"
 # Largest number of evaluations of one right-hand side, a few seconds. A trajectory that needs more diverges or is far
