@@ -37,11 +37,11 @@ from .problem.state_bounds import GoalState as GoalState
 from .problem.state_bounds import StateBounds as StateBounds
 from .reports.page import report as report
 from .results.export_c import export_c as export_c
-from .results.plan import Plan as Plan
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.rollout import Rollout as Rollout
 from .results.save_load import load as load
 from .results.save_load import save as save
+from .results.solution import Plan as Plan
 from .results.solution import Solution as Solution
 from .results.solution_parts import Status as Status
 from .results.solution_parts import Trajectory as Trajectory

@@ -34,8 +34,8 @@ from lqrsim.control.controllers import Controller, Feedback, FunctionController,
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
+from lqrsim.results.solution import Plan
 
 LOST_AFTER = 3  # control periods without a state after which the controller stops
 KEPT = 10  # commands that a reader keeps until they are received

@@ -10,11 +10,12 @@ from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.derivative_check import DerivativeCheck
+from lqrsim.results.certified import Funnel
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.display import DataTable
 from lqrsim.results.export_c import ExportedC
-from lqrsim.results.funnel import Funnel
-from lqrsim.results.plan import Replan
 from lqrsim.results.policy import OutputFeedbackPolicy
+from lqrsim.results.solution import Replan
 from lqrsim.results.solution_parts import (
     BetweenKnots,
     Candidate,
@@ -22,13 +23,14 @@ from lqrsim.results.solution_parts import (
     ContactCertificate,
     Curvature,
     Iteration,
+    Moments,
     Multipliers,
+    Quadratic,
+    TotalCost,
 )
-from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.gradients import Gradients
 from lqrsim.solvers.prepared import PreparedSolver
-from lqrsim.stress.data_table import DataTable
 from lqrsim.verify.verdict import Verification
 
 __all__ = [

@@ -9,8 +9,7 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.solution_parts import Status
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution_parts import Quadratic, Status
 from lqrsim.solvers import continuous
 from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
 from lqrsim.solvers.linear_quadratic import Stage

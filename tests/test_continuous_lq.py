@@ -8,8 +8,7 @@ from scipy.integrate import quad, solve_bvp
 from scipy.linalg import expm, solve_continuous_are
 
 from lqrsim.errors import Array
-from lqrsim.results.solution_parts import Status
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution_parts import Quadratic, Status
 from lqrsim.solvers.continuous import smooth_lq_continuous
 from lqrsim.solvers.linear_quadratic import Stage
 

@@ -20,7 +20,7 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.stress.data_table import fraction_format
+from lqrsim.results.display import fraction_format
 
 NASTY = r"a&b % $x$ #1_y {z} ~^ \ <b> | [q] * `c` _d_ &amp; 50% -- ü²"
 PLAIN = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=12).map(str.strip)

@@ -44,9 +44,8 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("coordinates", "solution_parts", "value_functions"),
-        ("archive", "goal", "notebook", "policy"),
-        ("plan",),
+        ("coordinates", "solution_parts"),
+        ("archive", "display", "goal", "policy"),
         ("solution",),
         ("rollout",),
     ),

@@ -11,7 +11,7 @@ from matplotlib.patches import Ellipse
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.value_functions import Moments
+from lqrsim.results.solution_parts import Moments
 from lqrsim.view import figure_parts
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.rates import tail

@@ -12,7 +12,7 @@ from lqrsim.commands import as_json, console
 from lqrsim.commands.options import Folder, Json, PolicyName, SetupOptions, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
-    from lqrsim.results.funnel import Funnel
+    from lqrsim.results.certified import Funnel
     from lqrsim.stress.failure_search import RareFailures, SmallestFailure
     from lqrsim.stress.safer_plans import HardenedPlan
 
@@ -142,7 +142,7 @@ class Report:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.stress.data_table import ENDINGS
+        from lqrsim.results.display import ENDINGS
 
         path = self.out or self.folder / "report.html"
         console.check_output("--out", path, "file", suffixes=(".html", *ENDINGS))
@@ -182,7 +182,7 @@ class Compare:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.stress.data_table import ENDINGS
+        from lqrsim.results.display import ENDINGS
 
         if self.out is not None:
             console.check_output("--out", self.out, "file", suffixes=ENDINGS)

@@ -64,7 +64,7 @@ class Render:
     """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
 
     def run(self) -> int:
-        from lqrsim.results.funnel import Funnel
+        from lqrsim.results.certified import Funnel
         from lqrsim.view import exports
 
         if not self.rollouts:

@@ -22,8 +22,8 @@ from lqrsim.problem.belief import Belief
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
-from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
+from lqrsim.results.solution import Plan
 from lqrsim.robots.sensors import RobotSensors
 
 

@@ -19,8 +19,8 @@ from lqrsim.kernels.feedback import FAR
 from lqrsim.kernels.records import Limits, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.plan import Plan
 from lqrsim.results.policy import OutputFeedbackPolicy
+from lqrsim.results.solution import Plan
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of

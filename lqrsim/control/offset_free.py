@@ -28,9 +28,8 @@ from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import PerEntry, Spaces, spaces_of
-from lqrsim.results.plan import Plan
 from lqrsim.results.policy import OutputFeedbackPolicy
-from lqrsim.results.solution import Solution
+from lqrsim.results.solution import Plan, Solution
 from lqrsim.robots.sensors import RobotSensors
 
 MEMORY = 5.0  # s, the default of `OffsetFree`

@@ -23,9 +23,9 @@ from lqrsim.errors import Array, InputError, check_array, check_function, check_
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
+from lqrsim.results.certified import Funnel
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
-from lqrsim.results.funnel import Funnel
-from lqrsim.results.plan import Plan, Replan
+from lqrsim.results.solution import Plan, Replan
 from lqrsim.results.solution_parts import Horizon
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess

@@ -1,4 +1,7 @@
-"""Pickles of what has code and models inside: they are for the version of lqrsim that wrote them."""
+"""Pickles of what has code and models inside: they are for the version of lqrsim that wrote them.
+
+Each pickle names `_empty` by the address of this module, which therefore stays.
+"""
 
 from typing import Any, Self
 

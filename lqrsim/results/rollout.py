@@ -12,8 +12,8 @@ import numpy.typing as npt
 from lqrsim.annotations import Bounds, Index, Line, NonNegative, Positive, checked, repr_of
 from lqrsim.errors import Array, InputError, check_symmetric, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.display import SHOWN, drawing, number_text, of_table
 from lqrsim.results.goal import OUTCOMES, Target, departure, scale_of, tracking_unit, worst_of
-from lqrsim.results.notebook import SHOWN, drawing, number_text, of_table
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
 

@@ -16,9 +16,8 @@ import numpy as np
 from lqrsim.annotations import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
 from lqrsim.results import archive
-from lqrsim.results.certificate import FailureCertificate
+from lqrsim.results.certified import FailureCertificate, Funnel
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution

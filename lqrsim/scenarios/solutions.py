@@ -10,7 +10,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_kind
 from lqrsim.problem.problem import Problem
-from lqrsim.results.certificate import FailureCertificate
+from lqrsim.results.certified import FailureCertificate
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
 from lqrsim.results.save_load import load

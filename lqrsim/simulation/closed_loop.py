@@ -19,8 +19,8 @@ from lqrsim.problem.belief import Belief
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
-from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import GOAL_MOVED, MovingObstacles, Rollout
+from lqrsim.results.solution import Plan
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World

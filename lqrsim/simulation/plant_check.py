@@ -14,7 +14,7 @@ from lqrsim.annotations import Bounds, Count, Line, NonNegative, Positive, Seed,
 from lqrsim.errors import Array, InputError, check_array, check_count
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
-from lqrsim.results.plan import Plan
+from lqrsim.results.solution import Plan
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import Scene

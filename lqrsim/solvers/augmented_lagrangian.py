@@ -21,8 +21,7 @@ from lqrsim.kernels.records import LOG, Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.costs import weighing_obstacles
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution_parts import Multipliers, Status
-from lqrsim.results.value_functions import Moments
+from lqrsim.results.solution_parts import Moments, Multipliers, Status
 from lqrsim.solvers.compiled import ConstraintMultipliers
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess

@@ -29,8 +29,7 @@ import scipy.linalg
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import ContactCertificate, Status
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution_parts import ContactCertificate, Quadratic, Status
 from lqrsim.scenes.contact_modes import ContactModes, Period, Switches
 from lqrsim.scenes.least_distance import least_distance
 from lqrsim.solvers import compiled

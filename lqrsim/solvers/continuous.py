@@ -29,8 +29,7 @@ from lqrsim.errors import Array, InputError, check_array, check_function, excerp
 from lqrsim.problem.costs import terms_of
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution_parts import Iteration, Quadratic, Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import InitialPrior

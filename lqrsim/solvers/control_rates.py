@@ -24,11 +24,9 @@ from lqrsim.kernels.records import Motion
 from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
-from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
-from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Multipliers, Trajectory
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution import Plan, Replan, Solution
+from lqrsim.results.solution_parts import Multipliers, Quadratic, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, parts_of
 from lqrsim.solvers.budget import Budget

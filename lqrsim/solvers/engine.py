@@ -19,8 +19,17 @@ from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Motion, 
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Iteration, Multipliers, Status, Trajectory
-from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.results.solution_parts import (
+    Candidate,
+    Certificate,
+    Curvature,
+    Iteration,
+    Moments,
+    Multipliers,
+    Quadratic,
+    Status,
+    Trajectory,
+)
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
 from lqrsim.solvers.certify import CANCELLATION, FLAT, SLACK, certificate_of, curvature_at, faults, no_value

@@ -12,10 +12,9 @@ from lqrsim.errors import Array, InputError, check_array, check_number, excerpt,
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
-from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import Iteration, Multipliers, Trajectory
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution import Plan
+from lqrsim.results.solution_parts import Iteration, Multipliers, Quadratic, Trajectory
 
 if TYPE_CHECKING:
     from lqrsim.solvers.interior_point import InteriorResult

@@ -17,8 +17,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Certificate, Iteration, Status, Trajectory
-from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.results.solution_parts import Certificate, Iteration, Moments, Quadratic, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.versions import versions
 

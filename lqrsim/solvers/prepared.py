@@ -15,9 +15,8 @@ from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.pickles import OneVersion
-from lqrsim.results.plan import Plan, Replan
-from lqrsim.results.solution_parts import Iteration, Status, Trajectory
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution import Plan, Replan
+from lqrsim.results.solution_parts import Iteration, Quadratic, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints

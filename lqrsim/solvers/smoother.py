@@ -22,8 +22,7 @@ from lqrsim.problem.derivative_check import check_functions, functions_of
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Status
-from lqrsim.results.value_functions import Quadratic
+from lqrsim.results.solution_parts import Quadratic, Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.budget import Budget, Callback, Stop, reported

@@ -24,7 +24,7 @@ from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
 from lqrsim.results.archive import plain, sha256, write_text
-from lqrsim.results.certificate import FailureCertificate
+from lqrsim.results.certified import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import names_code

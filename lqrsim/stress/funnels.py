@@ -24,8 +24,8 @@ from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_array, check_name, check_symmetric, excerpt, keep, numbers_of
 from lqrsim.problem.noise import Noise
 from lqrsim.process import keeping
+from lqrsim.results.certified import Funnel, flat, inverse_of
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.funnel import Funnel, flat, inverse_of
 from lqrsim.results.goal import Target
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate_from

@@ -15,6 +15,7 @@ from lqrsim.annotations import LINE, Count, Index, Want, checked
 from lqrsim.errors import InputError, check_name, check_path, excerpt, printable
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
+from lqrsim.results.display import DataTable, Entry, fraction_format
 from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -23,7 +24,6 @@ from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign_files import SOLUTION_FILE, Columns, Damaged, digest_of_solution, read_manifest, read_table
-from lqrsim.stress.data_table import DataTable, Entry, fraction_format
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
 from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.study import Campaign, Cell, Shard

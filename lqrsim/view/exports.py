@@ -23,7 +23,7 @@ import numpy.typing as npt
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import replacing, sha256
-from lqrsim.results.funnel import Funnel
+from lqrsim.results.certified import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.mjcf_kinematics import quaternion_of

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import Want, checked
 from lqrsim.errors import Array, InputError
-from lqrsim.results.funnel import Funnel
+from lqrsim.results.certified import Funnel
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.results.solution import Solution
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids

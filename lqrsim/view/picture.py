@@ -13,7 +13,7 @@ from mujoco.rendering.classic import gl_context
 
 from lqrsim.annotations import Bounds, Want, checked
 from lqrsim.errors import Array, InputError, check_items
-from lqrsim.results.funnel import Funnel
+from lqrsim.results.certified import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import geoms, gl

@@ -19,8 +19,8 @@ from lqrsim.annotations import Index, NonNegative, Want, checked
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_text
 from lqrsim.problem.belief import Belief
+from lqrsim.results.certified import Funnel
 from lqrsim.results.coordinates import check_same_system, spaces_of
-from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution

@@ -22,7 +22,7 @@ from PIL import Image
 from lqrsim.annotations import Bounds, Progress, checked
 from lqrsim.errors import InputError, check_number, check_path, excerpt
 from lqrsim.results.archive import replacing
-from lqrsim.results.funnel import Funnel
+from lqrsim.results.certified import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view.captions import Pixels
