@@ -1,5 +1,6 @@
 """Which start is gone on with, what the others cost, and what is refused."""
 
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -457,3 +458,22 @@ def test_a_cheaper_plan_that_has_not_converged_is_the_answer_or_named(exact: boo
     if cheaper:
         (least,) = (one for one in solution.candidates if one.cost == min(cheaper))
         assert f"{said}, {least.cost:.6g}: the trajectory of candidate {least.start!r}" in solution.detail
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("goal", [0.5, -2.0])
+def test_a_callback_hears_of_what_is_run_to_its_end_alone_and_in_the_callers_thread(goal: float, threads: int) -> None:
+    """From rest no single control turns it (Brockett's integrator): of the oscillating starts, one is gone on with."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [u[0], u[1], x[0] * u[1] - x[1] * u[0]],
+        states=dict.fromkeys(("x", "y", "turn"), ""), controls=dict.fromkeys("uv", ""),
+    )  # fmt: skip
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=20, initial=ls.FixedState(np.zeros(3)), stage_cost=ls.ControlCost([0.1, 0.1]),
+        final_cost=ls.QuadraticCost([10.0, 10.0, 10.0], about=[0.0, 0.0, goal]),
+    )  # fmt: skip
+    told: list[tuple[Iteration, int]] = []
+    solution = ls.smooth(problem, threads=threads, callback=lambda one: told.append((one, threading.get_ident())))
+    assert len(solution.candidates) == 2
+    assert {thread for _, thread in told} == {threading.get_ident()}
+    assert len(told) == sum(one.iterations for one in solution.candidates)

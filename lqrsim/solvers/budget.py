@@ -115,14 +115,10 @@ class Stop:
 class Budget:
     """Iterations, time and callback of one run. Runs of one solve share a `Stop`; each has its own iterations."""
 
-    def __init__(self, most: int, stop: Stop | None = None, *, callback: Callback | None = None) -> None:
-        self._most, self._callback, self._reported = most, callback, 0
+    def __init__(self, most: int, stop: Stop | None = None) -> None:
+        self._most, self._callback, self._reported = most, None, 0
         self.stop = Stop() if stop is None else stop
         self.log: list[Iteration] = []  # the iterations so far, by any method
-
-    def another(self) -> "Budget":
-        """A budget for another run, with the same number of iterations."""
-        return Budget(self._most, self.stop, callback=self._callback)
 
     @property
     def left(self) -> int:
@@ -146,9 +142,9 @@ class Budget:
         self.stop.iterations, self.stop.last = self.stop.iterations + 1, iteration
         self._call((iteration,))
 
-    def report_to(self, callback: Callback | None) -> None:
-        """Set a callback; it is called at once with the iterations so far that none was called with."""
-        self._callback = callback
+    def report(self) -> None:
+        """From now on call the callback, and at once with the iterations so far, for this run is run to its end."""
+        self._callback = self.stop.callback
         self._call(self.log[self._reported :])
 
     def _call(self, iterations: Iterable[Iteration]) -> None:

@@ -88,7 +88,7 @@ class DurationSearch:
         assert problem.duration is not None
         self._problem, self._settings, self._solve = problem, settings, solve
         self._range, self._stop = problem.duration, stop
-        self._budget = Budget(settings.max_iterations, stop, callback=stop.callback)
+        self._budget = Budget(settings.max_iterations, stop)
         # The cheapest optimum so far: the problem with its duration, and what the interior point found.
         self.best: tuple[Problem, InteriorResult] | None = None
         self.candidates = list[Candidate]()  # what was tried
@@ -251,6 +251,7 @@ class DurationSearch:
     def _find(self, begin: Trajectory, budget: Budget, fraction: float = 1.0) -> tuple[bool, Problem, InteriorResult]:
         """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
         before, settings = len(budget.log), self._settings
+        budget.report()
         with self._stop.reporting("smooth"):
             tolerance = fraction * settings.final(self._problem)
             ordinary, result = find_duration(self._problem, begin, settings, budget, tolerance=tolerance)

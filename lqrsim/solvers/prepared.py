@@ -254,7 +254,8 @@ def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
 
 def _solve(run: SolveRun, best: "_Best") -> RunResult:
     """Smoothing, its safeguard and the augmented Lagrangian, until they converge or have to stop."""
-    run.budget.report_to(best)
+    run.budget.stop.callback = best
+    run.budget.report()
     try:
         if run.initial_guess.multipliers:
             return meet_constraints(run, None)

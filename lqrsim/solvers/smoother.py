@@ -119,8 +119,8 @@ def smooth(
       risk: replaces the problem's own risk; see `Problem`.
       threads: number of starts to run at once; by default the number of processors.
       callback: called with each `Iteration` as it ends; in a search, with iterations of starts that are run to their
-        end. An exception in it ends the solve, as Ctrl-C does; it is raised again, with the best plan so far as
-        `solution`.
+        end, also those for heavier obstacles or softer contacts. An exception in it ends the solve, as Ctrl-C does; it
+        is raised again, with the best plan so far as `solution`.
 
     Returns:
       A Solution. A hard problem raises no exception: the status says how the solve ended and what to try.
@@ -297,7 +297,8 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
     assert problem.start is not None
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
-    budget = Budget(settings.max_iterations, stop, callback=stop.callback)
+    budget = Budget(settings.max_iterations, stop)
+    budget.report()
     with stop.not_counting():
         guess = resolve(settings.start, problem)
         if guess.prior is not None:  # a function may return one

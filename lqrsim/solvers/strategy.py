@@ -166,7 +166,7 @@ def outlined(
         guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
         check_functions(free, guess.offset[0].copy())
         run = SolveRun(free, rough, guess, free._start_or_zero, budget)
-    budget.report_to(stop.callback)
+    budget.report()
     with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
         run.smooth(OUTLINED)
     outline, log = Trajectory(*copied(run.work.best), problem.dt), tuple(budget.log)
@@ -261,10 +261,8 @@ class Search:
     def __init__(self, named: list[tuple[str, SolveRun]], given: RunResult | None = None) -> None:
         first = named[0][1]
         self._named, self._known, self._given = named, Known(), given
-        self._problem, self._settings, self._start, self._budget = (
-            first.problem, first.settings, first.work.start.copy(), first.budget
-        )  # fmt: skip
-        self._callback, self._threads = self._budget.stop.callback, self._budget.stop.threads
+        self._problem, self._settings, self._start = first.problem, first.settings, first.work.start.copy()
+        self._budget, self._stop, self._threads = first.budget, first.budget.stop, first.budget.stop.threads
         self._solving = self._threads if len(named) == 1 else 1
         self._exact = first.second_order  # as all runs of the search
         self._guided = multistart.path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
@@ -316,7 +314,7 @@ class Search:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         self.finish_promising()
         lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
-        if lost and self._problem.start is not None and not self._budget.stop.due:
+        if lost and self._problem.start is not None and not self._stop.due:
             self.try_finite()
         if self.needs_others and self.is_barred:
             self.try_past_constraints()
@@ -345,7 +343,7 @@ class Search:
         # constraints, are approximate lower bounds on their costs with constraints.
         for run in sorted(others, key=lambda run: run.cost):
             best = self.best[1]
-            if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
+            if self._stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
             self._offer(run, self._finish(run))
 
@@ -354,13 +352,13 @@ class Search:
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         """
-        run.budget.report_to(self._callback)
+        run.budget.report()
         run.smooth(self._settings.max_iterations)
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
-        if run.ending.success or run.ending.status in unfinished or self._budget.stop.due:
+        if run.ending.success or run.ending.status in unfinished or self._stop.due:
             return run
         line = self._add(resolve(line_of_states(self._problem), self._problem), "a line of states")
-        line.budget.report_to(self._callback)
+        line.budget.report()
         line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
 
@@ -375,21 +373,23 @@ class Search:
                 plans.append((missed, cost, control))
         for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
             self._try(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
-            if self.best[1].success or self._budget.stop.due:
+            if self.best[1].success or self._stop.due:
                 return
         if self._exact and not np.isfinite(self.best[1].cost):
             self._try("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
-        stop = self._budget.stop
+        stop = self._stop
         for times in HEAVIER:
             if stop.due:
                 return
             heavier = multistart.reweighted(self._problem, times)
             runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
             try:
-                heaviest = choose(runs, self._threads)[0].run_to_end()
+                chosen = choose(runs, self._threads)[0]
+                chosen.budget.report()
+                heaviest = chosen.run_to_end()
             except InputError:  # the heavier cost is not finite at the start
                 continue
             if stop.due:
@@ -409,19 +409,19 @@ class Search:
         motions = dict[str, StartLike](self._motions()) if self._exact and not self.best[1].success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
-            if self._budget.stop.due or self.best[1].success:
+            if self._stop.due or self.best[1].success:
                 break
             self._known.from_start = False
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._try(name, start, finish if self._exact and name in sways else refine)
-        self.tried = not self._budget.stop.due
+        self.tried = not self._stop.due
 
     def _follow_ways(self) -> None:
         """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
         problem = self._problem
         for way in list(ways(problem, self.best[0].stages)):
-            if self._budget.stop.due:
+            if self._stop.due:
                 return
             self._known.from_start = False
             self._try(way.name, way.over(problem), from_states)
@@ -439,13 +439,13 @@ class Search:
         problem = self._problem
         pairs = zip(problem.constraints, passable(problem), strict=True)
         _, best = self._searched(problem.with_constraints([constraint for constraint, passed in pairs if not passed]))
-        if best.success and not self._budget.stop.due:
+        if best.success and not self._stop.due:
             self._known.from_start = False
             name = "a plan without what is in the way"
             self._try(name, guess_from(best, name), refine)
 
     def grow_trees(self) -> None:
-        for seed, way in ways_by_trees(self._problem, self._budget.stop):
+        for seed, way in ways_by_trees(self._problem, self._stop):
             self._try(f"trees of short plans, seed {seed}", way, from_states)
             if self.best[1].success:
                 return
@@ -455,10 +455,9 @@ class Search:
         problem, cost = self._problem, self.best[1].cost
         motions = list[tuple[float, str, Trajectory]]()
         for name, prior in multistart.along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
-            if self._budget.stop.due:
+            if self._stop.due:
                 break
             run = self._another(resolve(prior, problem))
-            run.budget.report_to(None)  # it is not run to its end
             run.smooth(multistart.FOLLOW)
             plan = copied(run.work.arrays.last)
             if np.isfinite(plan.states).all():
@@ -487,7 +486,7 @@ class Search:
         result, best = self._finish(chosen, known=Known()), self.best[1]
         # Even a plan that has not converged is better than doing nothing.
         self._offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
-        self.tried = not self._budget.stop.due
+        self.tried = not self._stop.due
 
     @property
     def touches_passable(self) -> bool:
@@ -499,7 +498,7 @@ class Search:
         """Finish plans from paths to the sides."""
         tried = {name for name, _ in self._named}
         for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
-            if name not in tried and not self._budget.stop.due:
+            if name not in tried and not self._stop.due:
                 self._try(name, trajectory)
 
     def leave_saddles(self) -> None:
@@ -512,7 +511,7 @@ class Search:
             if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
                 return
             if count == SADDLES or not self._descend(run, best):
-                status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
+                status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
                 if count == SADDLES:
                     detail = f"a saddle: the cost falls to second order, as it did at {count} plans that were left"
@@ -540,9 +539,9 @@ class Search:
                 self._problem.dt,
             )  # fmt: skip
             run_beside = self._another(guess_from(saddle, "a saddle"))
-            run_beside.budget.report_to(self._callback)
+            run_beside.budget.report()
             result = from_beside(run_beside, moved, saddle)
-            if self._budget.stop.due:
+            if self._stop.due:
                 break
             if result is not None and result.success and result.cost < saddle.cost - SADDLE_DECREASE * abs(saddle.cost):
                 self._named.append(("beside a saddle", run_beside))
@@ -570,11 +569,11 @@ class Search:
         for name, controls, plan in multistart.pushes(problem):
             consider(name, resolve(controls, problem), plan)
         for name, through in reach.approaches(problem, before, places):
-            if self._budget.stop.due:
+            if self._stop.due:
                 break
             run = self._another(resolve(None, through), through)
             with through.dynamics.solving(self._threads), run.budget.limited(APPROACH):
-                drawn = refine(run, Known()).kept()
+                drawn = self._finish(run, refine, Known()).kept()
             self._approached.append(name)
             plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
             if consider(name, guess_from(drawn, name), plan):
@@ -586,7 +585,7 @@ class Search:
             with problem.dynamics.solving(self._threads):
                 begun, other = run.given(), self._finish(run, refine)
             if run.is_worse(other, begun):  # a plan that no step can begin from is left by smoothing
-                status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
+                status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
             self._offer(run, other, better=before.violation >= other.violation and other.cost < self.best[1].cost)
             if self._comes_nearer(other) and (self._best_nearer is None or other.cost < self._best_nearer[1].cost):
@@ -619,14 +618,14 @@ class Search:
         run, best = self.best
         still = reach.differ(best, given, self._unmoved())
         worsened = still or run.is_worse(best, given) or reach.goal_left(self._problem, best, given)
-        if worsened and not self._budget.stop.due:
+        if worsened and not self._stop.due:
             run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
             wanted = run.is_worse(best, given) or (still and other.cost < best.cost) or other.rank < best.rank
             self._offer(run, other, better=wanted and not run.is_worse(other, given))
         run, best = self.best
         if run.is_worse(best, given):
-            status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
+            status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
             detail = "no plan was found that is better than the given one, which is returned"
             self._offer(run, replace(given, status=status, detail=detail), better=True)
 
@@ -635,8 +634,8 @@ class Search:
         riskless = replace(self._problem, risk=0.0)
         with self._problem.dynamics.solving(self._solving):
             runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-            plan = finish(choose(runs, self._threads)[0], Known())
-            if not plan.success or self._budget.stop.due:
+            plan = self._finish(choose(runs, self._threads)[0], known=Known())
+            if not plan.success or self._stop.due:
                 return
             begin = guess_from(plan, "a plan without risk")
             run = self._add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
@@ -663,11 +662,11 @@ class Search:
         (name, widest), *harder = self._soft
         if moved is not None:
             self._stiffen({f", {moved[0]}": begin}, harder, [], self._budget.left)
-            if self.best[1].success or self._budget.stop.due:
+            if self.best[1].success or self._stop.due:
                 return
         results = {"": self._keep_softer(name, *self._searched(widest))}
         for cycles, side in itertools.product(SWAYS, (1, -1)):
-            if not self._budget.stop.due:
+            if not self._stop.due:
                 begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
                 results[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
         self._stiffen(results, harder, [name], self._budget.left)
@@ -686,7 +685,7 @@ class Search:
                 (candidate for candidate in (before, again) if candidate is not None and candidate is not optimum),
                 key=lambda result: result.cost, default=before,
             )  # fmt: skip
-            if begin is optimum or self._budget.stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
+            if begin is optimum or self._stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
                 return
             if not self._keep_modes(begin):
                 return
@@ -731,7 +730,7 @@ class Search:
                 for origin, result in plans.items()
                 if np.isfinite(result.cost)
             } or plans
-            if self._budget.stop.due:
+            if self._stop.due:
                 return None
             plans = dict(sorted(plans.items(), key=lambda pair: pair[1].cost)[: -(-len(plans) // FEWER)])
         origin = min(plans, key=lambda origin: plans[origin].cost)
@@ -747,7 +746,7 @@ class Search:
     def _solve_softly(self, name: str, soft: Problem, begin: InitialGuess, most: int) -> RunResult:
         run = self._another(begin, soft)
         with soft.dynamics.solving(self._threads), run.budget.limited(most):
-            return self._keep_softer(name, run, refine(run, Known()))
+            return self._keep_softer(name, run, self._finish(run, refine, Known()))
 
     def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
         self._softer.append(run.candidate(f"contacts of softness {name}", result))
@@ -758,7 +757,7 @@ class Search:
         from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
 
         run = self._another(guess_from(plan, "the best plan"))
-        run.budget.report_to(self._callback)
+        run.budget.report()
         result = None
         # A cost that is not curved in all controls has no descent of this kind.
         with self._problem.dynamics.solving(self._threads), contextlib.suppress(np.linalg.LinAlgError):
@@ -772,7 +771,7 @@ class Search:
 
     def solution(self) -> Solution:
         chosen, result = self.best
-        problem, settings, stop = self._problem, self._settings, self._budget.stop
+        problem, settings, stop = self._problem, self._settings, self._stop
         if not np.isfinite(result.states).all() and not result.success:
             result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
         elif result.status is Status.INFEASIBLE and not self.tried and stop.error is None:
@@ -818,7 +817,7 @@ class Search:
         elif otherwise:
             clause = "with which the robot touches that body" if problem.dynamics.by_mujoco else f"that change {names}"
             remedy = f"begin with start=[...], controls {clause}"
-        if self._budget.stop.due:
+        if self._stop.due:
             status, remedy = Status.TIME_LIMIT, ""
         return replace(result, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
 
@@ -852,7 +851,8 @@ class Search:
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
-        return SolveRun(problem or self._problem, self._settings, initial_guess, self._start, self._budget.another())
+        budget = Budget(self._settings.max_iterations, self._stop)
+        return SolveRun(problem or self._problem, self._settings, initial_guess, self._start, budget)
 
     def _add(self, initial_guess: InitialGuess, name: str | None = None) -> SolveRun:
         """A run from another start that is one of the candidates."""
@@ -862,7 +862,7 @@ class Search:
 
     def _finish(self, run: SolveRun, how: Finish = finish, known: Known | None = None) -> RunResult:
         """Run to the end. The callback is called for all iterations of the run, including earlier ones."""
-        run.budget.report_to(self._callback)
+        run.budget.report()
         return how(run, self._known if known is None else known)
 
     def _try(self, name: str, start: StartLike | InitialGuess, how: Finish = finish) -> None:
@@ -879,12 +879,12 @@ class Search:
     @property
     def may_go_on(self) -> bool:
         """Whether other starts may be tried: by default, as long as there is time."""
-        return self._settings.safeguard and not self._budget.stop.due
+        return self._settings.safeguard and not self._stop.due
 
     @property
     def _cut_short(self) -> bool:
         """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
-        if self.best[1].success or not (self._default and self._settings.safeguard and self._budget.stop.due):
+        if self.best[1].success or not (self._default and self._settings.safeguard and self._stop.due):
             return False
         if not self.tried and self._is_unacceptable:
             return True
