@@ -1385,7 +1385,7 @@ class TestPlanMethods:
         for rung in (3.0, 0.0):  # with regularised models, and without
             memory["rung"] = rung
             for done in range(2):
-                memory["filtered"] = 0.0
+                memory["filter_rows"] = 0.0
                 assert run(interior_point.ITERATE, done, done + 1)[0] == done + 1
         state = with_rows((stages.about, work, memory.view(np.recarray)[0]))
         assert replay(kernel, SIZES, "force_step", *state) != 0

@@ -53,56 +53,6 @@ from lqrsim.kernels.stages import (
 
 COMPACT = 1  # all functions but those that are inline
 
-# Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
-# must exceed 1e-9 of its weight; the kernel treats less as rounding.
-CROSSING = 1e-6
-LONG = 0.3  # fraction of a step above which the next step uses Mehrotra's rule
-LATELY = 4  # number of iterations with that rule; to continue, the measures must be below the worst of these
-# Largest number of corrections after a long step, and the largest fraction of the violation that each may leave.
-CLOSINGS, CLOSER = 3, 0.3
-# If a step is not long: the longer fraction for which centring aims, the part of this gain that is required, and the
-# factor by which products may then differ from the barrier parameter.
-REACH, FURTHER, OUTLIER = 0.5, 0.1, 10.0
-BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
-LEVELS = 4  # largest number of reductions of the barrier parameter at once
-NEARLY = 10.0  # residuals of a barrier problem that is nearly solved, relative to the parameter
-# Factor by which the parameter then falls at least, and power of the parameter, if that is less.
-FALL, POWER = 0.2, 1.5
-HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
-LEAST = 0.1  # least barrier parameter, relative to the tolerance
-HALF = 0.5  # the same where there is no crossover: of all rows together
-NOTHING, FAR = 1e-4, 1e-2  # least scale of the first plan, relative to the typical cost of a change; if infinite
-SHORTEST = 1e-7  # fraction of a step below which the line search gives up
-MARGIN = 1e-5  # improvement that the filter requires
-ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
-SWITCH, SWITCHED = 2.3, 1.1  # powers of the predicted decrease and of the violation in the switching condition
-FORCED, SOME = 6, 0.1  # largest number of steps that are taken although the filter rejects them; the fraction of these
-WIDE = 1e10  # factor by which slack times multiplier may differ from the barrier parameter
-CROSSINGS = 8  # largest number of final steps without a barrier
-POLISHED = 1e-3  # fraction of the tolerances at which these end
-FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if these fail, and its least value
-CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
-CRAWL = 0.5  # factor by which stationarity falls too little, so that the Hessians need what is learned of them
-# Where derivatives of the dynamics jump, as by dry friction, no plan is stationary. The stationarity above which that
-# may be; the change of cost, relative to the cost, that is none; the number of such iterations after which the barrier
-# falls nevertheless; and after which the run ends, if the barrier costs no more than that change.
-STEEP, FLAT, FALLS, ENDS = 1e-3, 1e-3, 2, 6
-SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
-STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
-ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
-FARTHEST = 10.0  # largest violation relative to the first plan's
-SMALL, PER_GAP = 1e-4, 1e-2  # violation below which a step may be judged by its merit alone; the same for each gap
-AT_REST, HUGE = 1e-9, 1e100  # violation below which the merit may stay as it is; the most that a power can take
-ROUNDED = 1e3  # slope relative to the tolerance, from which on it counts as rounding if the cost does not change
-ROUNDING, RESTING = 1e-12, 1e-11  # relative differences of merits that may be rounding, in these two tests
-PER_ROW = 0.05  # that may be taken for the first plan's, relative to sizes: even rows far from active count in a sum
-EDGE = 0.05  # distance of the first controls from their limits, relative to the range
-FAR = 1e3  # range relative to the first controls, or to 1, from which on limits may be very wide
-BARELY = 1e-3  # least first excess, relative to the least first slack
-WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
-CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
-NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its row's size and relative to the cost
-
 # The two slacks of a row, which belong to its multiplier's lower and upper bound, and their signs in `d = s - p`.
 LOWER, UPPER = 0, 1
 SIGNS = (1.0, -1.0)
@@ -110,6 +60,10 @@ SIGNS = (1.0, -1.0)
 # Tasks of `interior_point`: to find typical sizes at a plan; to choose slacks and multipliers there; to take steps
 # without a barrier from there; to iterate; and to cross over, because no iteration follows.
 SCALE, BEGIN, POLISH, ITERATE, CLOSE = 0, 1, 2, 3, 4
+
+LONG = 0.3  # fraction of a step above which the next step uses Mehrotra's rule
+CROSSINGS = 8  # largest number of final steps without a barrier
+NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its row's size and relative to the cost
 
 
 def interior_point(task, first, last, tolerance, violation, begun, stages, work, memory, log):
@@ -138,6 +92,17 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     return iterations(first, last, task == CLOSE, tolerance, violation, stages, work, memory[0], log)
 
 
+# The first plan.
+
+WIDE_RANGE = 1e3  # range relative to the first controls, or to 1, from which on limits may be very wide
+EDGE = 0.05  # distance of the first controls from their limits, relative to the range
+LEAST_SCALE = 1e-4  # least scale of the first plan, relative to the typical cost of a change
+BARELY = 1e-3  # least first excess, relative to the least first slack
+WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
+FARTHEST = 10.0  # largest violation relative to the first plan's
+PER_ROW = 0.05  # that may be taken for the first plan's, relative to sizes: even rows far from active count in a sum
+
+
 def find_sizes(begun, stages, work, mem):
     """Take a plan, with its controls a little inside their limits; compute typical sizes and the models there."""
     now, steps, limits = work.now, stages.steps, stages.model.limits
@@ -147,7 +112,7 @@ def find_sizes(begun, stages, work, mem):
         widest = max(widest, limits.high[i] - limits.low[i] if limits.high[i] - limits.low[i] < inf else 0.0)
         for t in range(steps):
             largest = max(largest, abs(now.plan.controls[t, i]))
-    wide = widest > FAR * largest
+    wide = widest > WIDE_RANGE * largest
     if wide:  # whether they are is known from the models alone
         determine_scales(stages, now.plan)
     for i in range(M):
@@ -166,7 +131,7 @@ def begin(begun, stages, work, mem):
     mem.cost = evaluate_plan(stages, now.plan, now.arrived)
     read_rows(stages, now.plan, now.numbers)
     # A cost near zero, as when standing still, says nothing about the scale of the problem.
-    mem.scale = max(mem.cost, NOTHING * mem.typical) if mem.cost < inf else FAR * mem.typical
+    mem.scale = max(mem.cost, LEAST_SCALE * mem.typical) if mem.cost < inf else mem.typical
     mem.pairs, mem.elastic = 0.0, 0.0
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
@@ -177,7 +142,7 @@ def begin(begun, stages, work, mem):
                 mem.elastic = 1.0
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
     mem.highest, mem.fraction, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
-    mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    mem.rung, mem.forced, mem.filter_rows, mem.falls, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, nan, 0.0, begun.oldest
     clear(now.slacks, rows.size * (steps + 1), 2)
     for at in range(rows.size * (steps + 1)):
@@ -186,9 +151,9 @@ def begin(begun, stages, work, mem):
             begin_row(at, begun, stages, work, mem)
     for t in range(steps):
         clear(stages.policy.gain[t], M, N)
-    adjoint(stages, work.costates, work.other.changes.controls)
+    adjoint(stages, work.costates, work.alternative.changes.controls)
     measure_iterate(stages, work, mem)
-    violated = off(now, stages)
+    violated = total_violation(now, stages)
     forget(stages)
     mem.before = mem.cost
     mem.farthest_gap = FARTHEST * max(PER_ROW * steps, violated)
@@ -241,13 +206,33 @@ def from_bound(at, side, rows):
 
 # The loop.
 
+FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if a crossover fails, and its least value
+CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
+SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
+# Where derivatives of the dynamics jump, as by dry friction, no plan is stationary. The stationarity above which that
+# may be; the change of cost, relative to the cost, that is none; the number of such iterations after which the barrier
+# falls nevertheless; and after which the run ends, if the barrier costs no more than that change.
+STEEP, FLAT_COST, FLAT_BEFORE_FALL, FLAT_BEFORE_END = 1e-3, 1e-3, 2, 6
+ROUNDED = 1e3  # slope relative to the tolerance, from which on it counts as rounding if the cost does not change
+OUTLIER = 10.0  # factor by which a product of slack and multiplier may differ from the barrier parameter
+LATELY = 4  # number of iterations with Mehrotra's rule; to continue, the measures must be below the worst of these
+HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
+# Least barrier parameter, relative to the tolerance; the same where there is no crossover, of all rows together.
+LEAST_PARAMETER, LEAST_TOTAL = 0.1, 0.5
+LEVELS = 4  # largest number of reductions of the barrier parameter at once
+NEARLY = 10.0  # residuals of a barrier problem that is nearly solved, relative to the parameter
+# Factor by which the parameter then falls at least, and power of the parameter, if that is less.
+FALL_FACTOR, FALL_POWER = 0.2, 1.5
+STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
+ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
+CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
+# If a step is not long: the longer fraction for which centring aims, and the part of this gain that is required.
+REACH, FURTHER = 0.5, 0.1
+BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
+
 
 def iterations(first, last, closing, tolerance, violation, stages, work, mem, log):
     """Run the iterations `first` to `last` - 1, until the measures are within tolerance or no step helps.
-
-    Then a crossover to the active set makes controls end exactly at their limits. If it fails, the barrier falls
-    further, which shows which rows are active even if most of the cost is constant. Without second derivatives of the
-    dynamics there is no crossover: its steps have no line search, and the plan ends inside the constraints.
 
     With `closing`, no iteration follows.
     """
@@ -255,27 +240,9 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
     if isnan(mem.target):  # the first call
         mem.target = tolerance
     while True:
-        inside = within(stages.learns == 1, tolerance, violation, mem)
-        if inside and mem.age > 0 and (ended or central(tolerance, mem)):
-            renew(stages, work, mem)
-            inside = within(stages.learns == 1, tolerance, violation, mem)
-        mem.solved = 1.0 if inside or (mem.solved != 0 and stages.learns == 0) else 0.0
-        if stages.learns == 1 and inside and (ended or central(tolerance, mem)):
-            return done, CONVERGED
-        close = max(mem.complementarity, mem.stationarity) < mem.target
-        if stages.learns == 0 and mem.solved != 0 and (ended or close or mem.since >= CROSSINGS):
-            if not inside:
-                go_back(stages, work, mem)
-                return done, STALLED
-            if cross(tolerance, violation, stages, work, mem):
-                return done, CONVERGED
-            ended = ended or mem.target <= FINEST or mem.unchanged >= ENDS
-            mem.target *= FINER
-            mem.since = 0.0
-        if ended:
-            return done, STALLED
-        if done >= last:
-            return done, RUNNING
+        outcome = judge(ended, tolerance, violation, stages, work, mem)
+        if outcome != RUNNING or done >= last:
+            return done, outcome
         if not isfinite(mem.cost) or not iterate(done, tolerance, stages, work, mem):
             ended = True
             continue
@@ -286,6 +253,39 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
         mem.since += 1
         count_unchanged(stages.learns == 1, violation, mem)
         ended = creeping(violation, mem) or (stages.learns == 1 and cost_is_flat(mem))
+
+
+def judge(ended, tolerance, violation, stages, work, mem):
+    """Whether the iterate is optimal (CONVERGED), nothing helps any more (STALLED), or iterations go on (RUNNING).
+
+    If the measures are within tolerance, a crossover to the active set makes controls end exactly at their limits. If
+    it fails, the barrier falls further, which shows which rows are active even if most of the cost is constant. Without
+    second derivatives of the dynamics there is no crossover: its steps have no line search, and the plan ends inside
+    the constraints. `ended`: no iteration can follow.
+    """
+    learns = stages.learns == 1
+    inside = within(learns, tolerance, violation, mem)
+    if inside and mem.age > 0 and (ended or central(tolerance, mem)):
+        renew(stages, work, mem)
+        inside = within(learns, tolerance, violation, mem)
+    if learns:
+        mem.solved = 1.0 if inside else 0.0
+        if inside and (ended or central(tolerance, mem)):
+            return CONVERGED
+        return STALLED if ended else RUNNING
+    if inside:
+        mem.solved = 1.0
+    close = max(mem.complementarity, mem.stationarity) < mem.target
+    if mem.solved != 0 and (ended or close or mem.since >= CROSSINGS):
+        if not inside:
+            go_back(stages, work, mem)
+            return STALLED
+        if cross(tolerance, violation, stages, work, mem):
+            return CONVERGED
+        ended = ended or mem.target <= FINEST or mem.unchanged >= FLAT_BEFORE_END
+        mem.target *= FINER
+        mem.since = 0.0
+    return STALLED if ended else RUNNING
 
 
 @inline
@@ -306,7 +306,7 @@ def count_unchanged(learns, violation, mem):
     Where derivatives may jump, changes count as none that elsewhere would not, and steps may be short.
     """
     kept = mem.violation <= violation and (mem.stationarity > STEEP if learns else mem.fraction >= LONG)
-    if kept and abs(mem.cost - mem.level) <= (FLAT if learns else ROUNDING) * abs(mem.level):
+    if kept and abs(mem.cost - mem.level) <= (FLAT_COST if learns else ROUNDING) * abs(mem.level):
         mem.unchanged += 1
     else:
         mem.unchanged, mem.level = 0.0, mem.cost
@@ -315,7 +315,7 @@ def count_unchanged(learns, violation, mem):
 @inline
 def cost_is_flat(mem):
     """Whether the cost no longer changes at the least barrier."""
-    return mem.unchanged >= ENDS and mem.pairs * mem.parameter <= FLAT * mem.scale
+    return mem.unchanged >= FLAT_BEFORE_END and mem.pairs * mem.parameter <= FLAT_COST * mem.scale
 
 
 @inline
@@ -325,10 +325,10 @@ def within(learns, tolerance, violation, mem):
     Where long steps no longer change the cost, a slope far above the tolerance is rounding, which grows along unstable
     dynamics.
     """
-    missed = mem.miss < tolerance if mem.elastic != 0 else mem.violation <= violation
-    rounded = not learns and mem.unchanged >= ENDS and mem.stationarity > ROUNDED * tolerance
+    row_residual = mem.miss < tolerance if mem.elastic != 0 else mem.violation <= violation
+    rounded = not learns and mem.unchanged >= FLAT_BEFORE_END and mem.stationarity > ROUNDED * tolerance
     stationary = rounded or mem.stationarity < tolerance
-    return stationary and mem.gap < tolerance and mem.complementarity < tolerance and missed
+    return stationary and mem.gap < tolerance and mem.complementarity < tolerance and row_residual
 
 
 @inline
@@ -340,11 +340,15 @@ def central(tolerance, mem):
 
 def iterate(done, tolerance, stages, work, mem):
     """Do one iteration; return whether a step was found."""
-    least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
+    least, free = LEAST_PARAMETER * mem.target * mem.scale, falls_lately(work, mem)
     if stages.learns == 1:
-        least = HALF * tolerance * mem.scale / max(mem.pairs, 1.0)
-        if mem.unchanged >= FALLS and mem.parameter > least:
-            mem.parameter, mem.filtered, mem.unchanged = max(least, FALL * FALL * mem.parameter), 0.0, 0.0
+        least = LEAST_TOTAL * tolerance * mem.scale / max(mem.pairs, 1.0)
+        if mem.unchanged >= FLAT_BEFORE_FALL and mem.parameter > least:
+            mem.parameter, mem.filter_rows, mem.unchanged = (
+                max(least, FALL_FACTOR * FALL_FACTOR * mem.parameter),
+                0.0,
+                0.0,
+            )
     lower_barrier(done, least, free, stages, work, mem)
     fraction = -1.0
     while True:
@@ -382,7 +386,7 @@ def falls_lately(work, mem):
     The rule empties the filter each time. Without this condition, iterations may cycle.
     """
     error = larger(larger(mem.stationarity, mem.gap), larger(mem.miss, mem.product / mem.scale))
-    count, worst = int(mem.failed), inf
+    count, worst = int(mem.falls), inf
     if count > 0:
         worst = -inf
         for i in range(min(count, LATELY)):
@@ -390,7 +394,7 @@ def falls_lately(work, mem):
     good = error < worst
     if good:
         work.errors[count % LATELY] = error
-        mem.failed += 1
+        mem.falls += 1
     return good
 
 
@@ -399,7 +403,7 @@ def lower_barrier(done, least, free, stages, work, mem):
     # A bad first plan may cost a hundred times the optimum, which would make the first barrier too high.
     mem.highest = min(mem.highest, mem.barrier * mem.scale / max(mem.pairs, 1.0))
     if mem.parameter > mem.highest and done > 0:
-        mem.parameter, mem.filtered = mem.highest, 0.0
+        mem.parameter, mem.filter_rows = mem.highest, 0.0
     if free and mem.rung == 0 and mem.fraction >= LONG:
         return
     for _ in range(LEVELS):
@@ -407,8 +411,8 @@ def lower_barrier(done, least, free, stages, work, mem):
         residual = max(residual, off_centre(stages, work, mem))
         if residual > NEARLY * mem.parameter or mem.parameter <= least:
             break
-        lower = mem.scale * (mem.parameter / mem.scale) ** POWER
-        mem.parameter, mem.filtered = max(least, min(FALL * mem.parameter, lower)), 0.0
+        lower = mem.scale * (mem.parameter / mem.scale) ** FALL_POWER
+        mem.parameter, mem.filter_rows = max(least, min(FALL_FACTOR * mem.parameter, lower)), 0.0
 
 
 def off_centre(stages, work, mem):
@@ -504,7 +508,7 @@ def find_step(least, free, stages, work, mem):
 
 def predict(least, stages, work, mem):
     """Mehrotra's rule: set the barrier parameter by an affine step, and second-order corrections of the products."""
-    rows, slacks, step, corrections = stages.rows, work.now.slacks, work.other, work.corrections
+    rows, slacks, step, corrections = stages.rows, work.now.slacks, work.alternative, work.corrections
     mem.parameter = 0.0
     solve(False, corrections, work.gaps, stages, work, mem)
     complete(False, corrections, step, stages, work, mem)
@@ -518,7 +522,7 @@ def predict(least, stages, work, mem):
                 after += (slacks[at, side] + primal * step.slacks[at, side]) * (distance + dual * change)
     average, ratio = average / mem.pairs, after / average
     mem.parameter = max(least, min(HIGHER * mem.highest, ratio * ratio * ratio * average))
-    mem.filtered = 0.0
+    mem.filter_rows = 0.0
     for at in range(rows.size * (stages.steps + 1)):
         for side in range(2):
             if rows.live[at] != 0 and primal > CENTRED:
@@ -542,18 +546,18 @@ def centre(stages, work, mem):
             if rows.live[at] != 0 and has_slack(at, side, rows):
                 distance = from_bound(at, side, rows) + SIGNS[side] * dual_longer * step.force[at]
                 product = (slacks[at, side] + longer * step.slacks[at, side]) * distance
-                work.others[at, side] = corrections[at, side] - lacking(product, mem)
-    if not solve(False, work.others, work.gaps, stages, work, mem):
+                work.centring[at, side] = corrections[at, side] - lacking(product, mem)
+    if not solve(False, work.centring, work.gaps, stages, work, mem):
         return
-    complete(False, work.others, work.other, stages, work, mem)
-    other_fraction, _ = longest(tau, slacks, work.other, stages)
+    complete(False, work.centring, work.alternative, stages, work, mem)
+    other_fraction, _ = longest(tau, slacks, work.alternative, stages)
     if other_fraction >= fraction + FURTHER * REACH:
         count = rows.size * (stages.steps + 1)
-        copy_matrix(work.others, count, 2, corrections)
-        copy_matrix(work.other.slacks, count, 2, step.slacks)
-        copy(work.other.force, count, step.force)
-        copy_plan(stages.steps, work.other.changes, step.changes)
-        copy_matrix(work.other.costates, stages.steps + 1, N, step.costates)
+        copy_matrix(work.centring, count, 2, corrections)
+        copy_matrix(work.alternative.slacks, count, 2, step.slacks)
+        copy(work.alternative.force, count, step.force)
+        copy_plan(stages.steps, work.alternative.changes, step.changes)
+        copy_matrix(work.alternative.costates, stages.steps + 1, N, step.costates)
 
 
 @inline
@@ -588,6 +592,22 @@ def longest(tau, slacks, step, stages):
 
 # The line search.
 
+SHORTEST = 1e-7  # fraction of a step below which the line search gives up
+# Largest number of corrections after a long step, and the largest fraction of the violation that each may leave.
+CLOSINGS, CLOSER = 3, 0.3
+MARGIN = 1e-5  # improvement that the filter requires
+ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
+SWITCH, SWITCHED = 2.3, 1.1  # powers of the predicted decrease and of the violation in the switching condition
+LARGEST_POWER = 1e100  # the most that such a power can take
+# Violation below which a step may be judged by its merit alone; the same for each gap.
+NEARLY_FEASIBLE, PER_GAP = 1e-4, 1e-2
+AT_REST = 1e-9  # violation below which the merit may stay as it is
+ROUNDING, RESTING = 1e-12, 1e-11  # relative differences of merits that may be rounding, in these two tests
+# Largest number of steps that are taken although the filter rejects them; the fraction of these.
+FORCED, FORCED_FRACTION = 6, 0.1
+WIDE = 1e10  # factor by which slack times multiplier may differ from the barrier parameter
+CRAWL = 0.5  # factor by which stationarity falls too little, so that the Hessians need what is learned of them
+
 
 def search(corrected, stages, work, mem):
     """Backtrack along the step until the filter accepts; the first trial also with a second-order correction.
@@ -600,12 +620,12 @@ def search(corrected, stages, work, mem):
       The fraction of the step that leads to the point in `work.tried`, or -1.
     """
     step, now = work.step, work.now
-    mem.slope, mem.violated = slope_of_merit(stages, work, mem), off(now, stages)
+    mem.slope, mem.violated = slope_of_merit(stages, work, mem), total_violation(now, stages)
     mem.merit = merit_of(now, mem.cost, stages, mem)
     fraction, _ = longest(boundary(mem), now.slacks, step, stages)
     mem.whole, first = fraction, True
     while fraction > SHORTEST:
-        mem.tried = go(fraction, now, step.changes, step.slacks, work.tried, stages)
+        mem.tried = write_trial(fraction, now, step.changes, step.slacks, work.tried, stages)
         if isfinite(mem.tried) and acceptable(fraction, work.tried, mem.tried, stages, work, mem):
             if corrected and fraction >= LONG and mem.oldest == 0:
                 close_residuals(fraction, stages, work, mem)
@@ -624,20 +644,20 @@ def correct(fraction, stages, work, mem):
     Multipliers and costates come from the uncorrected step.
     """
     rows, now, tried = stages.rows, work.now, work.tried
-    if not off(tried, stages) >= mem.violated:
+    if not total_violation(tried, stages) >= mem.violated:
         return False
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            before = missed(at, now)
-            work.extra_residuals[at] = fraction * before + missed(at, tried) - before
+            before = row_residual(at, now)
+            work.extra_residuals[at] = fraction * before + row_residual(at, tried) - before
     for t in range(stages.steps):
         for i in range(N):
             work.extra_gaps[t, i] = fraction * work.gaps[t, i] + tried.arrived[t, i] - tried.plan.states[t + 1, i]
     if not solve(True, work.corrections, work.extra_gaps, stages, work, mem):
         return False
-    complete(True, work.corrections, work.other, stages, work, mem)
-    longest_fraction, _ = longest(boundary(mem), now.slacks, work.other, stages)
-    cost = go(longest_fraction, now, work.other.changes, work.other.slacks, work.closer, stages)
+    complete(True, work.corrections, work.alternative, stages, work, mem)
+    longest_fraction, _ = longest(boundary(mem), now.slacks, work.alternative, stages)
+    cost = write_trial(longest_fraction, now, work.alternative.changes, work.alternative.slacks, work.closer, stages)
     if not isfinite(cost) or not acceptable(fraction, work.closer, cost, stages, work, mem):
         return False
     copy_point(work.closer, work.tried, stages)
@@ -651,11 +671,11 @@ def close_residuals(fraction, stages, work, mem):
     The changes use the models of the step, so each change costs a Riccati pass and an evaluation of the steps. A good
     plan is then feasible long before it is optimal.
     """
-    rows, tried, slacks, other = stages.rows, work.tried, work.now.slacks, work.other
+    rows, tried, slacks, other = stages.rows, work.tried, work.now.slacks, work.alternative
     for _ in range(CLOSINGS):
-        violated = off(tried, stages)
+        violated = total_violation(tried, stages)
         for at in range(rows.size * (stages.steps + 1)):
-            work.forces[at] = -work.curves[at] * missed(at, tried) if rows.live[at] != 0 else 0.0
+            work.forces[at] = -work.curves[at] * row_residual(at, tried) if rows.live[at] != 0 else 0.0
         for t in range(stages.steps):
             for i in range(N):
                 work.extra_gaps[t, i] = tried.arrived[t, i] - tried.plan.states[t + 1, i]
@@ -664,13 +684,13 @@ def close_residuals(fraction, stages, work, mem):
             return
         for at in range(rows.size * (stages.steps + 1)):
             if rows.live[at] != 0:
-                change = -work.curves[at] * (row_change(at, stages) + missed(at, tried))
+                change = -work.curves[at] * (row_change(at, stages) + row_residual(at, tried))
                 for side in range(2):
                     dual = from_bound(at, side, rows)
                     other.slacks[at, side] = -SIGNS[side] * slacks[at, side] / dual * change
         longest_fraction, _ = longest(boundary(mem), tried.slacks, other, stages)
-        cost = go(longest_fraction, tried, stages.changes, other.slacks, work.closer, stages)
-        if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:
+        cost = write_trial(longest_fraction, tried, stages.changes, other.slacks, work.closer, stages)
+        if not isfinite(cost) or total_violation(work.closer, stages) > CLOSER * violated:
             return
         if not acceptable(fraction, work.closer, cost, stages, work, mem):
             return
@@ -688,23 +708,23 @@ def force_step(stages, work, mem):
     clear(work.corrections, stages.rows.size * (stages.steps + 1), 2)
     if mem.forced > FORCED or not solve(False, work.corrections, work.gaps, stages, work, mem):
         return -1.0
-    mem.filtered = 0.0
+    mem.filter_rows = 0.0
     complete(False, work.corrections, work.step, stages, work, mem)
     fraction = search(False, stages, work, mem)
     if fraction >= 0:
         return fraction
     fraction, _ = longest(boundary(mem), work.now.slacks, work.step, stages)
-    fraction *= SOME
-    mem.tried = go(fraction, work.now, work.step.changes, work.step.slacks, work.tried, stages)
+    fraction *= FORCED_FRACTION
+    mem.tried = write_trial(fraction, work.now, work.step.changes, work.step.slacks, work.tried, stages)
     return fraction if isfinite(mem.tried) else -1.0
 
 
 def accept_step(fraction, stages, work, mem):
     """Go to the trial, with that fraction of the step in multipliers and costates."""
-    rows, step, count = stages.rows, work.step, int(mem.filtered)
+    rows, step, count = stages.rows, work.step, int(mem.filter_rows)
     work.filter[count, 0] = (1 - MARGIN) * mem.violated
-    work.filter[count, 1] = merit_of(work.now, mem.cost, stages, mem) - MARGIN * mem.violated
-    mem.filtered += 1
+    work.filter[count, 1] = mem.merit - MARGIN * mem.violated
+    mem.filter_rows += 1
     mem.fraction = fraction
     if fraction >= LONG:
         mem.soft = max(1.0, mem.soft / SOFTER)
@@ -728,7 +748,7 @@ def accept_step(fraction, stages, work, mem):
         learn(stages, work.costates, work.last_step, work.turns, fraction >= LONG and mem.stationarity > CRAWL * before)
 
 
-def go(fraction, about, changes, slacks, out, stages):
+def write_trial(fraction, about, changes, slacks, out, stages):
     """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
     rows, steps, good = stages.rows, stages.steps, True
     for t in range(steps + 1):
@@ -759,17 +779,17 @@ def is_hard(at, rows):
 
 
 @inline
-def missed(at, point):
+def row_residual(at, point):
     """A row's value minus its slacks."""
     return point.numbers[at] - (point.slacks[at, LOWER] - point.slacks[at, UPPER])
 
 
-def off(point, stages):
+def total_violation(point, stages):
     """Total violation of dynamics and rows at a point, relative to their sizes."""
     rows, total = stages.rows, gap_of(point, stages)
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            total += abs(missed(at, point)) / rows.sizes[at]
+            total += abs(row_residual(at, point)) / rows.sizes[at]
     return total
 
 
@@ -815,14 +835,19 @@ def slope_of_merit(stages, work, mem):
 
 def acceptable(fraction, point, cost, stages, work, mem):
     """Whether the filter accepts a trial."""
-    violated, merit, before, slope = off(point, stages), merit_of(point, cost, stages, mem), mem.violated, mem.slope
+    violated, merit, before, slope = (
+        total_violation(point, stages),
+        merit_of(point, cost, stages, mem),
+        mem.violated,
+        mem.slope,
+    )
     if not isfinite(merit) or violated > mem.farthest or gap_of(point, stages) > mem.farthest_gap:
         return False
-    for k in range(int(mem.filtered)):
+    for k in range(int(mem.filter_rows)):
         if violated > work.filter[k, 0] and merit > work.filter[k, 1]:
             return False
-    small = SMALL * max(1.0, PER_GAP * stages.steps * N)
-    if before < small and slope < 0 and min(-fraction * slope, HUGE) ** SWITCH > before**SWITCHED:
+    small = NEARLY_FEASIBLE * max(1.0, PER_GAP * stages.steps * N)
+    if before < small and slope < 0 and min(-fraction * slope, LARGEST_POWER) ** SWITCH > before**SWITCHED:
         return merit <= mem.merit + ARMIJO * fraction * slope + ROUNDING * abs(mem.merit)
     at_rest = violated < AT_REST and merit <= mem.merit + RESTING * abs(mem.merit)
     return violated <= (1 - MARGIN) * before or merit <= mem.merit - MARGIN * before or at_rest
@@ -883,7 +908,7 @@ def measure_iterate(stages, work, mem):
     mem.miss, mem.product = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            mem.miss = larger(mem.miss, abs(missed(at, work.now)) / rows.sizes[at])
+            mem.miss = larger(mem.miss, abs(row_residual(at, work.now)) / rows.sizes[at])
             for side in range(2):
                 if has_slack(at, side, rows):
                     mem.product = larger(mem.product, slacks[at, side] * from_bound(at, side, rows))
@@ -892,6 +917,11 @@ def measure_iterate(stages, work, mem):
 
 
 # The crossover from the barrier to the active set.
+
+# Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
+# must exceed 1e-9 of its weight; the kernel treats less as rounding.
+CROSSING = 1e-6
+POLISHED = 1e-3  # fraction of the tolerances at which these steps end
 
 
 def polish(tolerance, violation, begun, stages, work, mem):
@@ -929,42 +959,42 @@ def cross(tolerance, violation, stages, work, mem):
 
 
 def polish_rows(tolerance, violation, stages, work, mem):
-    """Take steps with the rows that press held at their targets, and go where they converge, or else back.
+    """Take steps with the rows that press held at their targets, and write_trial where they converge, or else back.
 
     Returns whether they converge.
     """
-    rows, active, memory = stages.rows, work.active, work.active_memory[0]
+    rows, active, active_mem = stages.rows, work.active, work.active_memory[0]
     for at in range(rows.size * (stages.steps + 1)):
         rows.held[at] = first_state(at, rows, mem) if rows.live[at] != 0 else FREE
         if rows.held[at] == FREE:
             rows.force[at] = 0.0
         elif rows.held[at] == PAID:
             rows.force[at] = copysign(rows.prices[at], rows.force[at])
-    memory.typical = mem.typical
-    memory.cost = write_models(True, stages, active.plan, active.costates, 0.0)
-    measure_plan(violation, stages, active, memory)
+    active_mem.typical = mem.typical
+    active_mem.cost = write_models(True, stages, active.plan, active.costates, 0.0)
+    measure_plan(violation, stages, active, active_mem)
     for k in range(CROSSINGS):
         # The first step may be long; with a weight as large as in the other steps, rounding would spoil it.
         softness, outcome = SOFTNESS if k > 0 else CROSSING, RUNNING
-        prepare_step(stages, active, memory)
+        prepare_step(stages, active, active_mem)
         while outcome == RUNNING:
-            outcome = pivot(softness, stages, active, memory)
+            outcome = pivot(softness, stages, active, active_mem)
         if outcome == STALLED:
             break
-        apply_step(violation, stages, active, memory)
-        if not isfinite(memory.cost):
+        apply_step(violation, stages, active, active_mem)
+        if not isfinite(active_mem.cost):
             break
         farthest = farthest_from_target(rows, stages.steps)
-        if max(memory.stationarity, memory.gap) < POLISHED * tolerance and farthest < POLISHED * violation:
+        if max(active_mem.stationarity, active_mem.gap) < POLISHED * tolerance and farthest < POLISHED * violation:
             break
-    kept = mem.elastic != 0 or memory.violation <= violation
-    if not isfinite(memory.cost) or not kept or not max(memory.stationarity, memory.gap) < tolerance:
+    kept = mem.elastic != 0 or active_mem.violation <= violation
+    if not isfinite(active_mem.cost) or not kept or not max(active_mem.stationarity, active_mem.gap) < tolerance:
         go_back(stages, work, mem)
         return False
     copy_plan(stages.steps, active.plan, work.now.plan)
     copy(rows.numbers, rows.size * (stages.steps + 1), work.now.numbers)
     copy_matrix(active.costates, stages.steps + 1, N, work.costates)
-    mem.cost = memory.cost
+    mem.cost = active_mem.cost
     measure_iterate(stages, work, mem)
     return True
 

@@ -318,7 +318,7 @@ def ilqr_iterations(first, stop, settings, model, work, memory, log):
         if NOISY:  # with the new policy's cost-to-go
             cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
-        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.last)
+        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, SHORTEST, work.last)
         if fraction > 0:
             copy_plan(steps, work.last, plan)
         improvement = relative_improvement(old, cost, 0.0)

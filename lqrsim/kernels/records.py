@@ -318,11 +318,11 @@ class InteriorArrays(NamedTuple):
     kept_force: Annotated[Arrays, "K"]
     kept_costates: Annotated[Arrays, "T+1 N"]
     step: PlanStep  # of an iteration
-    other: PlanStep  # another that may take its place
+    alternative: PlanStep  # may take its place
     curves: Annotated[Arrays, "K"]  # this and the next: see `direction` of `stages.py`
     forces: Annotated[Arrays, "K"]
     corrections: Annotated[Arrays, "K 2"]  # of the products of slacks and multipliers, for both steps
-    others: Annotated[Arrays, "K 2"]
+    centring: Annotated[Arrays, "K 2"]
     extra_residuals: Annotated[Arrays, "K"]  # further residuals of the rows
     extra_gaps: Annotated[Arrays, "T N"]
     last_step: Annotated[Arrays, "T+1 W"]  # the last step
@@ -583,42 +583,46 @@ def _row(*names: str) -> np.dtype[np.void]:
 
 
 # The state of the iterations between calls.
-# plan_cost, merit: cost and merit of the plan; the merit includes the augmented Lagrangian. started: 1 once the start
-# was rolled out. watched: 1 if undamped iterations end without progress, because the safeguard can take over.
-# Of a descent: small_changes: number of small changes of cost in a row; idle: number of steps in a row that improved by
-# rounding. failed: the step at which the last pass failed, or -1. negligible: the negligible cost; least: the least
-# cost to which an optimality is relative. final_gap: gap between smoothed states and plan at the end.
-# Of damped steps: reach of the next; weight on changes of the controls, which iLQR has, too; for steps at reach 0,
-# iLQR's, how many remain, how many there will be the next time, and how many others there were since.
-# Of passes about the plan: known: 1 if the next step's was made; its fraction of second_order terms, weight on changes
-# of the controls (damping), predicted slope of the merit (decrease) and predicted decrease, relative to the merit
-# (relative_decrease). extra_steps: number of steps that followed an optimal plan.
 MEMORY = _row(
-    "plan_cost", "merit", "started", "watched", "small_changes", "idle", "failed", "negligible", "least", "final_gap",
-    "reach", "weight", "ilqr_left", "ilqr_next", "since_ilqr", "known", "second_order", "damping", "decrease",
-    "relative_decrease", "extra_steps",
+    # Cost and merit of the plan; the merit includes the augmented Lagrangian. 1 once the start was rolled out; 1 if
+    # undamped iterations end without progress, because the safeguard can take over.
+    "plan_cost", "merit", "started", "watched",
+    # Of a descent: number of small changes of cost in a row; number of steps in a row that improved by rounding; the
+    # step at which the last pass failed, or -1; the negligible cost; the least cost to which an optimality is relative;
+    # gap between smoothed states and plan at the end.
+    "small_changes", "idle", "failed", "negligible", "least", "final_gap",
+    # Of damped steps: reach of the next; weight on changes of the controls, which iLQR has, too; for steps at reach 0,
+    # iLQR's, how many remain, how many there will be the next time, and how many others there were since.
+    "reach", "weight", "ilqr_left", "ilqr_next", "since_ilqr",
+    # Of passes about the plan: 1 if the next step's was made; its fraction of second-order terms, weight on changes of
+    # the controls, predicted slope of the merit, and predicted decrease relative to the merit; number of steps that
+    # followed an optimal plan.
+    "known", "second_order", "damping", "decrease", "relative_decrease", "extra_steps",
 )  # fmt: skip
 
-# The state of an interior point between calls. cost, stationarity, violation, gap, complementarity: the measures of the
-# iterate; see `interior_point.Measures` of the solvers. miss: largest difference of a row's value and its slacks,
-# relative to the row's size. product: largest product of a slack and its multiplier. scale: the cost to which measures
-# are relative. typical: the typical cost of a change. parameter, highest, barrier: the barrier parameter; its largest
-# value; and that as a fraction of the cost of a row. pairs: number of slacks. elastic: 1 if a row has a price. rung:
-# that of the step's models on the ladder of regularisation. convex_fraction: that of the projected Hessian in
-# these. soft: softness of equalities. fraction: that of the last step that was taken. forced: number of steps taken
-# although the filter rejected them. filtered, failed: numbers of rows of the filter and of the last errors. farthest,
-# farthest_gap: largest violations. violated, merit, slope: of the iterate, for the line search. tried: the cost of its
-# trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier falls. since:
-# number of iterations since the last attempt to cross over. short: number of short steps in a row. before: cost at the
-# first of these. unchanged, level: number of iterations in a row in which the constraints were kept and the cost was
-# that of the first, `level`. kept, kept_scale: cost and scale of the point to go back to. whole: the largest fraction
-# of the last step with which slacks stay positive. age: number of steps since the dynamics were linearised; oldest: its
-# largest value.
+# The state of an interior point between calls.
 INTERIOR = _row(
-    "cost", "stationarity", "violation", "gap", "complementarity", "miss", "product", "scale", "typical", "parameter",
-    "highest", "barrier", "pairs", "elastic", "rung", "convex_fraction", "soft", "fraction", "forced", "filtered",
-    "failed", "farthest", "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short",
-    "before", "unchanged", "level", "kept", "kept_scale", "whole", "age", "oldest",
+    # The measures of the iterate; see `interior_point.Measures` of the solvers.
+    "cost", "stationarity", "violation", "gap", "complementarity",
+    # Largest difference of a row's value and its slacks, relative to the row's size; largest product of a slack and its
+    # multiplier; the cost to which measures are relative; the typical cost of a change.
+    "miss", "product", "scale", "typical",
+    # The barrier parameter; its largest value; that as a fraction of the cost of a row; number of slacks; 1 if a row
+    # has a price; the tolerance towards which the barrier falls; number of last errors that Mehrotra's rule compares.
+    "parameter", "highest", "barrier", "pairs", "elastic", "target", "falls",
+    # The step: the rung of its models on the ladder of regularisation; the fraction of the projected Hessian in these;
+    # softness of equalities.
+    "rung", "convex_fraction", "soft",
+    # The line search: violation, merit and slope of the iterate; rows of the filter; largest violations; the cost of
+    # the trial; the largest fraction with which slacks stay positive; the fraction that was taken; number of steps
+    # taken although the filter rejected them.
+    "violated", "merit", "slope", "filter_rows", "farthest", "farthest_gap", "tried", "whole", "fraction", "forced",
+    # Endings: 1 once the measures are within tolerance; number of iterations since the last attempt to cross over;
+    # number of short steps in a row, and the cost at the first of these; number of iterations in a row in which the
+    # constraints were kept and the cost was that of the first, `level`.
+    "solved", "since", "short", "before", "unchanged", "level",
+    # Cost and scale of the point to go back to; number of steps since the dynamics were linearised, at most `oldest`.
+    "kept", "kept_scale", "age", "oldest",
 )  # fmt: skip
 
 # The state of an active set between calls. cost, stationarity, violation, gap, complementarity, scale, typical: as

@@ -15,7 +15,7 @@ from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels import active_set
 from lqrsim.kernels.declarations import CONVERGED, NO_PROGRESS, NOT_FINITE, RUNNING
-from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, POLISH, SCALE
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, FLAT_BEFORE_END, ITERATE, POLISH, SCALE
 from lqrsim.kernels.records import MEASURES, RESTORED, Motion, PlanBeginning, StructuredArray
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState, Problem
@@ -170,8 +170,8 @@ class InteriorPoint:
         return InteriorResult(
             plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain,
             measures=Measures.of(self._memory), multipliers=tuple(stages.by_constraint(stages.force)),
-            pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self._sizes,
-            scale=float(self._memory["scale"][0]),
+            pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= FLAT_BEFORE_END),
+            sizes=self._sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip
 
 

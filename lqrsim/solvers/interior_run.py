@@ -11,7 +11,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels.active_set import AT_LIMIT, FIRMNESS
-from lqrsim.kernels.interior_point import ENDS, FLAT
+from lqrsim.kernels.interior_point import FLAT_BEFORE_END, FLAT_COST
 from lqrsim.kernels.records import Motion, Policy
 from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
@@ -27,13 +27,13 @@ FAINT = 1e-9  # factor by which penalties are smaller where a plan ends inside: 
 # What is said where the cost no longer changes, and the gradient does not vanish.
 KINKED = (
     "the derivatives of the dynamics jump along the plan, as by dry friction, at a contact, at a joint's limit or in a"
-    f" medium at rest, where no gradient vanishes; the cost has not changed by {FLAT:g} of itself in {ENDS} iterations,"
-    " but plans beside it may cost less"
+    f" medium at rest, where no gradient vanishes; the cost has not changed by {FLAT_COST:g} of itself in"
+    f" {FLAT_BEFORE_END} iterations, but plans beside it may cost less"
 )
 UNSETTLED = (
     "no gradient vanishes along the plan, as where a flat side of the robot lies along an obstacle and the derivatives"
-    f" of a distance jump; from two plans the search ended at costs within {FLAT:g} of each other, but plans beside"
-    " them may cost less"
+    f" of a distance jump; from two plans the search ended at costs within {FLAT_COST:g} of each other, but plans"
+    " beside them may cost less"
 )
 # Distance from the plan at which derivatives are compared, relative to sizes of states and controls; and the difference
 # that is a jump, relative to the largest derivative: along arms without dry friction it is 1e-5 to 1e-4.
@@ -86,7 +86,7 @@ class InteriorRun:
         if not interior.flat or result.violation > self.allowed:
             return result
         detail = KINKED if self._jumps(interior) else ""
-        if self._flat is not None and abs(self._flat.cost - result.cost) <= FLAT * abs(result.cost):
+        if self._flat is not None and abs(self._flat.cost - result.cost) <= FLAT_COST * abs(result.cost):
             result, detail = min(self._flat, result, key=lambda flat: flat.cost), detail or UNSETTLED
         self._flat = result.kept()
         if detail:
