@@ -19,8 +19,8 @@ from lqrsim.problem import quadratic_cost
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.effects import Effect
 from lqrsim.stress import statistics
+from lqrsim.stress.failure_search import PrescribedDraws
 from lqrsim.stress.reliability import failure_probability, smallest_failure
-from lqrsim.stress.trial_score import PrescribedDraws
 
 ls: Any = lqrsim  # any type is passed
 of: Any = lqrsim.disturbances

@@ -7,9 +7,8 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, ForceNoise, Push
-from lqrsim.stress.failure_search import largest_effects
+from lqrsim.stress.failure_search import TrialScore, largest_effects
 from lqrsim.stress.reliability import smallest_failure
-from lqrsim.stress.trial_score import TrialScore
 
 UNITS = 1.0, 2.0**20, 2.0**-20  # powers of two, which round nothing
 

@@ -31,9 +31,9 @@ from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import executors
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.campaign_files import Columns, Damaged, unpack
+from lqrsim.stress.executors import Trials
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.study import Campaign, Cell, Shard
-from lqrsim.stress.trials import Trials
 
 OWN = """
 import dataclasses

@@ -41,9 +41,9 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign import run_campaign
+from lqrsim.stress.executors import Trials
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.study import Campaign
-from lqrsim.stress.trials import Trials
 
 ARM = """<mujoco>
   <option timestep="0.01"/>

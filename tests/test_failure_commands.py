@@ -21,8 +21,7 @@ from lqrsim.cli import main
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import reliability
-from lqrsim.stress.failure_search import write_json
-from lqrsim.stress.trial_score import TrialScore
+from lqrsim.stress.failure_search import TrialScore, write_json
 
 # One random number decides: how far towards the wall behind it the robot begins.
 OWN = """

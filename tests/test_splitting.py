@@ -19,9 +19,9 @@ from lqrsim.disturbances import (
     Push,
 )
 from lqrsim.simulation.disturbances import preset
+from lqrsim.stress.failure_search import PrescribedDraws, TrialScore, collision_score, miss_score
 from lqrsim.stress.reliability import NoFailure, failure_probability, smallest_failure
 from lqrsim.stress.statistics import rate
-from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision_score, miss_score
 from lqrsim.templates.my_robot.my_robot import MyRobot
 
 

@@ -3,7 +3,10 @@ from .analysis import outcomes as outcomes
 from .campaign import run_campaign as run_campaign
 from .failure_search import FailureCertificate as FailureCertificate
 from .failure_search import ReliabilityProblem as ReliabilityProblem
+from .failure_search import TrialScore as TrialScore
 from .failure_search import certify as certify
+from .failure_search import collision_score as collision_score
+from .failure_search import miss_score as miss_score
 from .funnels import FunnelCheck as FunnelCheck
 from .funnels import check_funnel as check_funnel
 from .reliability import NoFailure as NoFailure
@@ -20,6 +23,3 @@ from .study import Campaign as Campaign
 from .study import Cell as Cell
 from .study import Setup as Setup
 from .study import Study as Study
-from .trial_score import TrialScore as TrialScore
-from .trial_score import collision_score as collision_score
-from .trial_score import miss_score as miss_score

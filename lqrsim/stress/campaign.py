@@ -31,9 +31,9 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors, policies
+from lqrsim.stress.executors import Trials
 from lqrsim.stress.results import Results
 from lqrsim.stress.study import Campaign, Shard
-from lqrsim.stress.trials import Trials
 from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")

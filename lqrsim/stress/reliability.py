@@ -1,6 +1,6 @@
 """Reliability analysis: the probability of a rare failure by multilevel splitting, and the most likely failure.
 
-A trial is a function of a vector z of standard normal numbers (trial_score.py), and fails if its score is positive. A
+A trial is a function of a vector z of standard normal numbers (`TrialScore`), and fails if its score is positive. A
 pilot run finds levels of the score, each exceeded by a fraction of about `keep` of the vectors above the previous
 level, and a step size for each level. Each repetition uses these levels and step sizes: it begins with N vectors; those
 above the level replace the others; then all are moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b

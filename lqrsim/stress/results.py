@@ -24,10 +24,10 @@ from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign_files import SOLUTION_FILE, Columns, Damaged, digest_of_solution, read_manifest, read_table
+from lqrsim.stress.executors import Trials
 from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
 from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.study import Campaign, Cell, Shard
-from lqrsim.stress.trials import Trials
 
 MOST_REASONS = 5  # largest number of reasons in a summary
 # What may differ between two campaigns that are compared: settings, and other fields of the manifest.

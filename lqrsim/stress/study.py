@@ -1,7 +1,7 @@
 """What is run: the records that state studies and campaigns. Plain data, which converts to JSON and back.
 
 A study is one policy of a scenario under disturbances; a campaign is many, with trials of each. Both state the same
-`Setup`. A study becomes a plant and a controller in `Study.closed_loop`, a campaign in `trials.Trials`.
+`Setup`. A study becomes a plant and a controller in `Study.closed_loop`, a campaign in `executors.Trials`.
 """
 
 import dataclasses
