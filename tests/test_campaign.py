@@ -30,10 +30,8 @@ from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import executors
 from lqrsim.stress.campaign import run_campaign
-from lqrsim.stress.campaign_files import Columns, Damaged, unpack
-from lqrsim.stress.executors import Trials
-from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.study import Campaign, Cell, Shard
+from lqrsim.stress.results import Columns, Damaged, Results, differences, replay, unpack
+from lqrsim.stress.study import Campaign, Cell, Shard, Trials
 
 OWN = """
 import dataclasses
@@ -370,7 +368,7 @@ def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pyte
         plain = own.solutions[cell.policy].policy
         return Mad(plain) if cell.policy == "open_loop" else plain
 
-    monkeypatch.setattr(Trials, "_controller", mad)
+    monkeypatch.setattr(Trials, "controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
     nan = Cell("open_loop", "scenario", 1.0)
     assert results.tally(nan)["error"] > 15  # the others collide before
@@ -562,8 +560,8 @@ def test_a_full_disk_stops_it_until_there_is_room(
 
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
-    code = "import sys, time; from pathlib import Path; from lqrsim.stress.campaign_files import sole_writer\n"
-    code += "with sole_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    code = "import sys, time; from pathlib import Path; from lqrsim.stress.campaign import _sole_writer\n"
+    code += "with _sole_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     campaign = replace(CAMPAIGN, trials=2)
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
@@ -745,7 +743,7 @@ def test_a_table_is_read_once(command: str, own: Path, tmp_path: Path, monkeypat
 
     if command != "stress":
         run_campaign(campaign, "out", workers=0)
-    monkeypatch.setattr("lqrsim.stress.campaign_files.unpack", counted)
+    monkeypatch.setattr("lqrsim.stress.results.unpack", counted)
     if command == "stress":
         options = "--sweep scenario --strengths 1 --policies smooth --trials 24 --shard 8 --workers 0 --out out --json"
         assert main(["stress", campaign.scenario, *options.split()]) == 1

@@ -675,7 +675,7 @@ import numpy as np
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.results.archive import replacing
-from lqrsim.stress.campaign_files import write
+from lqrsim.stress.results import write
 from lqrsim.view.render import encoder
 
 rng = np.random.default_rng(0)

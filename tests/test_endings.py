@@ -41,9 +41,8 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign import run_campaign
-from lqrsim.stress.executors import Trials
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.study import Campaign
+from lqrsim.stress.study import Campaign, Trials
 
 ARM = """<mujoco>
   <option timestep="0.01"/>
@@ -825,7 +824,7 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     def controller(own: Trials, cell: Any) -> Controller | ls.AffinePolicy:
         return ls.OffsetFree(scenario.problem, own.solutions[cell.policy], wrong, tolerate=tolerate)
 
-    monkeypatch.setattr(Trials, "_controller", controller)
+    monkeypatch.setattr(Trials, "controller", controller)
     noise = (MeasurementNoise(0.02), ForceNoise(1.0))
     campaign = replace(ROUGH, sweeps={"noise": noise}, strengths=(1.0,), trials=12)
     files = []
@@ -935,7 +934,7 @@ def test_in_a_campaign_only_those_trials_fail_that_fail_alone(
     alone = rough.trials.run(rough.cells[1], 0, 12, frames=False, contacts=False)
     beyond = alone.measured[:, 7, 0] > np.median(alone.measured[:, 7, 0])
     monkeypatch.setitem(globals(), "FAR", float(np.median(alone.measured[:, 7, 0])))
-    monkeypatch.setattr(Trials, "_controller", lambda own, cell: Failing(own.solutions[cell.policy], some))
+    monkeypatch.setattr(Trials, "controller", lambda own, cell: Failing(own.solutions[cell.policy], some))
     files = []
     for batch in (12, 5):
         results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.control.controllers import Feedback, evaluator, turn_to_nearest
+from lqrsim.scenarios.solutions import digest_of_solution
 from lqrsim.solvers import compiled
-from lqrsim.stress.campaign_files import digest_of_solution
 
 
 def test_on_the_plan_it_plays_the_plan(drive_solution: ls.Solution) -> None:

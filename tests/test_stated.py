@@ -17,7 +17,6 @@ from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, Mo
 from lqrsim.errors import InputError
 from lqrsim.reports.page import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
-from lqrsim.stress.campaign_files import read_manifest
 from lqrsim.stress.policies import (
     CAMPAIGN_POLICIES,
     CONTROLLERS,
@@ -28,6 +27,7 @@ from lqrsim.stress.policies import (
     make_controller,
     solve_policies,
 )
+from lqrsim.stress.results import read_manifest
 
 LIGHT = (
     ControlNoise(0.02),

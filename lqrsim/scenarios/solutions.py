@@ -10,6 +10,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_kind
 from lqrsim.problem.problem import Problem
+from lqrsim.results.archive import sha256
 from lqrsim.results.certified import FailureCertificate
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
@@ -142,3 +143,15 @@ def _check_fits(field: str, what: object, scenario: Scenario, spaces: Spaces, st
 def digest_of_start(scenario: Scenario) -> str | None:
     """Hash of the scenario's start; None if it has none."""
     return None if scenario.start is None else resolve(scenario.start, scenario.problem).digest
+
+
+def digest_of_solution(solution: Solution) -> str:
+    """Hash of everything in a solution that its runs depend on, which excludes the log of its solve."""
+    plan, policy = solution.trajectory, solution.policy
+    goal = np.zeros(0) if solution.goal is None else solution.goal
+    arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]
+    if solution.cost_to_go is not None:  # re-planning begins with the cost-to-go and the multipliers
+        arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
+    arrays += [multiplier.values for multiplier in solution.multipliers]
+    rules = policy.state_coordinates.rules, policy.control_coordinates.rules
+    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)), *rules)

@@ -8,6 +8,7 @@ the number of workers, the batch size or interruptions.
 """
 
 import contextlib
+import errno
 import itertools
 import logging
 import os
@@ -29,17 +30,25 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.stress import campaign_files as files
 from lqrsim.stress import executors, policies
-from lqrsim.stress.executors import Trials
-from lqrsim.stress.results import Results
-from lqrsim.stress.study import Campaign, Shard
+from lqrsim.stress.results import (
+    MANIFEST,
+    SOLUTION_FILE,
+    Damaged,
+    Results,
+    read_manifest,
+    read_table,
+    write,
+    write_manifest,
+)
+from lqrsim.stress.study import Campaign, Shard, Trials
 from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
 
 MOST_WORKERS, LARGEST_BATCH = 1024, 100_000
-_CAMPAIGN_FILES = {files.NAME, files.SOLUTION_FILE, "campaign.lock", "policies", "shards", "damaged"}
+_HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
+_CAMPAIGN_FILES = {MANIFEST, SOLUTION_FILE, "campaign.lock", "policies", "shards", "damaged"}
 
 
 @checked
@@ -70,17 +79,17 @@ def run_campaign(
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
     _check_runnable(campaign)
-    if os.path.isdir(folder) and not os.path.exists(folder / files.NAME):
+    if os.path.isdir(folder) and not os.path.exists(folder / MANIFEST):
         names = (name for name in os.listdir(folder) if not name.startswith(".unfinished-"))
         if others := sorted({*names} - _CAMPAIGN_FILES):
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
-        stack.enter_context(files.sole_writer(folder))
+        stack.enter_context(_sole_writer(folder))
         stack.enter_context(_resumable(folder, campaign.scenario))
         specification = _specification(campaign)
-        if os.path.exists(folder / files.NAME):
-            _check_same_campaign(specification, files.read_manifest(folder), folder)
+        if os.path.exists(folder / MANIFEST):
+            _check_same_campaign(specification, read_manifest(folder), folder)
         else:
             _begin(campaign, specification, _solve(campaign), folder)
         results = Results(folder, scenario=campaign.scenario)
@@ -90,7 +99,7 @@ def run_campaign(
             raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
         trials = Trials(campaign, {policy: results.solution(policy) for policy in campaign.policies})
         if unfinished:
-            trials.warm_up()  # done here first, so that the workers find everything compiled
+            executors.warm_up(trials)  # done here first, so that the workers find everything compiled
         job = executors.Job.of(trials, results.manifest, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
@@ -102,7 +111,7 @@ def run_campaign(
         else:
             work = ((shard, job.work(shard, trials)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
-            files.write(contents, results.path(shard))
+            write(contents, results.path(shard))
             done += shard.count
             tell(done, total)
         for cell, ends, _ in results.cell_successes():
@@ -114,12 +123,54 @@ def run_campaign(
 
 
 @contextlib.contextmanager
+def _sole_writer(folder: Path) -> Iterator[None]:
+    """Make the folder if it does not exist, and lock it during the block.
+
+    The system releases the lock when the process dies, however it dies. File systems without locks are refused.
+    """
+    path = folder / "campaign.lock"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise InputError(f"folder: got {folder}, want one that can be written ({error.strerror})") from None
+    try:
+        try:
+            _lock(handle)
+        except OSError as error:
+            got = f"{folder}, which another process writes (see {path.name}), want one at a time"
+            if error.errno not in _HELD:
+                got = f"{folder}, want one whose files can be locked ({error.strerror or error})"
+            raise InputError(f"folder: got {got}") from None
+        with contextlib.suppress(OSError):  # shows which process has the lock
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
+        yield
+    finally:
+        os.close(handle)
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(handle: int) -> None:
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that is never read: locked bytes cannot be read
+
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+else:
+    import fcntl
+
+    def _lock(handle: int) -> None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextlib.contextmanager
 def _resumable(folder: Path, scenario: str) -> Iterator[None]:
     """A block whose KeyboardInterrupt says how to go on, once the folder has a campaign."""
     try:
         yield
     except KeyboardInterrupt as stop:
-        if (folder / files.NAME).exists():
+        if (folder / MANIFEST).exists():
             command = Results(folder, scenario=scenario).command
             stop.add_note(f"{folder} has what is done; to go on, call run_campaign again, or run: {command}")
         raise
@@ -190,7 +241,7 @@ def _specification(campaign: Campaign) -> dict[str, Any]:
         "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
         "start": solving.digest_of_start(scenario),
-        "solution": None if given is None else files.digest_of_solution(given),
+        "solution": None if given is None else solving.digest_of_solution(given),
         "code": _code(campaign),
     }
 
@@ -209,15 +260,15 @@ def _begin(campaign: Campaign, specification: dict[str, Any], solutions: dict[st
     scenario, given, hashes = campaign.resolved, campaign.given, dict[str, dict[str, str]]()
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
-        hashes[policy] = {"digest": files.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
+        hashes[policy] = {"digest": solving.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
-        save_load.save(given, folder / files.SOLUTION_FILE)
+        save_load.save(given, folder / SOLUTION_FILE)
     remarks = [f"{name} {line}" for name, plan in solutions.items() for line in solving.remarks(scenario, plan)]
     impossible = policies.impossible_policies(scenario, given)
     missing = "; ".join(f"{name}, {impossible[name]}" for name in policies.DEFAULT_POLICIES if name in impossible)
     # Policies that were chosen leave out others on purpose.
     by_default = {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*impossible}
-    files.write_manifest(folder, specification | {
+    write_manifest(folder, specification | {
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",
         "deterministic": [
@@ -248,7 +299,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(f"scenario: got a {parts} other than the one {folder} was begun with{older}, want another")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
-        want = "none" if manifest["solution"] is None else folder / files.SOLUTION_FILE
+        want = "none" if manifest["solution"] is None else folder / SOLUTION_FILE
         raise InputError(f"solution: got {got}, want {want}, as {folder} was begun with, or another folder")
     for kind, digest in specification["code"].items():
         if digest != manifest["code"].get(kind):
@@ -297,8 +348,8 @@ def _is_intact(results: Results, shard: Shard) -> bool:
     """Whether a shard's file is as it was written; if it is not, it is moved aside."""
     path = results.path(shard)
     try:
-        files.read_table(path, shard, results.manifest["digest"])
-    except files.Damaged as error:
+        read_table(path, shard, results.manifest["digest"])
+    except Damaged as error:
         folder = results.folder / "damaged"
         try:
             folder.mkdir(exist_ok=True)

@@ -30,11 +30,11 @@ from lqrsim.results.certified import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import names_code
+from lqrsim.scenarios.solutions import digest_of_solution
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 from lqrsim.stress import reliability
-from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.study import Study, disturbances_as_json
 from lqrsim.versions import changed, versions

@@ -1,7 +1,7 @@
 """What is run: the records that state studies and campaigns. Plain data, which converts to JSON and back.
 
 A study is one policy of a scenario under disturbances; a campaign is many, with trials of each. Both state the same
-`Setup`. A study becomes a plant and a controller in `Study.closed_loop`, a campaign in `executors.Trials`.
+`Setup`. A study becomes a plant and a controller in `Study.closed_loop`, a campaign in `Trials`.
 """
 
 import dataclasses
@@ -18,11 +18,15 @@ from typing import Annotated, Any
 import numpy as np
 
 from lqrsim.annotations import Count, Index, Line, NonNegative, OneOf, Positive, Seed, Want, checked
+from lqrsim.control.controllers import Controller
 from lqrsim.errors import InputError, check_items, check_kind, check_name, excerpt, keep
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, from_anywhere, resolve
+from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.policies import (
     CAMPAIGN_POLICIES,
@@ -306,6 +310,36 @@ class Campaign(Setup):
 
 
 CAMPAIGN_FIELDS = tuple(field.name for field in dataclasses.fields(Campaign) if field.name != "solution")
+
+
+class Trials:
+    """Runs the trials of a campaign's cells, each policy with its solution."""
+
+    def __init__(self, campaign: Campaign, solutions: Mapping[str, Solution]) -> None:
+        self.campaign, self.solutions = campaign, solutions
+        plan = next(iter(solutions.values()))  # all plans have the same duration
+        self.scenario = campaign.resolved.with_duration_of(plan)
+        self.plant = self.scenario.plant()
+        self._controllers: dict[Cell | str, Controller | AffinePolicy] = {}
+
+    def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
+        campaign = self.campaign
+        return simulate(
+            self.plant, self.solutions[cell.policy], controller=self.controller(cell), threads=1,
+            disturbances=campaign.disturbances(cell), **campaign.goal_options, seed=campaign.seed, trials=count,
+            first_trial=first, frames=frames, contacts=contacts,
+        )  # fmt: skip
+
+    def controller(self, cell: Cell) -> Controller | AffinePolicy:
+        """The controller of a cell, made once for its policy or for the cell, because its gains take time."""
+        kind, campaign, solution = POLICY_KINDS[cell.policy], self.campaign, self.solutions[cell.policy]
+        key = cell if kind.per_cell else cell.policy
+        if key not in self._controllers:
+            design = campaign.disturbances(cell) if kind.per_cell else campaign.design_disturbances
+            self._controllers[key] = make_controller(
+                kind.controller, self.scenario, solution, design=design, replan_every=campaign.replan_every
+            )
+        return self._controllers[key]
 
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:

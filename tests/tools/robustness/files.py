@@ -32,8 +32,7 @@ from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import LONGEST, InputError
 from lqrsim.simulation.disturbances import MeasurementNoise
 from lqrsim.stress.campaign import run_campaign
-from lqrsim.stress.campaign_files import digest_of_rows
-from lqrsim.stress.results import Results
+from lqrsim.stress.results import Results, digest_of_rows
 from lqrsim.stress.study import Campaign
 from lqrsim.view.recorded_trial import RecordedTrial
 from robustness import mutations
