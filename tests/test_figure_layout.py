@@ -59,11 +59,13 @@ def flown(extent: Array, about: Array, controls: int, seed: int) -> tuple[ls.Sol
     return solution, rollout
 
 
-def written(draw: Callable[..., Any], *arguments: Any, **options: Any) -> Figure:
-    """The figure that a function writes."""
-    found: list[Figure] = []
+def written(draw: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Figure, dict[Text, Array]]:
+    """The figure that a function writes, and its texts with the settings that it is written with."""
+    found: list[tuple[Figure, dict[Text, Array]]] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda self, file, **_: (found.append(self), file.write_bytes(b"")))
+        patch.setattr(
+            Figure, "savefig", lambda self, file, **_: (found.append((self, texts(self))), file.write_bytes(b""))
+        )
         draw(*arguments, **options)
     return found[0]
 
@@ -81,8 +83,7 @@ def texts(figure: Figure) -> dict[Text, Array]:
     return {text: np.array(text.get_window_extent().extents) for text in seen if isinstance(text, Text)}
 
 
-def check_layout(figure: Figure) -> dict[Text, Array]:
-    boxes = texts(figure)
+def check_layout(figure: Figure, boxes: dict[Text, Array]) -> None:
     width, height = figure.bbox.size
     for text, (left, low, right, high) in boxes.items():
         # Hinting moves letters by up to a pixel.
@@ -91,7 +92,6 @@ def check_layout(figure: Figure) -> dict[Text, Array]:
     for (one, a), (other, b) in combinations(boxes.items(), 2):
         apart = max(a[0] - b[2], b[0] - a[2], a[1] - b[3], b[1] - a[3])
         assert apart > -1, (one, other)
-    return boxes
 
 
 LENGTHS = st.sampled_from([0.05, 1.0, 7.0, 60.0])
@@ -119,10 +119,10 @@ def test_no_texts_overlap(tmp_path_factory: pytest.TempPathFactory, data: st.Dat
     path = tmp_path_factory.mktemp("figure") / "figure.png"
     if data.draw(st.booleans(), label="of the policy"):
         radius = run.radius if len(extent) == 2 else 0.0
-        figure = written(ls.view.plot_policy, solution, path, world=world, radius=radius, style=looks)
+        figure, boxes = written(ls.view.plot_policy, solution, path, world=world, radius=radius, style=looks)
     else:
-        figure = written(ls.view.plot_run, solution, {"calm": run, "again": run}, path, world=world, style=looks)
-    boxes = check_layout(figure)
+        figure, boxes = written(ls.view.plot_run, solution, {"calm": run, "again": run}, path, world=world, style=looks)
+    check_layout(figure, boxes)
     assert figure.get_figwidth() == style.LAYOUTS[looks].width
     assert looks == "screen" or min(float(text.get_fontsize()) for text in boxes) >= 7
     said = " ".join(text.get_text() for text in boxes)
@@ -153,8 +153,8 @@ def test_rounding_errors_of_a_constant_are_not_seen(value: float, tmp_path: Path
             axes.plot([0, 1, 2], value * (1 + 1e-13 * np.array([0, 1, 0])))
             axes.set(xlabel="number", ylabel="cost")
 
-    figure = written(draw)
-    check_layout(figure)
+    figure, boxes = written(draw)
+    check_layout(figure, boxes)
     seen = ticks(figure.axes[0].yaxis)
     assert len(seen) >= 2
     assert min(after - before for before, after in pairwise(seen)) > 1e-3 * abs(value)
@@ -187,8 +187,8 @@ def test_what_a_run_moved_is_drawn_where_it_was(tmp_path: Path) -> None:
     (crate,) = moved_objects(run, 0)
     assert crate.name == "crate"
     np.testing.assert_allclose(crate.path, np.add([1, 0.5, 0], np.pad(frames[0, :, 1:3], ((0, 0), (0, 1)))), atol=1e-12)
-    figure = written(ls.view.plot_run, solution, {"run": run}, tmp_path / "figure.png", world=ls.World())
-    check_layout(figure)
+    figure, boxes = written(ls.view.plot_run, solution, {"run": run}, tmp_path / "figure.png", world=ls.World())
+    check_layout(figure, boxes)
     axes = figure.axes[0]
     first, last = (np.asarray(patch.get_path().vertices) for patch in axes.patches)
     for outline, middle in ((first, (1.0, 0.5)), (last, (1.7, 0.3))):
