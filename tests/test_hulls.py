@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.kernels.hull_distance import hull_distance
+from lqrsim.kernels.distances import hull_distance
 from lqrsim.problem.collision_shape import hull_distances, signed_distance
 from lqrsim.problem.derivative_check import evaluate
 

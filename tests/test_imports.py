@@ -41,7 +41,7 @@ FLOORS = (
 
 # Within a room, the same: what is not named here may import whatever is, and its own kind.
 FLOORS_WITHIN = {
-    "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
+    "kernels": (("declarations",), ("distances", "linear_algebra", "rotation_ratios", "runge_kutta")),
     "scenes": (("world",),),
     "results": (
         ("coordinates", "solution_parts"),

@@ -45,23 +45,18 @@ from lqrsim.kernels import (
     active_set,
     augmented_lagrangian,
     certificate,
-    collisions,
-    cost_to_come,
     declarations,
-    entry_points,
+    distances,
     feedback,
-    hull_distance,
     interior_point,
     iterations,
     linear_algebra,
     mjcf_dynamics,
     model_functions,
     passes,
-    projection,
     restoration,
+    riccati,
     rotation_ratios,
-    secants,
-    signed_distance,
 )
 from lqrsim.kernels import stages as stage_kernels
 from lqrsim.kernels.iterations import DAMPED_STEPS, NEWTON_STEPS
@@ -413,7 +408,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     work, log = run.work, np.zeros(3, LOG)
     for own in work.multipliers:
         own.penalty, own.values[...] = penalty, 0.5
-    source, sizes = source_of(entry_points), sizes_of(one, form)
+    source, sizes = source_of(iterations), sizes_of(one, form)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     if task == "opening":
         model = work.model
@@ -537,7 +532,7 @@ class TestSolvers:
             np.zeros((steps + 1, n)),
         )  # fmt: skip
         sizes = {"N": n, "M": m, "W": n + m, "NOISY": 0, "PRIMAL": int(form == "primal")}
-        replay(source_of(entry_points), sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
+        replay(source_of(iterations), sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
 
 
 class Begun:
@@ -548,7 +543,7 @@ class Begun:
         settings = settings_of(form=form, **changed)
         self.run = SolveRun(one, settings, resolve(start, one), begin, Budget(settings.max_iterations))
         self.work, self.log = self.run.work, np.zeros(20, LOG)
-        self.source, self.sizes = source_of(entry_points), sizes_of(one, form)
+        self.source, self.sizes = source_of(iterations), sizes_of(one, form)
 
     def iterate(self, first: int, last: int, **changed: Any) -> tuple[Any, ...]:
         given = list(self.run._arguments(first, last, self.log))
@@ -597,7 +592,7 @@ def descended(
     stage = work.model.stage
     if factor != 1:
         work.model = work.model._replace(stage=with_numbers(stage, 1, 2, lambda weight: factor * weight))
-    source, sizes = source_of(entry_points), sizes_of(one, form)
+    source, sizes = source_of(iterations), sizes_of(one, form)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
@@ -765,7 +760,7 @@ class TestRareEnds:
 
     def test_matrices_without_what_is_wanted(self) -> None:
         zero, eye = np.zeros((3, 3)), np.eye(3)
-        of_certificate, of_come = source_of(certificate), source_of(cost_to_come)
+        of_certificate, of_come = source_of(certificate), source_of(riccati)
         box = np.array([1.0, -2.0]), np.full(2, -1.0), np.full(2, 1.0), np.zeros(2)
         assert np.isnan(replay(of_certificate, SIZES, "box_decrease", -np.eye(2), *box))
         stage = QuadraticStage(np.zeros((5, 5)), np.zeros(5))
@@ -803,7 +798,7 @@ class TestRareEnds:
         out = np.zeros(1, CERTIFICATE)
         arguments = run._check_arguments(declarations.EVALUATE, found, no_value(found.states), out)
         found.plan.states[knot, state] = np.nan
-        replay(source_of(entry_points), sizes_of(one), "smoother", *with_rows(arguments))
+        replay(source_of(iterations), sizes_of(one), "smoother", *with_rows(arguments))
         assert np.isnan(out[0]["dynamics_residual"])
         assert np.isnan(out[0]["policy_residual"])
 
@@ -831,7 +826,7 @@ class TestRareEnds:
             )  # fmt: skip
             sizes = SIZES | {"NOISY": 0, "PRIMAL": int(form == "primal")}
             assert (
-                replay(source_of(entry_points), sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work)
+                replay(source_of(iterations), sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work)
                 == wanted
             )
 
@@ -862,7 +857,7 @@ class TestRareEnds:
         ball = np.array(WORLD.table).ravel()
         at = np.zeros(3), np.zeros((3, 3))
         given = *WORLD.obstacles[0].position.tolist(), *at
-        replay(source_of(signed_distance), {}, "signed_distance_derivatives", ball, 0, *given)
+        replay(source_of(distances), {}, "signed_distance_derivatives", ball, 0, *given)
 
 
 # What problems bring.
@@ -939,13 +934,13 @@ class TestParts:
         flat.reshape(2, 4, 3)[..., :2] = square(X, None)
         out, slopes = np.zeros(2 * count), np.zeros((2 * count, 12))
         given = count, 2, 1, world.upright().table, parts, 1, flat, np.zeros((2 * count, 3)), out, slopes
-        replay(source_of(collisions), {}, "hull_distances", *given)
+        replay(source_of(distances), {}, "hull_distances", *given)
 
     @pytest.mark.usefixtures("hardly_optimised")
     @pytest.mark.parametrize("seed", [0, 1, *rarely(2, 3, 4, 5)])
     def test_hulls_in_space(self, seed: int) -> None:
         """Apart, overlapping and touching, of all corners, of some, and of one."""
-        rng, source = np.random.default_rng(seed), source_of(hull_distance)
+        rng, source = np.random.default_rng(seed), source_of(distances)
         rock = ls.Obstacle.of_corners("rock", rng.normal(size=(9, 3)) * 0.4)
         pillar = ls.Obstacle("pillar", "cylinder", np.zeros(3), np.eye(3), np.array([0.2, np.inf, 0.0]))
         table = ls.World([rock, pillar, *WORLD.obstacles]).table
@@ -972,8 +967,8 @@ class TestParts:
         rock = np.array(ls.World([ls.Obstacle.of_corners("rock", points[:4])]).table)
         for number, table in ((count, data), (1, rock)):
             given = number, 6, 3, table, points, np.zeros((2 * number, 3)), np.zeros(6)
-            replay(source_of(collisions), {}, "nearest", *given)
-        source = source_of(signed_distance)
+            replay(source_of(distances), {}, "nearest", *given)
+        source = source_of(distances)
         at = np.zeros(3), np.zeros((3, 3))
         for i in range(count):  # at the rim of the cylinder, in the box and about it
             place = WORLD.obstacles[i].position + rng.normal(size=3) * 0.25
@@ -1016,7 +1011,7 @@ class TestParts:
 
     @staticmethod
     def places(places: SphereCenters, coordinates: int, x: Array) -> None:
-        source = source_of(collisions).filled(places=places.code, places_jacobian=places.code)
+        source = source_of(distances).filled(places=places.code, places_jacobian=places.code)
         data, n = numbers_of(places), len(x)  # pyright: ignore[reportArgumentType]
         states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}
         replay(source, sizes, "write_centres", 2, states, data, np.zeros((2, coordinates)))
@@ -1036,7 +1031,7 @@ class TestParts:
     @pytest.mark.parametrize("seed", range(4))
     def test_projection(self, seed: int) -> None:
         root = np.random.default_rng(seed).normal(size=(5, 5))
-        source = source_of(projection, SUPPORT=(0, 1, 3))
+        source = source_of(linear_algebra, SUPPORT=(0, 1, 3))
         replay(source, SIZES, "project", root + root.T - 2 * (seed > 1) * np.eye(5))
 
     def test_noise(self) -> None:
@@ -1410,7 +1405,7 @@ class TestPlanMethods:
         """After n + m steps, SR1 has its Hessian exactly (Nocedal and Wright, Theorem 6.1), up to rounding."""
         stages, plan = self.made()
         about = stages.about._replace(learns=1)
-        rng, source, models = np.random.default_rng(seed), source_of(secants), stages.models
+        rng, source, models = np.random.default_rng(seed), source_of(interior_point), stages.models
         hessian = rng.normal(size=(4, 5, 5))
         hessian += hessian.transpose(0, 2, 1)
         hessian[3, 3:], hessian[3, :, 3:] = 0.0, 0.0  # the last stage has no control
@@ -1482,7 +1477,7 @@ class TestPlanMethods:
     def test_models_and_steps(self) -> None:
         """The entries that no method leads to; and models that have no minimum."""
         stages, plan = self.made()
-        source, rng = source_of(entry_points), np.random.default_rng(0)
+        source, rng = source_of(iterations), np.random.default_rng(0)
         costates, rows = rng.normal(size=(4, 3)), stages.live.size
         assert replay(source, SIZES, "determine_scales", stages.about, plan) > 0
         stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)

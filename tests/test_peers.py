@@ -15,7 +15,7 @@ from sampling import rarely
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import ROW
-from lqrsim.kernels.signed_distance import signed_distance_derivatives
+from lqrsim.kernels.distances import signed_distance_derivatives
 from lqrsim.problem.costs import terms_of
 
 ROBOTS = ("differential_drive", "quadrotor")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import ROW
-from lqrsim.kernels.signed_distance import signed_distance_derivatives
+from lqrsim.kernels.distances import signed_distance_derivatives
 from lqrsim.problem import collision_shape
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
 

@@ -21,7 +21,7 @@ from lqrsim import kernels
 from lqrsim.annotations import checked
 from lqrsim.codegen.language import CONSTANTS, MATH, SubsetError
 from lqrsim.errors import InputError, check_kind, excerpt
-from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
+from lqrsim.kernels import declarations, distances, linear_algebra, records, rotation_ratios
 from lqrsim.results.archive import sha256
 
 # Words of the language that `declarations.py` declares.
@@ -259,7 +259,7 @@ class Scope:
         """The meaning of a name that a text can use without importing it."""
         if name in MATH:
             return self._imported("math", name)
-        for module in (rotation_ratios, signed_distance, linear_algebra):
+        for module in (rotation_ratios, distances, linear_algebra):
             if name in _parse(_text_of(module.__name__)).functions:
                 return self._module(module.__name__).find(name)
         return self._declared(name)

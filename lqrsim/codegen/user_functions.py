@@ -371,7 +371,7 @@ class Term:
     Attributes:
       source: text that defines the functions of its kind of term, or a Source, from a module of the package.
         `codegen/language.py` defines what it may contain. N, M, W, functions such as sqrt and exp, and those of
-        `kernels/signed_distance.py` and `kernels/rotation_ratios.py` are available by their bare names.
+        `kernels/distances.py` and `kernels/rotation_ratios.py` are available by their bare names.
       data: (any,) float64; the source can index it, but cannot determine its length.
       functions: functions that the source calls with `call`; their addresses come first in its data.
     """

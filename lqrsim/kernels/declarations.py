@@ -34,7 +34,7 @@ ROW = 16  # count of numbers per obstacle in `World.table`: kind, position (3), 
 # Indices of a constraint's numbers in its array, and of its first multiplier; see `augmented_lagrangian.py`.
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
-# Tasks of the entry points; see `entry_points.py`.
+# Tasks of `smoother` and `ilqr`; see `iterations.py`.
 ITERATE, DESCEND, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5
 
 # What is written of many steps at once: the states after them, with their Jacobians, and with their Hessians.
@@ -153,13 +153,6 @@ def rate_jacobian(x, u, p, out, fx, fu) -> None:
 def rate_curvature(x, u, p, w, curve) -> None:
     """Write the second derivatives of `sum_i w[i] f[i]` that may be nonzero, in the entries that `runge_kutta.py`
     lists; of symmetric pairs the one below the diagonal.
-    """
-
-
-def part_curvature(x, u, p, h, weights, out, jacobian, hessian) -> None:
-    """Write a Runge-Kutta step (N,) and its Jacobian (N, W); add the Hessian (W, W) of the step times weights (N,).
-
-    `runge_kutta.py`, and what `differences.py` has in its place.
     """
 
 

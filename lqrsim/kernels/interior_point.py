@@ -16,6 +16,11 @@ equality without a price has no slacks, and is regularised.
 If MuJoCo linearises, that takes most of an iteration. Where the plan hardly moves, as when a robot plans again, the
 derivatives of the dynamics may serve for several steps; the gaps that steps leave are always MuJoCo's own. They are
 computed anew if a step with old ones has to be shortened, and before a plan counts as converged.
+
+Of dynamics without second derivatives, such as MuJoCo's steps, the models of `stages.py` have the curvature of cost and
+rows alone. What they lack at each stage is learned from the changes of the Lagrangian's gradient by the steps taken,
+by symmetric updates of rank one (SR1). It enters the Hessians only if convergence without it is slow: at first the
+updates know little.
 """
 
 from math import copysign, inf, isfinite, isnan, log, nan
@@ -32,18 +37,19 @@ from lqrsim.kernels.active_set import (
     pivot,
     prepare_step,
 )
-from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, inline
-from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix
+from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, W, inline, stack
+from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill
 from lqrsim.kernels.passes import copy_plan, larger
-from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
     EQUALITY,
     LIMIT,
+    add_matrix,
     adjoint,
     convex_fraction_at,
     determine_scales,
     direction,
     evaluate_plan,
+    lagrangian_slope,
     plan_residuals,
     read_rows,
     regularised_direction,
@@ -914,6 +920,61 @@ def measure_iterate(stages, work, mem):
                     mem.product = larger(mem.product, slacks[at, side] * from_bound(at, side, rows))
     # The product of margin and multiplier; for violated elastic rows, that of the other slack.
     mem.complementarity = (mem.product if mem.elastic != 0 else product) / mem.scale
+
+
+# Curvature from secants.
+
+UNLEARNED = 1e-8  # least part of a residual along its step from which curvature is learned (Nocedal and Wright, (6.26))
+
+
+def forget(stages):
+    """Begin with nothing learned."""
+    stages.uses_learned[0] = 0.0
+    for t in range(stages.steps + 1):
+        for i in range(W):
+            fill(stages.models.learned[t, i], W, 0.0)
+
+
+def remember(stages, before, after, costates, last_step, turns):
+    """Before a step is taken, keep it, (T+1, W), and the Lagrangian's gradients at its beginning, (T+1, W).
+
+    The Lagrangian is that of the multipliers after the step.
+    """
+    for t in range(stages.steps + 1):
+        lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], turns[t])
+        for i in range(N):
+            last_step[t, i] = after.states[t, i] - before.states[t, i]
+        for i in range(M):
+            last_step[t, N + i] = after.controls[t, i] - before.controls[t, i] if t < stages.steps else 0.0
+
+
+def learn(stages, costates, last_step, turns, slow):
+    """Update what is learned, with the models at the end of the step; after a `slow` step, add it to the Hessians."""
+    models, slope, lacks = stages.models, stack(W), stack(W)
+    for t in range(stages.steps + 1):
+        lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
+        along, moved, wide = 0.0, 0.0, 0.0
+        for i in range(W):
+            lacks[i] = slope[i] - turns[t, i]
+            for j in range(W):
+                known = models.hessian[t, i, j]
+                if stages.uses_learned[0] == 0:
+                    known += models.learned[t, i, j]
+                lacks[i] -= known * last_step[t, j]
+            along += lacks[i] * last_step[t, i]
+            moved += last_step[t, i] * last_step[t, i]
+            wide += lacks[i] * lacks[i]
+        if along * along > UNLEARNED * UNLEARNED * moved * wide:
+            for i in range(W):
+                for j in range(W):
+                    change = lacks[i] * lacks[j] / along
+                    models.learned[t, i, j] += change
+                    if stages.uses_learned[0] != 0:
+                        models.hessian[t, i, j] += change
+    if slow and stages.uses_learned[0] == 0:
+        stages.uses_learned[0] = 1.0
+        for t in range(stages.steps + 1):
+            add_matrix(models.learned[t], W, models.hessian[t])
 
 
 # The crossover from the barrier to the active set.

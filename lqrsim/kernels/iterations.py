@@ -1,4 +1,8 @@
-"""Iterations of LQR smoothing and of iLQR, and a descent, all in compiled code.
+"""Iterations of LQR smoothing and of iLQR, and a descent, all in compiled code; and all else that Python calls.
+
+Python calls `smoother` and `ilqr`, and functions that are imported here for it: methods for constraints, and single
+passes and rollouts. All code that a solve can need is compiled together, before the solve begins. Code that its parts
+share is compiled once.
 
 `smoother_iterations`, `ilqr_iterations` and `descend` run the iterations `first` to `stop` - 1, and can be called again
 to continue, because their state is in their arrays. The log gets a row per iteration. They return four values: the
@@ -26,14 +30,21 @@ reach 0 is also used, each time for twice as long.
 
 from math import inf, isnan, nan
 
+from lqrsim.kernels.active_set import active_set as active_set
+from lqrsim.kernels.certificate import certify, reduced_curvature
 from lqrsim.kernels.declarations import (
+    CERTIFY,
     CONVERGED,
     COST_CONVERGED,
+    CURVE,
     CYCLING,
     DAMPED,
+    DESCEND,
     DIVERGED,
+    EVALUATE,
     ILQR,
     IN_VALLEY,
+    LINEARIZE,
     LINGER,
     LONGEST_CYCLE,
     MAX_ITERATIONS,
@@ -56,6 +67,7 @@ from lqrsim.kernels.declarations import (
     stack,
     zeros,
 )
+from lqrsim.kernels.interior_point import interior_point as interior_point
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.passes import (
     backward_pass,
@@ -75,7 +87,16 @@ from lqrsim.kernels.passes import (
     smoothed_states,
     towards,
 )
+from lqrsim.kernels.passes import lq_passes as lq_passes
+from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.records import CostToGo, Descent, Linearization, ModelOrder, Policy, Prior, ProblemModel
+from lqrsim.kernels.restoration import restoration as restoration
+from lqrsim.kernels.stages import adjoint as adjoint
+from lqrsim.kernels.stages import determine_scales as determine_scales
+from lqrsim.kernels.stages import evaluate_plan as evaluate_plan
+from lqrsim.kernels.stages import least_curvatures as least_curvatures
+from lqrsim.kernels.stages import read_rows as read_rows
+from lqrsim.kernels.stages import write_models as write_models
 
 # A small change of cost can come from a short step, so two in a row are required. At a kink of the dynamics damped
 # steps may lower the merit by rounding for ever.
@@ -96,6 +117,45 @@ WEIGHT_DECAY, NEGLIGIBLE_WEIGHT = 0.1, 1e-6
 PATIENCE = 50  # number of steps at a reach above 0 after which iLQR's are tried
 ROUNDING = 1e-11  # relative improvement that may be rounding
 MAX_EXTRA_STEPS = 3  # largest number of further steps of Newton's method while the smoothed states are not at the plan
+
+
+def smoother(task, first, stop, settings, model, work, memory, log):
+    """Run one task of the smoother: iterate, descend, or linearise, certify or measure a plan.
+
+    Args:
+      task: one of ITERATE, DESCEND; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
+        to certify the last policy and rollout with the Hessians of the cost-to-go; EVALUATE, the same with the Hessians
+        of the cost of following the policy, which replace those of the cost-to-go; or CURVE, to measure the curvature
+        of the cost about the last rollout.
+      first, stop: iterations to run, `stop` excluded. The rest are records.
+    """
+    if task == CURVE:
+        reduced_curvature(settings, work.last, model, work.certificate[0])
+        return 0, 0, False, -1
+    if task >= CERTIFY:
+        certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
+        return 0, 0, False, -1
+    if task == LINEARIZE:
+        measure_optimality(settings, False, False, model, work, memory[0], log[0])
+        return 0, RUNNING, memory[0].failed >= 0, int(memory[0].failed)
+    if task == DESCEND:
+        return descend(first, stop, settings, model, work, memory[0], log)
+    return smoother_iterations(first, stop, settings, model, work, memory[0], log)
+
+
+def ilqr(task, first, stop, settings, model, work, memory, log):
+    """Run iterations of iLQR; or linearise about the plan, or certify a plan, as `smoother` does.
+
+    DESCEND and CURVE are not among its tasks.
+    """
+    if task >= CERTIFY:
+        certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
+        return 0, 0, False, -1
+    if task == LINEARIZE:
+        failed, _, decrease = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        log[0].optimality = relative_optimality(failed, decrease, memory[0].plan_cost, 0.0)
+        return 0, RUNNING, failed >= 0, failed
+    return ilqr_iterations(first, stop, settings, model, work, memory[0], log)
 
 
 def relative_improvement(old, cost, negligible):

@@ -6,13 +6,6 @@ arguments.
 
 from math import inf, isnan, nan
 
-from lqrsim.kernels.cost_to_come import (
-    initial_cost_to_come,
-    linearize,
-    previous_state,
-    riccati_forward,
-    smoothed_state,
-)
 from lqrsim.kernels.declarations import NOISY, M, N, W, inline, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     about_origin,
@@ -24,6 +17,7 @@ from lqrsim.kernels.linear_algebra import (
     congruence,
     copy,
     copy_matrix,
+    fill,
     finite,
 )
 from lqrsim.kernels.model_functions import (
@@ -39,7 +33,17 @@ from lqrsim.kernels.model_functions import (
     step_second_order,
 )
 from lqrsim.kernels.records import Limits, Linearization, LinearStep, ModelOrder, NextStep, QuadraticStage
-from lqrsim.kernels.riccati import fix_controls_at_limits, limited_control, minimize_within, riccati_backward
+from lqrsim.kernels.riccati import (
+    fix_controls_at_limits,
+    initial_cost_to_come,
+    limited_control,
+    linearize,
+    minimize_within,
+    previous_state,
+    riccati_backward,
+    riccati_forward,
+    smoothed_state,
+)
 
 # A predicted decrease below this fraction of the terms that cancel in it is a rounding error.
 SQUARES = 1e-28
@@ -466,3 +470,42 @@ def policy_about_plan(steps, plan, policy):
         affine(policy.gain[t], policy.offset[t], plan.states[t], M, N, u)
         for i in range(M):
             policy.offset[t, i] = u[i] - plan.controls[t, i]
+
+
+def lq_passes(steps, dynamics, forward_steps, stages, constants, work):
+    """Both passes of a linear-quadratic problem, and its smoothed states.
+
+    Args:
+      dynamics: LinearStep, [A B] (T, N, W) and c (T, N).
+      forward_steps: steps of the forward pass: inverse steps in the primal form, `dynamics` in the dual form.
+      stages: QuadraticStage, (T, W, W) and (T, W). constants: (T,).
+      work: RiccatiArrays, with the cost-to-go at T and the cost-to-come at 0.
+
+    Returns:
+      The step that failed, or -1; and 0 if it was in the backward pass, 1 in the forward pass, 2
+      where the two value functions were added.
+    """
+    stage, costate, anywhere = QuadraticStage(stack(W, W), stack(W)), stack(N), zeros(N)
+    limits = Limits(stack(M), stack(M))
+    fill(limits.low, M, -inf)
+    fill(limits.high, M, inf)
+    for t in range(steps - 1, -1, -1):
+        copy_stage(t, stages, stage)
+        step = LinearStep(dynamics.jacobian[t], dynamics.offset[t])
+        if not riccati_backward(t, step, stage, constants[t], anywhere, limits, work.policy, work.to_go):
+            return t, 0
+    for t in range(steps):
+        copy_stage(t, stages, stage)
+        step = LinearStep(forward_steps.jacobian[t], forward_steps.offset[t])
+        if not riccati_forward(t, step, stage, constants[t], work.to_come, work.smoothing):
+            return t, 1
+    for t in range(steps + 1):
+        if not smoothed_state(t, work.to_go, work.to_come, costate, work.x_hats[t]):
+            return t, 2
+    return -1, 0
+
+
+def copy_stage(t, stages, stage):
+    """Copy a stage, because the Riccati steps overwrite theirs."""
+    copy_matrix(stages.hessian[t], W, W, stage.hessian)
+    copy(stages.gradient[t], W, stage.gradient)

@@ -213,7 +213,7 @@ class StageModels(NamedTuple):
     jacobian: Annotated[Arrays, "T N W"]
     arrived: Annotated[Arrays, "T N"]  # next states
     slopes: Annotated[Arrays, "K W"]  # gradients of the rows
-    learned: Annotated[Arrays, "T+1 W W"]  # what secants say that the Hessians lack; see `secants.py`
+    learned: Annotated[Arrays, "T+1 W W"]  # what secants say that the Hessians lack; see `learn`
 
 
 class StageRows(NamedTuple):

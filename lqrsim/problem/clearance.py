@@ -10,8 +10,7 @@ import numpy.typing as npt
 from lqrsim.annotations import NonNegative, checked
 from lqrsim.errors import Array, InputError, check_array, check_number, real
 from lqrsim.kernels.declarations import ROW, N, stack
-from lqrsim.kernels.hull_distance import hull_distance
-from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
+from lqrsim.kernels.distances import hull_distance, signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.constraints import Constraint, ConstraintTerm

@@ -15,7 +15,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, module_of
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels import collisions
+from lqrsim.kernels import distances
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, evaluate, evaluate_slopes, one_at
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
@@ -324,4 +324,4 @@ def hull_distances(
 
 
 def _distances() -> CompiledModule:
-    return module_of(source_of(collisions), "distances to obstacles")
+    return module_of(source_of(distances), "distances to obstacles")

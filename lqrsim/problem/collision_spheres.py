@@ -35,8 +35,8 @@ from lqrsim.errors import (
     excerpt,
     vectors_of,
 )
-from lqrsim.kernels import collisions, differences, user_functions
-from lqrsim.kernels.collisions import MOST_CORNERS
+from lqrsim.kernels import differences, distances, user_functions
+from lqrsim.kernels.distances import MOST_CORNERS
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 
@@ -306,8 +306,8 @@ def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[A
 
 
 def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> None:
-    """Call a function of `kernels/collisions.py`; exceptions of a user's function pass through."""
-    filled = source_of(collisions).filled(places=places.code, places_jacobian=places.code)
+    """Call a function of `kernels/distances.py`; exceptions of a user's function pass through."""
+    filled = source_of(distances).filled(places=places.code, places_jacobian=places.code)
     module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
     getattr(module, name)(len(states), states, numbers_of(places), *outputs)
     raise_again(places.functions)

@@ -27,7 +27,7 @@ from lqrsim.codegen.user_functions import (
     with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, excerpt
-from lqrsim.kernels import differences, runge_kutta, substeps, user_functions
+from lqrsim.kernels import differences, runge_kutta, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
@@ -305,13 +305,18 @@ class Dynamics:
         """Source of `advance` and `step_jacobian`, as in `kernels/runge_kutta.py`."""
         if self.level == "jax":
             return self.source.filled(rate_jacobian=self.source)
-        step = self._part_source if self.substeps == 1 else source_of(substeps, PARTS=self.substeps)
-        return step.filled(**self._rates)
+        return self._in_parts(self._part_source(), "advance", "step_jacobian")
 
-    @property
-    def _part_source(self) -> Source:
+    def _in_parts(self, part: Source, *names: str) -> Source:
+        """Functions of a period, given their source of one Runge-Kutta step."""
+        if self.substeps == 1:
+            return part
+        return part.filled(**{name: (part, f"{name}_in_parts") for name in names})
+
+    def _part_source(self, **constants: int | tuple[int, ...]) -> Source:
         """The same of one Runge-Kutta step."""
-        return source_of(runge_kutta, MAP=int(self.discrete)).filled(**self._rates)
+        part = source_of(runge_kutta, MAP=int(self.discrete), PARTS=self.substeps, **constants)
+        return part.filled(**self._rates)
 
     @property
     def _rates(self) -> dict[str, Source]:
@@ -337,20 +342,17 @@ class Dynamics:
         if self.level == "jax":
             return self.step_source
         part = self._curvature_of_part()
-        if part is None or self.substeps == 1:
-            return part
-        step = source_of(substeps, PARTS=self.substeps)
-        return step.filled(part_curvature=(part, "step_curvature"), **self._rates)
+        return None if part is None else self._in_parts(part, "step_curvature")
 
     def _curvature_of_part(self) -> Source | None:
         """The same of one Runge-Kutta step."""
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
-        part, by_values = self._part_source, source_of(differences, ACTIVE=axes)
+        part, by_values = self._part_source(), source_of(differences, ACTIVE=axes)
         by_values = by_values.filled(**self._rates, advance=part, step_jacobian=part)
-        by_jacobians = source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_jacobians"))
+        by_jacobians = part.filled(step_curvature=(by_values, "curvature_from_jacobians"))
         if self.level != "symbolic" and self.jacobian is None:
             by_values = by_values.filled(value=(by_values, "weighted_step"))
-            return source_of(runge_kutta).filled(step_curvature=(by_values, "curvature_from_values"))
+            return part.filled(step_curvature=(by_values, "curvature_from_values"))
         if self.level != "symbolic":
             return by_jacobians
         details = ("second derivatives", MOST_STEPS, *self._names, *self.constants.items())
@@ -362,8 +364,7 @@ class Dynamics:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)
         curved = text_source(traced["source"], f"second derivatives of {self.name}(x, u, p)")
-        open_source = source_of(runge_kutta, SUPPORT=support, K=len(support), STATES=states, MAP=int(self.discrete))
-        return open_source.filled(rate_curvature=curved, **self._rates)
+        return self._part_source(SUPPORT=support, K=len(support), STATES=states).filled(rate_curvature=curved)
 
     @cached_property
     def step_curvature(self) -> float:

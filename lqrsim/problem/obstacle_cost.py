@@ -10,8 +10,7 @@ from lqrsim.annotations import NonNegative, Positive, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, check_number
 from lqrsim.kernels.declarations import ROW, N, exact, places, places_jacobian, power_of_two, stack, zeros
-from lqrsim.kernels.hull_distance import hull_distance
-from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
+from lqrsim.kernels.distances import hull_distance, signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.costs import Cost, CostTerm

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from lqrsim.annotations import Finite, OneOf, Want, checked
 from lqrsim.errors import Array, InputError, check_array, check_name, check_text, keep, real
 from lqrsim.kernels.declarations import ROW
-from lqrsim.kernels.hull_distance import hull_distance
-from lqrsim.kernels.signed_distance import signed_distance
+from lqrsim.kernels.distances import hull_distance, signed_distance
 
 # Spaces of a position: "xyz", or a plane by its two axes in their order.
 SPACE = "xyz"

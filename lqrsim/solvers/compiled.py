@@ -17,9 +17,9 @@ from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
-    entry_points,
+    iterations,
+    linear_algebra,
     model_functions,
-    projection,
     records,
 )
 from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
@@ -35,18 +35,18 @@ FORMS = ("dual", "primal")  # of the cost-to-come
 
 
 def core(problem: Problem, form: str = "dual") -> CompiledModule:
-    """The compiled passes and iterations for problems of this size; see `kernels/entry_points.py`."""
+    """The compiled passes and iterations for problems of this size; see `kernels/iterations.py`."""
     noisy = problem.noise_term is not None
     sizes = _sizes(problem.dynamics)
     description = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
     description += "" if form == "dual" else f", {form} form"
-    return module_of(source_of(entry_points), description, **sizes, NOISY=int(noisy), PRIMAL=int(form == "primal"))
+    return module_of(source_of(iterations), description, **sizes, NOISY=int(noisy), PRIMAL=int(form == "primal"))
 
 
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
-    """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/entry_points.py`."""
+    """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/passes.py`."""
     description = f"linear-quadratic problems, {n} states and {m} controls"
-    return module_of(source_of(entry_points), description, N=n, M=m, NOISY=0, PRIMAL=int(form == "primal"))
+    return module_of(source_of(iterations), description, N=n, M=m, NOISY=0, PRIMAL=int(form == "primal"))
 
 
 def _sizes(dynamics: Dynamics) -> dict[str, int]:
@@ -118,7 +118,7 @@ def _term_functions(terms: tuple[tuple[Source, tuple[int, ...] | None], ...], si
     support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
     project = 0.0
     if support:
-        source = source_of(projection, SUPPORT=support)
+        source = source_of(linear_algebra, SUPPORT=support)
         (project,) = module_of(source, "the projection of a cost", **dict(sizes)).addresses("project")
     return np.array(rows, dtype=np.float64).reshape(-1, 2), project
 

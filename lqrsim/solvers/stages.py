@@ -15,7 +15,7 @@ import numpy as np
 from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import entry_points, records
+from lqrsim.kernels import iterations, records
 from lqrsim.kernels.interior_point import LATELY
 from lqrsim.kernels.records import ACTIVE_SET, INTERIOR, RESTORATION, Motion, StructuredArray, zeros_of
 from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, LINEAR, RANGE, SIDE, SIGN
@@ -74,7 +74,7 @@ class Stages:
         self._shape = n, m, steps, counts, lower, upper = _shape(problem)
         rows, self.n, self.m = sum(counts) + len(lower) + len(upper), n, m
         self._lengths = {"T": steps, "N": n, "M": m, "W": n + m, "R": rows, "K": (steps + 1) * rows, "C": len(counts)}
-        self._module = module_of(source_of(entry_points), f"stages of {n} states and {m} controls", N=n, M=m)
+        self._module = module_of(source_of(iterations), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
         stage_rows = zeros_of(records.StageRows, {"size": rows}, **self._lengths)
         stage_rows.limits[...], stage_rows.first[...] = np.inf, np.cumsum([0, *counts])[:-1]

@@ -1,25 +1,165 @@
-"""The signed distance of a robot's convex hull to an obstacle, in space and in a plane. Written in the kernels' subset.
+"""Signed distances to obstacles: of points, of convex hulls, and of robots at many states at once.
 
-Let M be the set of all differences of a point of the robot and a point of the obstacle. The signed distance is that of
-the origin to M: apart, the length of M's shortest vector, by the method of Gilbert, Johnson and Keerthi; for an
-overlap, the depth below M's nearest face, by an expanding polytope within M. That is the shortest move that ends the
-overlap. Both methods evaluate only *supports* of M, its farthest points in a direction.
+An obstacle is ROW numbers of a flat table, which begin at index `row`. Of a point and a primitive the distance is a
+formula. Of a hull, in space or in a plane, let M be the set of all differences of a point of the robot and a point of
+the obstacle. The signed distance is that of the origin to M: apart, the length of M's shortest vector, by the method of
+Gilbert, Johnson and Keerthi; for an overlap, the depth below M's nearest face, by an expanding polytope within M. That
+is the shortest move that ends the overlap. Both methods evaluate only *supports* of M, its farthest points in a
+direction.
 
 An infinite obstacle makes M a prism without ends, whose faces are edges of its projection. In a plane all are infinite.
 """
 
 from math import copysign, inf, isnan, nan, sqrt
 
-from lqrsim.kernels.declarations import compact, outline, stack, zeros
-from lqrsim.kernels.signed_distance import BOX, CAPSULE, CYLINDER, PLANE, SPHERE, signed_distance_derivatives
+from lqrsim.kernels.declarations import ROW, compact, inline, outline, places, places_jacobian, stack, zeros
 
-STEPS = 60  # largest number of supports; corners need fewer, the rim of a cylinder some 20
+PLANE, SPHERE, CAPSULE, CYLINDER, BOX = 0, 1, 2, 3, 4  # kinds of obstacles, as in `KINDS` of `world.py`
 MESH = 5  # kind of an obstacle that is the convex hull of corners; its row has their number and where they begin
+MOST_CORNERS = 64  # of one hull of a robot; distances take time in proportion to its corners
+STEPS = 60  # largest number of supports; corners need fewer, the rim of a cylinder some 20
 POINTS, FACES = 64, 256  # largest numbers of points and of faces of the polytope within M
 ROUNDING = 1e-14  # error of a distance, relative to the size of M
 TOUCHING = 1e-12  # distance, relative to the size of M, below which robot and obstacle touch
 SHORT = 1e-6  # length, relative to the size of M, below which a difference has lost its direction
 CORNER = 3  # index in a point of M, after its coordinates: the number of the robot's corner
+
+
+# Of points.
+
+
+@inline
+def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
+    """The signed distance of a point to an obstacle; negative inside."""
+    kind = data[row]
+    dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
+    c = data[row + 6] * dx + data[row + 9] * dy + data[row + 12] * dz
+    if kind == PLANE:
+        return c
+    radius, half = data[row + 13], data[row + 14]
+    if kind == SPHERE:
+        return sqrt(dx * dx + dy * dy + dz * dz) - radius
+    a = data[row + 4] * dx + data[row + 7] * dy + data[row + 10] * dz
+    b = data[row + 5] * dx + data[row + 8] * dy + data[row + 11] * dz
+    if kind == CAPSULE:
+        c -= min(max(c, -half), half)
+        return sqrt(a * a + b * b + c * c) - radius
+    if kind == CYLINDER:
+        side, end = sqrt(a * a + b * b) - radius, abs(c) - half
+        return sqrt(side * side + end * end) if side > 0 and end > 0 else max(side, end)
+    a, b, c = abs(a) - data[row + 13], abs(b) - data[row + 14], abs(c) - data[row + 15]
+    inside = max(a, b, c)
+    a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
+    return sqrt(a * a + b * b + c * c) if inside > 0 else inside
+
+
+@inline
+def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gradient, hessian) -> float:
+    """The signed distance; write its gradient (3,) and Hessian (3, 3).
+
+    With `v` the vector from the nearest point of the centre or axis and `q` its length, the gradient is `v / q` and the
+    Hessian `(F - gradient gradient') / q`, where F projects on the directions in which the obstacle is curved there. On
+    an axis or at a centre, where both do not exist, they are set to zero.
+    """
+    kind = data[row]
+    dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
+    nx, ny, nz = data[row + 6], data[row + 9], data[row + 12]  # the axis, or a plane's normal
+    along = nx * dx + ny * dy + nz * dz
+    if kind == BOX:
+        return box_derivatives(data, row, dx, dy, dz, gradient, hessian)
+    if kind == PLANE:
+        return flat_derivatives(along, 1.0, nx, ny, nz, gradient, hessian)
+    radius, half = data[row + 13], data[row + 14]
+    # The nearest point of the axis is at `shift`; a side is flat along the axis.
+    shift, flat = 0.0, 0.0
+    if kind == CAPSULE:
+        shift = min(max(along, -half), half)
+        flat = 1.0 if abs(along) < half else 0.0
+    elif kind == CYLINDER:
+        shift, flat = along, 1.0
+    vx, vy, vz = dx - shift * nx, dy - shift * ny, dz - shift * nz
+    length = sqrt(vx * vx + vy * vy + vz * vz)
+    if kind == CYLINDER:
+        side, end = length - radius, abs(along) - half
+        sign = 1.0 if along > 0 else -1.0
+        if side > 0 and end > 0:
+            gradient[0], gradient[1], gradient[2] = vx, vy, vz
+            return rim_derivatives(data, row, side, end * sign, gradient, hessian)
+        if end > side:
+            return flat_derivatives(end, sign, nx, ny, nz, gradient, hessian)
+    inverse = 1 / length if length >= 1e-12 else 0.0
+    gradient[0], gradient[1], gradient[2] = inverse * vx, inverse * vy, inverse * vz
+    for i in range(3):
+        for j in range(3):
+            round_there = (1.0 if i == j else 0.0) - flat * data[row + 6 + 3 * i] * data[row + 6 + 3 * j]
+            hessian[i, j] = inverse * (round_there - gradient[i] * gradient[j])
+    return length - radius
+
+
+def flat_derivatives(distance: float, sign: float, nx: float, ny: float, nz: float, gradient, hessian) -> float:
+    """Write the derivatives of the distance to a face with the normal `sign n`; return the distance."""
+    gradient[0], gradient[1], gradient[2] = sign * nx, sign * ny, sign * nz
+    for i in range(3):
+        for j in range(3):
+            hessian[i, j] = 0.0
+    return distance
+
+
+def rim_derivatives(data, row: int, side: float, end: float, gradient, hessian) -> float:
+    """Write the derivatives of the distance to the rim of a cylinder; return the distance.
+
+    Args:
+      side: distance beyond the side. end: signed distance beyond the end, along the axis.
+      gradient: (3,) the vector from the axis; overwritten.
+    """
+    vx, vy, vz = gradient[0], gradient[1], gradient[2]
+    radial = sqrt(vx * vx + vy * vy + vz * vz)
+    distance = sqrt(side * side + end * end)
+    outward = stack(3)
+    outward[0], outward[1], outward[2] = vx / radial, vy / radial, vz / radial
+    for i in range(3):
+        gradient[i] = (side * outward[i] + end * data[row + 6 + 3 * i]) / distance
+    for i in range(3):
+        for j in range(3):
+            across = outward[i] * outward[j] + data[row + 6 + 3 * i] * data[row + 6 + 3 * j]
+            around = (1.0 if i == j else 0.0) - across
+            hessian[i, j] = (across - gradient[i] * gradient[j] + around * side / radial) / distance
+    return distance
+
+
+def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, hessian) -> float:
+    """As `signed_distance_derivatives`, for a box, at (dx, dy, dz) from its centre."""
+    beyond, sign = stack(3), stack(3)
+    deepest, face = -inf, 0
+    for k in range(3):
+        local = data[row + 4 + k] * dx + data[row + 7 + k] * dy + data[row + 10 + k] * dz
+        beyond[k] = abs(local) - data[row + 13 + k]
+        sign[k] = 1.0 if local > 0 else -1.0
+        if beyond[k] > deepest:
+            deepest, face = beyond[k], k
+    if not deepest > 0:
+        axis = row + 4 + face
+        return flat_derivatives(deepest, sign[face], data[axis], data[axis + 3], data[axis + 6], gradient, hessian)
+    distance = 0.0
+    for k in range(3):
+        beyond[k] = max(beyond[k], 0.0)
+        distance += beyond[k] * beyond[k]
+    distance = sqrt(distance)
+    for i in range(3):
+        gradient[i] = 0.0
+        for k in range(3):
+            gradient[i] += data[row + 4 + 3 * i + k] * sign[k] * beyond[k] / distance
+    for i in range(3):
+        for j in range(3):
+            total = -gradient[i] * gradient[j]
+            for k in range(3):
+                if beyond[k] > 0:
+                    total += data[row + 4 + 3 * i + k] * data[row + 4 + 3 * j + k]
+            hessian[i, j] = total / distance
+    return distance
+
+
+# Of hulls.
 
 
 @outline
@@ -418,3 +558,84 @@ def dot(a, b):
 def cross(a, b, out):
     """Write a x b."""
     out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+# Of robots to all obstacles, and the centres of their balls.
+
+
+def hull_distances(obstacles, count, per_displacement, data, parts, hull_count, corners, displaced, out, slopes):
+    """Write the distances (count hulls obstacles,) of robots made of hulls, and their derivatives in the corners.
+
+    Args:
+      per_displacement: number of consecutive robots for which the obstacles are displaced alike.
+      parts: index of each hull's first corner, then the number B of corners. hull_count: number of hulls.
+      corners: (count, 3 B). displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
+      slopes: (count hulls obstacles, at least 3 for each corner of a hull).
+    """
+    for i in range(count):
+        for part in range(hull_count):
+            for k in range(obstacles):
+                at, moved = (i * hull_count + part) * obstacles + k, obstacles * (i // per_displacement) + k
+                first, end = int(parts[part]), int(parts[part + 1])
+                out[at] = hull_distance_displaced(data, ROW * k, corners[i], first, end, displaced[moved], slopes[at])
+
+
+@outline
+def hull_distance_displaced(data, row, corners, first, end, displaced, gradient):
+    """The distance of one hull to one obstacle that is displaced by (3,)."""
+    relative = stack(3 * MOST_CORNERS)
+    for k in range(end - first):
+        for i in range(3):
+            relative[3 * k + i] = corners[3 * (first + k) + i] - displaced[i]
+    return hull_distance(data, row, relative, 0, end - first, gradient)
+
+
+def nearest(obstacles, count, per_displacement, data, points, displaced, out):
+    """Write the distances (count,) of points (count, 3) to the nearest of the obstacles.
+
+    Args:
+      per_displacement: number of consecutive points for which the obstacles are displaced alike.
+      displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
+    """
+    for i in range(count):
+        out[i] = nearest_to(obstacles, data, points[i], displaced, obstacles * (i // per_displacement))
+
+
+@outline
+def nearest_to(obstacles, data, point, displaced, first):
+    """The distance of one point (3,) to the nearest obstacle. Obstacles are displaced by the rows from `first` on."""
+    least, relative, corner_slopes = inf, stack(3), stack(3)
+    for k in range(obstacles):
+        for i in range(3):
+            relative[i] = point[i] - displaced[first + k, i]
+        if data[ROW * k] == MESH:
+            distance = hull_distance(data, ROW * k, relative, 0, 1, corner_slopes)
+        else:
+            distance = signed_distance(data, ROW * k, relative[0], relative[1], relative[2])
+        if distance < least or isnan(distance):
+            least = distance
+    return least
+
+
+def write_centres(count, states, data, out):
+    """Write the centres (count, 3 balls) at states (count, N)."""
+    for i in range(count):
+        centres_at(states[i], data, out[i])
+
+
+def write_centres_and_jacobians(count, states, data, out, slopes):
+    """Write the centres, and their Jacobians (count, 3 balls, N) into arrays of zeros."""
+    for i in range(count):
+        jacobian_at(states[i], data, out[i], slopes[i])
+
+
+@outline
+def centres_at(x, data, out):
+    """Write the centres at one state."""
+    places(x, data, out)
+
+
+@outline
+def jacobian_at(x, data, out, slopes):
+    """Write the centres and their Jacobian at one state."""
+    places_jacobian(x, data, out, slopes)
