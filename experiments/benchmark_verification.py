@@ -19,7 +19,8 @@ import injected_faults as faults
 from runner import Settings, counting, judge, opening, progress, run
 
 import lqrsim as ls
-from lqrsim.view import gl, video_metadata
+from lqrsim.view import gl
+from lqrsim.view.render import digest, read_metadata
 
 VIEWS = {"quadrotor": ("top", "side"), "differential_drive": ("top",)}  # a camera, and insets
 RUN, VIDEO = "the run, drawn", "the video"
@@ -65,7 +66,7 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
         RUN: verdict(ls.verify_run(disturbed, solution=solution)),
         VIDEO: verdict(ls.verify_video(video, disturbed, solution=solution)),
     }
-    made = all_faults(video, video_metadata.digest(other))
+    made = all_faults(video, digest(other))
     for label, (make, is_other) in progress(made.items(), f"{name}, faults"):
         make(video, changed)
         found[label] = verdict(ls.verify_video(changed, other if is_other else disturbed, solution=solution))
@@ -74,7 +75,7 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
 
 def all_faults(video: Path, digest: str) -> dict[str, tuple[faults.Fault, bool]]:
     """The function that makes each fault, and whether its file then claims to show the run of that digest."""
-    views = [camera for _, camera in faults.calibrated(video_metadata.read(video))]
+    views = [camera for _, camera in faults.calibrated(read_metadata(video))]
     made: dict[str, tuple[faults.Fault, bool]] = {
         "one frame late": (faults.late, False),
         "one frame dropped": (faults.dropped, False),

@@ -19,7 +19,7 @@ from runner import FolderSettings, Result, Statement, between, interval, opening
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare, rate
-from lqrsim.view import figure_parts
+from lqrsim.view import plots
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 FEEDBACK, OPEN_LOOP = "with feedback", "open loop"
@@ -130,7 +130,7 @@ def draw_paths(
         for number, scenario in enumerate(scenarios):
             place = list(scenario.robot.dynamics.state_coordinates.position)
             plan = rollouts[scenario.name][FEEDBACK].plan.states[:, place]
-            low, high = figure_parts.bounds(plan, scenario.scene.world, 0.5 if len(place) == 3 else 0.0)
+            low, high = plots.bounds(plan, scenario.scene.world, 0.5 if len(place) == 3 else 0.0)
             if len(place) == 3:
                 axes = drawn.add_subplot(grid[number], projection="3d")
                 assert isinstance(axes, Axes3D)
@@ -138,7 +138,7 @@ def draw_paths(
                 axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))
             else:
                 axes = drawn.add_subplot(grid[number])
-                figure_parts.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
+                plots.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
             for name in (OPEN_LOOP, FEEDBACK):
                 draw_runs(axes, rollouts[scenario.name][name], config.paths, name)
             axes.plot(*plan.T, color=PLAN, label="plan")

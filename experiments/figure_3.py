@@ -20,7 +20,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.goal import OUTCOMES
 from lqrsim.stress.statistics import rate
-from lqrsim.view import figure_parts
+from lqrsim.view import plots
 from lqrsim.view.style import MARGIN, PLAN, RUNS, SOLID
 
 EVERY = 0.5  # seconds between two robots, as in the paper
@@ -81,7 +81,7 @@ def draw(config: Config, result: Result, scenario: ls.Scenario, solution: ls.Sol
     with figure(config, result, "figure_3", (11, 4.4)) as drawn:
         space = drawn.add_axes((0.0, 0.07, 0.38, 0.93), projection="3d")
         assert isinstance(space, Axes3D)
-        low, high = figure_parts.bounds(plan.states[:, :3], world)
+        low, high = plots.bounds(plan.states[:, :3], world)
         draw_in_space(space, world, low, high)
         space.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))  # those of the corners would touch
         space.plot(*plan.states[:, :3].T, color=PLAN)

@@ -13,10 +13,9 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
-from lqrsim.view.render import encoder
-from lqrsim.view.video_metadata import Pane, VideoMetadata
+from lqrsim.view.picture import Pane
+from lqrsim.view.render import VideoMetadata, encoder, read_metadata
 
 Pixels = npt.NDArray[np.uint8]
 Fault = Callable[[Path, Path], None]
@@ -70,19 +69,19 @@ def late(source: Path, path: Path) -> None:
             yield frame if before is None else before
             before = frame
 
-    write(path, frames(), video_metadata.read(source))
+    write(path, frames(), read_metadata(source))
 
 
 def dropped(source: Path, path: Path) -> None:
     """Drop the middle frame; the metadata counts the frames that are left."""
-    metadata = video_metadata.read(source)
+    metadata = read_metadata(source)
     frames = (frame for number, frame in enumerate(decoded(source)) if number != metadata.frames // 2)
     write(path, frames, dataclasses.replace(metadata, frames=metadata.frames - 1))
 
 
 def swapped(source: Path, path: Path) -> None:
     """Swap the middle frame with the next."""
-    metadata = video_metadata.read(source)
+    metadata = read_metadata(source)
 
     def frames() -> Iterator[Pixels]:
         held = []
@@ -99,7 +98,7 @@ def swapped(source: Path, path: Path) -> None:
 
 def mirrored(source: Path, path: Path) -> None:
     """Mirror the first calibrated pane."""
-    metadata = video_metadata.read(source)
+    metadata = read_metadata(source)
     pane, _ = calibrated(metadata)[0]
     rows, columns = slice(pane.top, pane.top + pane.height), slice(pane.left, pane.left + pane.width)
 
@@ -124,7 +123,7 @@ def off(view: str, axis: int) -> Fault:
         return dataclasses.replace(pane, camera=dataclasses.replace(pane.camera, position=tuple(position.tolist())))
 
     def fault(source: Path, path: Path) -> None:
-        metadata = video_metadata.read(source)
+        metadata = read_metadata(source)
         with_metadata(source, path, dataclasses.replace(metadata, panes=tuple(moved(pane) for pane in metadata.panes)))
 
     return fault
@@ -134,7 +133,7 @@ def forged(digest: str) -> Fault:
     """Claim in the metadata that the file shows the run of this digest."""
 
     def fault(source: Path, path: Path) -> None:
-        with_metadata(source, path, dataclasses.replace(video_metadata.read(source), runs=(digest,)))
+        with_metadata(source, path, dataclasses.replace(read_metadata(source), runs=(digest,)))
 
     return fault
 

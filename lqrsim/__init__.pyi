@@ -70,8 +70,8 @@ from .solvers.smoother import ilqr_many as ilqr_many
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many
 from .stress.funnels import funnel as funnel
-from .verify.checks import verify_run as verify_run
-from .verify.checks import verify_video as verify_video
+from .verify import verify_run as verify_run
+from .verify import verify_video as verify_video
 from .view.render import render as render
 
 __version__: str

@@ -31,7 +31,7 @@ from lqrsim.results.solution_parts import (
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.gradients import Gradients
 from lqrsim.solvers.prepared import PreparedSolver
-from lqrsim.verify.verdict import Verification
+from lqrsim.verify import Verification
 
 __all__ = [
     "BetweenKnots", "Box", "Candidate", "Capsule", "Certificate", "ConstraintTerm", "ContactCertificate",

@@ -18,7 +18,7 @@ from lqrsim.errors import Array
 from lqrsim.problem.constraints import PlainTerm
 from lqrsim.results.solution_parts import Status
 from lqrsim.simulation.uncertainty_of import tube_under
-from lqrsim.view.figure_parts import accuracy
+from lqrsim.view.plots import accuracy
 
 DT = 0.1
 A, B = np.array([[1.0, DT], [-0.3, 0.9]]), np.array([[0.0, 0.1], [DT, 0.3]])

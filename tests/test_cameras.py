@@ -14,11 +14,10 @@ from sampling import rarely
 import lqrsim as ls
 from lqrsim.results.rollout import BallRecord
 from lqrsim.view import cameras, gl
-from lqrsim.view.cameras import Camera
-from lqrsim.view.geoms import MARK_RGB, draw_mark, mark_radius
+from lqrsim.view.cameras import MARK_RGB, Camera, draw_mark, mark_radius
+from lqrsim.view.picture import Pane
 from lqrsim.view.recorded_trial import RecordedTrial, drawn_size
-from lqrsim.view.render import encoder
-from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read
+from lqrsim.view.render import VideoMetadata, digest, encoder, read_metadata
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 TILTED = Camera("tilted", (3.0, -4.0, 5.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6), 4.0)
@@ -135,29 +134,29 @@ def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
             frame = av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), dtype=np.uint8), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    assert read(path) == written
+    assert read_metadata(path) == written
     np.testing.assert_allclose(written.times(), np.arange(3) * 0.5 * 1001 / 30000)
 
 
 def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
     with pytest.raises(ls.InputError, match="want a file that exists"):
-        read(tmp_path / "none.mp4")
+        read_metadata(tmp_path / "none.mp4")
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(ls.InputError, match="want one that can be read"):
-        read(tmp_path / "text.mp4")
+        read_metadata(tmp_path / "text.mp4")
     good = metadata(rollout)
     with encoder(tmp_path / "latin.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast", metadata=good) as encode:
         encode(np.zeros((64, 64, 3), dtype=np.uint8))
     content = (tmp_path / "latin.mp4").read_bytes()
     (tmp_path / "latin.mp4").write_bytes(content.replace(b'{"format', b"Mus\xe9es "))  # of another program, in Latin-1
     with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
-        read(tmp_path / "latin.mp4")
+        read_metadata(tmp_path / "latin.mp4")
     with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
         VideoMetadata.from_json(100_000 * "[")
     with encoder(tmp_path / "other.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast") as encode:
         encode(np.zeros((64, 64, 3), dtype=np.uint8))
     with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
-        read(tmp_path / "other.mp4")
+        read_metadata(tmp_path / "other.mp4")
     good = json.loads(metadata(rollout).as_json())
     for change, message in [
         ({"version": 99}, "got version 99"),

@@ -20,7 +20,7 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.view import style
-from lqrsim.view.figure_parts import moved_objects
+from lqrsim.view.plots import moved_objects
 
 STEPS, DT = 20, 0.1
 KINDS = ("sphere", "box", "capsule", "cylinder")

@@ -11,7 +11,7 @@ from PIL import Image
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.verify.checks import EMPTY
+from lqrsim.verify import EMPTY
 from lqrsim.view import gl
 from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import INTERPOLATED, DrawnTube, Overlays, Scale, colour_of, legend_entries

@@ -22,7 +22,7 @@ from lqrsim.commands.options import stated
 from lqrsim.commands.stressing import Break, Rare
 from lqrsim.scenarios.solutions import remarks
 from lqrsim.stress.policies import solve_policies
-from lqrsim.verify.checks import ran_policy_of
+from lqrsim.verify import ran_policy_of
 from lqrsim.view import viewer
 
 DRIVE, LIGHT = "differential_drive", (ls.disturbances.ControlNoise(0.02), ls.disturbances.MeasurementNoise(0.01))

@@ -14,8 +14,7 @@ from sampling import examples, rarely
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, ForceNoise
 from lqrsim.view import style
-from lqrsim.view.figure_parts import surface
-from lqrsim.view.plots import plot_run
+from lqrsim.view.plots import plot_run, surface
 
 
 @pytest.fixture(scope="module")

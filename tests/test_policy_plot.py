@@ -14,9 +14,8 @@ from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.control.tubes import Tube, predict_tube
-from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.figure_parts import CLOSE, draw_projected, draw_tube
-from lqrsim.view.plots import draw_policy, strength
+from lqrsim.view.overlays import Ellipsoids
+from lqrsim.view.plots import CLOSE, draw_policy, draw_projected, draw_tube, strength
 from lqrsim.view.style import MARGIN
 
 

@@ -18,13 +18,12 @@ from tracking import hover, track
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
-from lqrsim.view import cameras, gl, video_metadata
-from lqrsim.view.captions import Legend
+from lqrsim.view import cameras, gl
 from lqrsim.view.options import ALL_OVERLAYS, DRAWN_BY, OVERLAYS, Overlay
 from lqrsim.view.overlays import DrawnTube, Overlays, Scale, colour_of, legend_entries
-from lqrsim.view.picture import open_picture
+from lqrsim.view.picture import Legend, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.render import render
+from lqrsim.view.render import digest, read_metadata, render
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
@@ -269,7 +268,7 @@ def test_a_robot_without_a_radius_is_drawn_and_measured(body: str, camera: str, 
     run = ls.simulate(ls.Plant(robot, robot.scene), solution, disturbances=[push], goal_radius=0.1)
     assert run.radius == 0
     video = render(run, tmp_path / "run.mp4", size=SMALL, fps=10, camera=camera)
-    assert video_metadata.read(video).markers[0] > 0
+    assert read_metadata(video).markers[0] > 0
     if camera == "top" and "geom" in body:
         assert (found := ls.verify_video(video, run)).passed, str(found)
         assert (found := ls.verify_run(run)).passed, str(found)
@@ -315,8 +314,8 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
     """Two runs, each with the first camera and two calibrated ones: where the panes are, and that they are apart."""
     other = dataclasses.replace(flight, seed=4)
     path = render([flight, other], tmp_path / "run.mp4", size=(640, 360), fps=1, insets=("top", "side"))
-    found = video_metadata.read(path)
-    assert found.runs == (video_metadata.digest(flight), video_metadata.digest(other))
+    found = read_metadata(path)
+    assert found.runs == (digest(flight), digest(other))
     assert (found.rate, found.speed, found.frames) == (1, 1.0, 6)
     assert [pane.run for pane in found.panes] == [0, 0, 0, 1, 1, 1]
     cameras = [None if pane.camera is None else pane.camera.name for pane in found.panes]

@@ -15,12 +15,12 @@ from sampling import examples, rarely
 from tracking import weave
 
 import lqrsim as ls
+from lqrsim import verify
 from lqrsim.cli import main
-from lqrsim.verify import checks
-from lqrsim.verify.checks import check_plan, run_beside
-from lqrsim.view import cameras, gl, video_metadata
+from lqrsim.verify import check_plan, run_beside
+from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
-from lqrsim.view.video_metadata import VideoMetadata
+from lqrsim.view.render import VideoMetadata, digest, read_metadata
 
 faults: Any = importlib.import_module("injected_faults")  # of experiments/, whose benchmark makes them at full size
 
@@ -66,7 +66,7 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         ls.render(run, path, camera="top", insets=("side",), size=(800, 360), speed=3)
     else:
         ls.render(run, path, camera="top", size=(560, 360), speed=10)
-    return Case(name, solution, run, other, path, list(faults.decoded(path)), video_metadata.read(path))
+    return Case(name, solution, run, other, path, list(faults.decoded(path)), read_metadata(path))
 
 
 def failed(found: ls.types.Verification) -> set[str]:
@@ -247,7 +247,7 @@ def test_calibration_that_is_off_by_2_cm_is_told(case: Case, tmp_path: Path) -> 
 
 def test_another_seeds_run_is_told_by_the_pixels_alone(case: Case, tmp_path: Path) -> None:
     assert {"run", "position"} <= failed(ls.verify_video(case.video, case.other))
-    faults.forged(video_metadata.digest(case.other))(case.video, tmp_path / "changed.mp4")
+    faults.forged(digest(case.other))(case.video, tmp_path / "changed.mp4")
     found = ls.verify_video(tmp_path / "changed.mp4", case.other)
     assert "position" in failed(found)
     assert "run" not in failed(found)
@@ -356,14 +356,14 @@ def verified_as_rod(
 
     Without a seed the rod lies along the pixels.
     """
-    model = checks.drawable_model(run, 0)
-    geom, pixel = checks._tracked_geom(model, model.body(run.body).id), 0.0
+    model = verify.drawable_model(run, 0)
+    geom, pixel = verify._tracked_geom(model, model.body(run.body).id), 0.0
     for view in (cameras.calibrated("top", run), cameras.calibrated("side", run)):
-        pixel = max(pixel, view.height / checks.SIZE[1])
+        pixel = max(pixel, view.height / verify.SIZE[1])
     turn = np.array([1.0, 0, 1, 0]) if seed is None else np.random.default_rng(seed).normal(size=4)
     model.geom_type[geom], model.geom_quat[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, turn / np.linalg.norm(turn)
     model.geom_size[geom] = thickness * pixel / 2, run.radius, 0.0
-    changed.setattr(checks, "drawable_model", lambda *_: model)
+    changed.setattr(verify, "drawable_model", lambda *_: model)
     # A small radius is a tight bound: less than half of the finest pixel.
     return ls.verify_run(dataclasses.replace(run, radius=0.08) if seed is None else run)
 
@@ -433,8 +433,8 @@ def test_a_robot_without_position_or_balls_is_measured_by_a_geom_that_is_whole_i
     found = ls.verify_run(run)
     assert found.passed, found.summary()
     assert f"the silhouette of {drawn} in" in found.method
-    data = mujoco.MjData(model := checks.drawable_model(run, 0))
-    for seen, frame in zip(found.seen, run.frames[0, checks.frames_at_states(run, 0)[1]], strict=True):
+    data = mujoco.MjData(model := verify.drawable_model(run, 0))
+    for seen, frame in zip(found.seen, run.frames[0, verify.frames_at_states(run, 0)[1]], strict=True):
         data.qpos[:] = frame
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(seen, data.geom("lens").xpos, rtol=0, atol=0.05 / 60)
@@ -454,7 +454,7 @@ def test_the_middle_of_a_thin_mask_is_its_centre(
     x, y = np.meshgrid(np.arange(200) + 0.5 - centre[0], np.arange(200) + 0.5 - centre[1])
     along = np.clip(x * np.cos(angle) + y * np.sin(angle), -length, length)
     mask = np.hypot(x - along * np.cos(angle), y - along * np.sin(angle)) <= thickness / 2
-    np.testing.assert_allclose(checks.mask_middle(mask), centre, rtol=0, atol=1.0)
+    np.testing.assert_allclose(verify.mask_middle(mask), centre, rtol=0, atol=1.0)
 
 
 @settings(max_examples=examples(12))
@@ -476,7 +476,7 @@ def test_how_far_a_geom_reaches(kind: str, size: tuple[float, float, float], see
     away = [mujoco.mj_ray(model, data, 5 * ray, -ray, None, 1, -1, found, None) for ray in rays]
     surface = (5 - np.array(away))[:, None] * rays
     directions = rays[:20]
-    reach = checks._reach(mujoco.mjtGeom(model.geom_type[0]), model.geom_size[0], directions)
+    reach = verify._reach(mujoco.mjtGeom(model.geom_type[0]), model.geom_size[0], directions)
     sampled = (directions @ surface.T).max(axis=1)
     assert (sampled <= reach + 1e-9).all()
     np.testing.assert_allclose(sampled, reach, rtol=0.1, atol=0)  # of so many rays the nearest to a corner
@@ -487,11 +487,11 @@ def test_views_that_disagree_are_told_apart() -> None:
     side = Camera("side", (0.0, -10.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 5.0)
     point = np.array([0.3, -0.2, 0.5])
     measured = np.array([[view.axes @ point for view in (top, side)]])
-    place, apart = checks.triangulate((top, side), measured, "xyz")
+    place, apart = verify.triangulate((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-12)
     measured[0, 0, 0] += 0.01
-    place, apart = checks.triangulate((top, side), measured, "xyz")
+    place, apart = verify.triangulate((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point + np.array([0.005, 0, 0])], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0.01, rtol=0, atol=1e-12)
 
@@ -508,13 +508,13 @@ def test_the_marks_middle_is_found_between_pixels(centre: tuple[float, float]) -
     image[90:92, 90] = (20, 220, 10)
     # Where a fifth of it is outside of the picture, its middle is not the ball's, by less than that.
     near = 0.03 if centre[0] > radius else 0.5
-    np.testing.assert_allclose(checks.marker_centre(image, radius), centre, rtol=0, atol=near)
+    np.testing.assert_allclose(verify.marker_centre(image, radius), centre, rtol=0, atol=near)
     image[:, 50:] = 0
     image[:, :50] = 0
-    assert np.isnan(checks.marker_centre(image, radius)).all()
+    assert np.isnan(verify.marker_centre(image, radius)).all()
 
 
 def test_cameras_of_a_robot_in_the_plane_see_it_from_above(case: Case) -> None:
     views = [cameras.calibrated("side", case.run)]
     with pytest.raises(ls.InputError, match="views: got side, want"):
-        checks.triangulate(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)
+        verify.triangulate(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.view import figure_parts
+from lqrsim.view import plots
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 COLOURS = (*RUNS, "#e69f00", "#56b4e9", "#f0e442")  # of the commonest ways
@@ -25,7 +25,7 @@ def arena(axes: Axes, scenario: ls.Scenario) -> None:
     """Pillars and walls from above, and the wished start and goal."""
     ends = np.array([scenario.problem.start, scenario.problem.goal])[:, :2]
     world = scenario.scene.world.seen_by("xy")
-    figure_parts.draw_in_plane(axes, world, *figure_parts.bounds(ends, world, WALL), scenario.robot.radius)
+    plots.draw_in_plane(axes, world, *plots.bounds(ends, world, WALL), scenario.robot.radius)
     axes.spines[:].set_visible(False)
     axes.set(xticks=range(-2, 3), yticks=range(-3, 4))
 

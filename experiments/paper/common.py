@@ -15,7 +15,7 @@ from scipy import stats
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
-from lqrsim.view import figure_parts, gl, style
+from lqrsim.view import gl, plots, style
 
 FREE = (-np.inf, np.inf)  # limits of the controls: the paper's problems have none
 
@@ -45,7 +45,7 @@ def draw_in_space(axes: Axes3D, world: ls.World, low: Array, high: Array) -> Non
     """Draw translucent surfaces of obstacles between two corners (3,)."""
     for obstacle in world.obstacles:
         if obstacle.kind != "plane":  # planes are the sides of the box
-            x, y, z = figure_parts.surface(obstacle, low, high)
+            x, y, z = plots.surface(obstacle, low, high)
             axes.plot_surface(x, y, z, color=style.SOLID, alpha=0.10, linewidth=0, rstride=1, cstride=1, shade=True)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set(xlabel="x (m)", ylabel="y (m)")

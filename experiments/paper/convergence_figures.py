@@ -12,7 +12,7 @@ from matplotlib.patches import Ellipse
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Moments
-from lqrsim.view import figure_parts
+from lqrsim.view import plots
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.rates import tail
 
@@ -151,8 +151,8 @@ def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> Non
     least_to_go = -np.einsum("tij,tj->ti", of_go, go.gradient)
     (cost,) = scenario.problem.obstacle_costs
     world, plan = cost.world.seen_by("xy"), solution.trajectory.states[:, :2]
-    low, high = figure_parts.bounds(plan, world, 0.2)
-    figure_parts.draw_in_plane(axes, world, low, high, cost.radius)
+    low, high = plots.bounds(plan, world, 0.2)
+    plots.draw_in_plane(axes, world, low, high, cost.radius)
     axes.plot(*plan.T, color=LIMIT, linewidth=1, label="rollout")
     for name, colour, marker, centres, shapes in (
         ("cost-to-go", RUNS[0], "s", least_to_go, of_go),

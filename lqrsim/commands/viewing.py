@@ -272,7 +272,7 @@ class Verify:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.verify.checks import ran_policy_of, run_beside
+        from lqrsim.verify import ran_policy_of, run_beside
 
         is_run = self.file.suffix.lower() == ".npz"
         if is_run and self.run_file is not None:

@@ -1,4 +1,4 @@
-"""Cameras of panes: calibrated ones, an overview, a chase view, and the model's own.
+"""Cameras of panes: calibrated ones, in which a robot has a mark, an overview, a chase view, and the model's own.
 
 Calibrated cameras are fixed, so that pixels measure positions. They are orthographic, like an engineering drawing: a
 metre has the same number of pixels everywhere. The centre of a ball's pixels is therefore exactly the centre of the
@@ -17,12 +17,18 @@ from lqrsim.annotations import Finite, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
+from lqrsim.view.overlays import appending_to, set_geom
 from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial, interpolated, tracked_balls
 
 Vector = tuple[Finite, Finite, Finite]
 
 # Depths in m that are drawn. The depth buffer is linear in an orthographic view, so a wide range loses no precision.
 CLIPPING = 0.01, 1000.0
+
+# The mark by which a robot's position is read from a video: a green ball at the origin of its body, in front of a black
+# ball. Nothing else is pure green. The mark emits all of its light, so it looks the same in the sun and in the shade.
+MARK_RGB = (0.0, 1.0, 0.0)
+RIM = 1.8  # radius of the black ball, in radii of the green one: a video then blurs one colour into the whole edge
 
 
 @checked
@@ -90,6 +96,23 @@ def calibrated(name: str, rollout: Rollout, aspect: float = 4 / 3, *, around: Ar
 def measuring(plane: str) -> tuple[str, ...]:
     """Those of the cameras `top` and `side` that together measure positions along these axes of the world."""
     return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
+
+
+def mark_radius(recorded: RecordedTrial) -> float:
+    """Radius of the mark of a robot, in metres."""
+    return 0.25 * recorded.size
+
+
+def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -> None:
+    """Add the mark of a robot whose body is at `centre` (3,) to a scene that is seen through the camera.
+
+    It is drawn close to the camera, where nothing hides it: in an orthographic picture its place is the same.
+    """
+    forward, new = np.array(camera.forward), appending_to(scene)
+    centre = centre - (forward @ (centre - camera.position)) * forward
+    for distance, size, colour in ((1, radius, MARK_RGB), (2, RIM * radius, (0.0, 0.0, 0.0))):
+        place = centre + (distance + size) * forward
+        set_geom(new(), mujoco.mjtGeom.mjGEOM_SPHERE, [size] * 3, place, (*colour, 1.0), emission=1)
 
 
 def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array]:

@@ -28,13 +28,13 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.mjcf_kinematics import quaternion_of
 from lqrsim.view.cameras import camera_view
-from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import (
     Arrow,
     Dots,
     Drawable,
     DrawnTube,
+    Ellipsoids,
     Line,
     MovingBody,
     Overlays,

@@ -1,10 +1,5 @@
-"""What can be drawn over a scene, by name; qualities and views by name; and the layout of a picture.
+"""What can be drawn over a scene, qualities and views, by name. Imports nothing heavy: the command line needs them."""
 
-This module imports nothing heavy, so that the command line starts fast.
-"""
-
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
 Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "cost_tube", "funnel", "caption"]
@@ -51,40 +46,3 @@ OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if OVERLAY_K
 DRAWN_BY: dict[str, Overlay] = {"solution": "cost_tube", "funnel": "funnel", "titles": "caption"}
 CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)
-INSETS_FRACTION = 0.4  # fraction of a run's part for its insets
-
-
-@dataclass(frozen=True)
-class Box:
-    """A rectangle of the picture, in pixels from the upper left corner."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    @property
-    def aspect(self) -> float:
-        return self.width / self.height
-
-
-def side_by_side(count: int, size: tuple[int, int]) -> list[Box]:
-    """Equal parts of a picture of `size` width and height, up to three in a row, with even edges."""
-    columns = count if count <= 3 else -(-count // 2)
-    rows = -(-count // columns)
-    x = [2 * round(size[0] * column / columns / 2) for column in range(columns + 1)]
-    y = [2 * round(size[1] * row / rows / 2) for row in range(rows + 1)]
-    places = [(number % columns, number // columns) for number in range(count)]
-    return [Box(x[i], y[j], x[i + 1] - x[i], y[j + 1] - y[j]) for i, j in places]
-
-
-def split_into_panes(box: Box, insets: int) -> list[Box]:
-    """The first pane and the insets, in a column on its right, or in a row below it if the box is higher than wide."""
-    wide = box.width >= box.height
-    length, across = (box.width, box.height) if wide else (box.height, box.width)
-    edge = 2 * round(length * (1 - INSETS_FRACTION) / 2) if insets else length
-    cuts = [2 * round(across * number / max(insets, 1) / 2) for number in range(insets + 1)]
-    parts = [(0, 0, edge, across), *((edge, i, length - edge, j - i) for i, j in pairwise(cuts))]
-    if not wide:
-        parts = [(y, x, height, width) for x, y, width, height in parts]
-    return [Box(box.left + x, box.top + y, width, height) for x, y, width, height in parts]

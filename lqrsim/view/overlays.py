@@ -1,21 +1,23 @@
-"""Overlays of a trial, as lines, dots, tubes, bodies and an arrow in the scene over time; and its readings as text.
+"""Overlays of a trial: lines, dots, tubes, bodies and an arrow in the scene over time; and its readings as text.
 
-Each is drawn by MuJoCo (`geoms.py`), and by a page in a browser and by Rerun (`exports.py`).
+MuJoCo draws each as geoms in addition to the model's (`draw`), and so do a page in a browser and Rerun (`exports.py`).
+Tubes are of ellipsoids along a plan, which figures have, too.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
+from mujoco import mjtGeom as Geom
 
 from lqrsim.annotations import Want, checked
 from lqrsim.errors import Array, InputError
 from lqrsim.results.certified import Funnel
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.results.solution import Solution
-from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, Colour, Overlay
 from lqrsim.view.recorded_trial import RecordedTrial, interpolated
 
@@ -46,6 +48,103 @@ SLIM = 0.65  # relative width of lines within a tube, which is often hardly wide
 SEGMENTS = 120  # of a line, at most: each is a geom of MuJoCo's
 DOTS = 30  # number of latest measured states that are drawn
 ARROW = 4.0  # length of the largest force's arrow, in radii of the robot: longer than the robot, and no path
+UPRIGHT = np.eye(3)
+END_ON = 0.9  # cosine of the angle to the line of sight above which an arrow is not drawn
+
+SIGMAS = 2.0  # standard deviations at which ellipsoids are drawn
+COST_ABOVE_LEAST = SIGMAS**2 / 2  # total cost above its minimum, on an ellipsoid of the cost
+PREDICTED = f"predicted: {SIGMAS:g} sigma, 95 % in each direction"
+OF_COST = f"{SIGMAS:g} sigma of the cost: total ≤ least + {COST_ABOVE_LEAST:g}"
+
+WIDEST = 0.2  # largest half axis that is drawn, relative to the extent of the plan; larger ones hide the picture
+STAYS = 1e-3  # m; a plan of less extent stays in place, and its tube hides nothing
+APART = 0.8  # distance between neighbours, in half axes
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoids:
+    """Ellipsoids at the knots of a plan, or at some of them: centres (k, d) and covariances (k, d, d)."""
+
+    centres: Array
+    covariances: Array
+    cut_at: float | None = None  # half axis in m at which the tube is cut off; None if it is whole
+
+    @classmethod
+    def predicted(cls, centres: Array, covariances: Array) -> "Ellipsoids":
+        """The ellipsoids of a tube about positions (T+1, d), up to the first that is too wide for a picture."""
+        extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+        largest = WIDEST * extent if extent > STAYS else np.inf
+        wide = SIGMAS * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)) > largest
+        last = int(np.argmax(wide)) if wide.any() else len(wide)
+        return cls(centres[:last], covariances[:last], largest if wide.any() else None)
+
+    @classmethod
+    def of_cost(cls, solution: Solution, states: tuple[int, ...]) -> "Ellipsoids":
+        """The states whose total cost is at most `COST_ABOVE_LEAST` above its minimum, projected onto d of the states.
+
+        The projection of an ellipsoid has the corresponding block of its covariance.
+        """
+        total, chosen = solution.total_cost, list(states)
+        return cls(total.minimizer()[:, chosen], total.covariance()[:, chosen][:, :, chosen])
+
+    @property
+    def label(self) -> str:
+        """The label of a predicted tube in a legend."""
+        return PREDICTED if self.cut_at is None else f"{PREDICTED}; drawn up to half axes of {self.cut_at:.2g} m"
+
+    def axes(self) -> tuple[Array, Array]:
+        """Half axes (k, d), and rotations (k, d, d) whose columns are their directions."""
+        covariances = 0.5 * (self.covariances + np.swapaxes(self.covariances, 1, 2))
+        variances, rotations = np.linalg.eigh(covariances)
+        rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
+        return SIGMAS * np.sqrt(np.maximum(variances, 0.0)), rotations
+
+    def projected(self, onto: Array) -> "Ellipsoids":
+        """Their projections onto a plane, whose axes are the rows of `onto` (2, d)."""
+        return Ellipsoids(self.centres @ onto.T, onto @ self.covariances @ onto.T, self.cut_at)
+
+    def outlines(self) -> Array:
+        """Outlines (k, 48, 2) of ellipses."""
+        half_axes, rotations = self.axes()
+        around = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+        circle = np.stack([np.cos(around), np.sin(around)], axis=-1)
+        return self.centres[:, None, :] + np.einsum("kij,kj,pj->kpi", rotations, half_axes, circle)
+
+    def overlapping(self, knots: npt.NDArray[np.int64], most: int) -> npt.NDArray[np.int64]:
+        """Knots whose ellipsoids overlap to a tube of even depth: the first, the last and some in between."""
+        half_axes = self.axes()[0].mean(axis=1)
+        chosen = list(knots[:1])
+        for knot in knots[1:]:
+            before = chosen[-1]
+            moved = np.linalg.norm(self.centres[knot] - self.centres[before])
+            grown = abs(half_axes[knot] - half_axes[before])
+            if moved + grown >= APART * half_axes[knot] or knot == knots[-1]:
+                chosen.append(knot)
+        places = np.linspace(0, len(chosen) - 1, min(most, len(chosen))).astype(np.int64)
+        return np.array(chosen, dtype=np.int64)[places]
+
+
+NewGeom = Callable[[], mujoco.MjvGeom]
+
+
+def appending_to(scene: mujoco.MjvScene) -> NewGeom:
+    """A function that appends a geom to a scene and returns it."""
+
+    def new() -> mujoco.MjvGeom:
+        scene.ngeom += 1
+        return scene.geoms[scene.ngeom - 1]
+
+    return new
+
+
+def set_geom(
+    geom: mujoco.MjvGeom, kind: Geom, size: Any, place: Any, rgba: Any, rotation: Array = UPRIGHT, *, emission: float
+) -> mujoco.MjvGeom:
+    """Give a geom this kind, size (3,), place (3,) and colour (4,), without shadow and gloss; returns the geom."""
+    mujoco.mjv_initGeom(geom, kind, size, place, rotation.ravel(), rgba)
+    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
+    geom.specular, geom.emission = 0, emission
+    return geom
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +154,9 @@ class Drawable:
     name: str  # of the overlay, of a part of it, or of an obstacle that moves
     rgba: Rgba
     label: str  # in the legend; none if empty
+
+    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+        """Draw it at a time, with geoms that `new` returns; an arrow waits for the camera, see `draw_for`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +168,22 @@ class Line(Drawable):
     times: Array | None = None  # (k,) at which it gets to its points; None for a line that is always whole
     colours: Array | None = None  # (k-1, 4) of its segments, by the map of the tracking error; None if all have `rgba`
 
-    def until(self, time: float) -> tuple[Array, Array]:
-        """Its points (j, 3) up to a time, and the colours (j-1, 4) of the segments between them."""
+    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+        """A box for each segment that it has by then; boxes are cheaper than capsules."""
         points = self.points
         colours = np.tile(np.array(self.rgba), (len(points) - 1, 1)) if self.colours is None else self.colours
         if self.times is not None and time < self.times[-1]:
             count = int(np.searchsorted(self.times, time, side="right"))
             points = np.vstack([points[:count], interpolated(points, self.times, time)])
-        return points, colours[: len(points) - 1]
+        along = np.diff(points, axis=0)
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        z = along / np.where(length > 0, length, 1)
+        side = np.cross(np.where(np.abs(z[:, 2:]) < 0.99, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), z)
+        x = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+        rotations, centres = np.stack([x, np.cross(z, x), z], axis=-1), points[:-1] + 0.5 * along
+        for i in np.flatnonzero(length > 1e-6):
+            size = [*self.profile, 0.5 * length[i, 0]]
+            set_geom(new(), Geom.mjGEOM_BOX, size, centres[i], colours[i], rotations[i], emission=emission)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +195,10 @@ class Dots(Drawable):
     half_sizes: tuple[float, float, float]
     seconds: float
 
-    def at(self, time: float) -> Array:
-        """Those that are shown at a time, (j, 3)."""
+    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
         age = time - self.times
-        return self.points[(age >= 0) & (age < self.seconds - 1e-9)]
+        for point in self.points[(age >= 0) & (age < self.seconds - 1e-9)]:
+            set_geom(new(), Geom.mjGEOM_BOX, self.half_sizes, point, self.rgba, emission=emission)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +209,10 @@ class DrawnTube(Drawable):
     centres: Array
     half_axes: Array
     rotations: Array
+
+    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+        for centre, sizes, rotation in zip(self.centres, self.half_axes, self.rotations, strict=True):
+            set_geom(new(), Geom.mjGEOM_ELLIPSOID, sizes, centre, self.rgba, rotation, emission=emission)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +229,11 @@ class MovingBody(Drawable):
         """Its places at these times, (..., 3)."""
         return interpolated(self.places, self.times, times)
 
+    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+        kind, size = getattr(Geom, f"mjGEOM_{self.kind.upper()}"), self.size
+        size = np.full(3, size[0]) if self.kind == "sphere" else size
+        set_geom(new(), kind, size, self.at(time), self.rgba, self.rotation, emission=emission)
+
 
 @dataclass(frozen=True, eq=False)
 class Arrow(Drawable):
@@ -124,6 +243,19 @@ class Arrow(Drawable):
     gap: float
     width: float
     metres_per_newton: float
+
+    def draw_for(self, scene: mujoco.MjvScene, force: Array, place: Array, *, emission: float) -> None:
+        """Append the arrow of a force (3,) on a robot at `place` (3,), for the camera that is set in the scene.
+
+        An arrow along the line of sight is left out: it would show nothing and hide the robot.
+        """
+        forward, strength = np.array(scene.camera[0].forward, dtype=np.float64), float(np.linalg.norm(force))
+        length = self.metres_per_newton * strength
+        if length < 2 * self.width or abs(force @ forward) > END_ON * strength:
+            return
+        start = place + self.gap * force / strength
+        geom = set_geom(appending_to(scene)(), Geom.mjGEOM_ARROW, [1, 1, 1], start, self.rgba, emission=emission)
+        mujoco.mjv_connector(geom, Geom.mjGEOM_ARROW, self.width, start, start + length * force / strength)
 
 
 class Scale(NamedTuple):

@@ -1,1 +1,0 @@
-"""Verification of runs from pixels: positions in pictures, compared with the record of the run."""
