@@ -18,7 +18,7 @@ from peers.common import Unavailable
 from tqdm import tqdm
 
 import lqrsim as ls
-from lqrsim.commands.as_json import text_of
+from lqrsim.commands.console import text_of
 from lqrsim.machine import description
 from lqrsim.results.archive import replacing
 from lqrsim.stress.statistics import Estimate

@@ -20,7 +20,7 @@ import lqrsim as ls
 import lqrsim.gym
 from lqrsim.control.controllers import Feedback
 from lqrsim.errors import InputError
-from lqrsim.gym.environment import LARGEST
+from lqrsim.gym import LARGEST
 from lqrsim.view import gl
 
 NAMES = {"lqrsim/DifferentialDrive-v0": "differential_drive", "lqrsim/Quadrotor-v0": "quadrotor"}

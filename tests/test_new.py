@@ -14,7 +14,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.commands.creating import TEMPLATES
+from lqrsim.commands.solving import TEMPLATES
 from lqrsim.templates.my_robot.my_robot import MyRobot
 from lqrsim.view import gl
 

@@ -8,12 +8,12 @@ from typing import Annotated, Any, Union
 
 from tyro.conf import subcommand
 
-from lqrsim.commands import creating, reproduce, solving, stressing, viewing
+from lqrsim.commands import reproduce, solving, stressing, viewing
 
 _ALL = (
-    solving.List, creating.New, solving.Solve, solving.Simulate, viewing.Render, viewing.Verify, viewing.View,
+    solving.List, solving.New, solving.Solve, solving.Simulate, viewing.Render, viewing.Verify, viewing.View,
     solving.Demo, stressing.Stress, stressing.Replay, stressing.Report, stressing.Compare, stressing.Rare,
-    stressing.Certify, stressing.Harden, stressing.Break, stressing.FunnelCommand, creating.Export, solving.Bridge,
+    stressing.Certify, stressing.Harden, stressing.Break, stressing.FunnelCommand, viewing.Export, solving.Bridge,
     reproduce.Reproduce, solving.Cache,
 )  # fmt: skip
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}

@@ -1,7 +1,12 @@
-"""Commands that solve and execute: in MuJoCo, or on a robot that speaks ROS 2. The demo, and the compiled solvers."""
+"""Commands from a new robot to its runs, in MuJoCo or on a robot that speaks ROS 2. The demo, and compiled solvers."""
 
+import builtins
+import importlib.util
 import itertools
+import keyword
 import math
+import shlex
+import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 import lqrsim as ls
-from lqrsim.commands import as_json, console
+from lqrsim.commands import console
 from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
@@ -42,8 +47,83 @@ class List:
             console.say(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
             for line in str(scenario.robot).splitlines()[2:]:  # of a robot from an MJCF; the first two say the same
                 console.say(line)
-        console.result(scenarios=[as_json.of_scenario(name, scenario) for name, scenario in scenarios.items()])
+        console.result(scenarios=[console.of_scenario(name, scenario) for name, scenario in scenarios.items()])
         return 0
+
+
+TEMPLATE, CLASS = "my_robot", "MyRobot"
+TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
+# Names with another meaning: those used in the written files, MuJoCo's first body, pytest's own file, Windows' devices.
+RESERVED = {
+    "any", "path", "self", "world", "conftest", "con", "prn", "aux", "nul",
+    *(f"{port}{number}" for port in ("com", "lpt") for number in range(10)),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class New:
+    """Write the files of a new robot.
+
+    The folder contains an MJCF, dynamics, a scenario and a test. They work unchanged: a disc is pushed round a crate.
+    Prints the commands that solve, simulate, render and test it. docs/new_robot.md explains the changes to make.
+    """
+
+    name: Annotated[Positional[str], arg(metavar="NAME")]
+    """Name of the robot, a name that Python can import: lower-case letters, digits and underscores."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path(".")
+    """Folder in which the robot's folder is made."""
+
+    def run(self) -> int:
+        from lqrsim.results.archive import excerpt_of, write_text
+
+        check_robot_name(self.name)
+        folder = self.out / self.name
+        console.check_output("--out", self.out)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            raise ls.InputError(f"name: got {self.name!r}, want one without a folder {excerpt_of(folder)}") from None
+        except OSError as error:
+            got = excerpt_of(self.out)
+            raise ls.InputError(f"--out: got {got}, want a folder that can be written ({error})") from None
+        try:
+            for template in sorted(TEMPLATES.glob("*.*")):
+                path = folder / _named(template.name, self.name)
+                write_text(path, _named(template.read_text(encoding="utf-8"), self.name))
+                console.wrote(path)
+        except BaseException:  # as on a full disk: the same command can then be given again
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        scenario, runs = f"{(folder / self.name).as_posix()}.py:scenario", f"runs/{self.name}"
+        console.say("\nnext:")
+        for command in (
+            ["lqrsim", "solve", scenario],
+            ["lqrsim", "simulate", f"{runs}/solution.npz", "--scenario", scenario, "--disturbances", "scenario"],
+            ["lqrsim", "render", f"{runs}/rollout.npz"],
+            ["python", "-m", "pytest", folder.as_posix()],
+        ):
+            console.say(f"  {shlex.join(command)}")
+        return 0
+
+
+def check_robot_name(name: str) -> None:
+    """Raise InputError unless a new module can have this name."""
+    from lqrsim.errors import excerpt
+
+    wanted = "lower-case letters, digits and underscores, beginning with a letter, such as my_robot"
+    plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
+    if not plain or keyword.iskeyword(name):
+        raise ls.InputError(f"name: got {excerpt(name)}, want {wanted}")
+    reserved = RESERVED | {word.lower() for word in (*dir(builtins), *keyword.kwlist)}
+    if name in reserved:
+        raise ls.InputError(f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another")
+    spec = importlib.util.find_spec(name)
+    if spec is not None and spec.origin is not None:  # a folder without modules has no origin
+        raise ls.InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")
+
+
+def _named(text: str, name: str) -> str:
+    return text.replace(TEMPLATE, name).replace(CLASS, "".join(part.capitalize() for part in name.split("_")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +198,7 @@ class Solve:
             raise
         solution = replace(solved, scenario=reference)
         console.save(solution, folder / "solution.npz")
-        console.result(solution=as_json.of_solution(solution))
+        console.result(solution=console.of_solution(solution))
         if self.figure is not None:
             _plot_policy(scenario.with_duration_of(solution), solution, self.figure)
         return 0 if solution.success else 1
@@ -247,7 +327,7 @@ class Simulate:
         console.save(rollout, folder / "rollout.npz")
         console.say(rollout.tally())
         if console.wants_result():
-            run = as_json.of_rollout(rollout, scenario.problem)
+            run = console.of_rollout(rollout, scenario.problem)
             console.result(run=run, violations=violations, tube_leaves_out=remark)
         return 0
 
@@ -388,7 +468,7 @@ class Demo:
                 wanted = f"want one of them: {self.out / folder_name(scenario)} is the folder of both"
                 raise ls.InputError(f"--robots: got {other} and {reference}, {wanted}")
         rows, failures, misses = [TABLE], list[str](), list[str]()
-        results = list[as_json.Object]()
+        results = list[console.Object]()
         for reference, scenario in scenarios.items():
             folder = self.out / folder_name(scenario)
             console.say(f"\n== {reference}: {scenario.summary}")
@@ -423,8 +503,8 @@ class Demo:
                 with console.progress("rendering", "frame") as progress:
                     console.wrote(ls.render(run, folder / "video.mp4", progress=progress, **options))
             if console.wants_result():
-                shown = {name: as_json.of_rollout(run, scenario.problem) for name, run in runs.items()}
-                results.append({"solution": as_json.of_solution(solution), "runs": shown})
+                shown = {name: console.of_rollout(run, scenario.problem) for name, run in runs.items()}
+                results.append({"solution": console.of_solution(solution), "runs": shown})
         console.say("\n" + "\n".join(rows))
         for line in [*misses, *(f"FAILED {failure}" for failure in failures)]:
             console.say(line)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, Suppress, arg
 
 import lqrsim as ls
-from lqrsim.commands import as_json, console
+from lqrsim.commands import console
 from lqrsim.commands.options import Folder, Json, PolicyName, SetupOptions, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Stress(SetupOptions):
         console.wrote(folder)
         console.say(f"\nnext:\n  {results.command_of('report')}")
         if console.wants_result():
-            console.result(campaign=as_json.of_campaign(results))
+            console.result(campaign=console.of_campaign(results))
         return 1 if any(ends["error"] for _, ends, _ in results.cell_successes()) else 0
 
 
@@ -120,7 +120,7 @@ class Replay:
             console.say("identical to the table")
         console.save(rollout, self.out)
         if console.wants_result():
-            run = as_json.of_rollout(rollout, results.trials.scenario.problem)
+            run = console.of_rollout(rollout, results.trials.scenario.problem)
             console.result(cell=cell, run=run, differences=different)
         return 1 if different else 0
 
@@ -157,7 +157,7 @@ class Report:
                 ls.report(results, **stated(self, ls.report, out=path, progress=progress))
         console.wrote(path)
         if console.wants_result():
-            console.result(campaign=as_json.of_campaign(results))
+            console.result(campaign=console.of_campaign(results))
         return 0
 
 
@@ -190,7 +190,7 @@ class Compare:
         console.say(str(table))
         if self.out is not None:
             console.wrote(table.save(self.out))
-        console.result(cells=as_json.rows_of(table.columns), notes=table.notes)
+        console.result(cells=console.rows_of(table.columns), notes=table.notes)
         return 0
 
 
@@ -421,7 +421,7 @@ class FunnelCommand(StudyOptions):
 
         def write(result: "Funnel") -> int:
             console.say(result.summary())
-            console.result(funnel=as_json.of_funnel(result))
+            console.result(funnel=console.of_funnel(result))
             console.save(result, folder / "funnel.npz")
             if space.position and set(space.position) <= set(result.chosen):
                 world, radius = scenario.scene.world, scenario.robot.shape.get("radius", 0.0)

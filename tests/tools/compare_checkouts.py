@@ -28,7 +28,7 @@ import numpy as np
 import tyro
 
 import lqrsim as ls
-from lqrsim.commands.as_json import text_of
+from lqrsim.commands.console import text_of
 from lqrsim.versions import versions
 
 
