@@ -284,6 +284,8 @@ def test_a_funnel_and_the_cost(folder: Path, rollout: ls.Rollout, tmp_path: Path
         (["--trial", "99"], "trial: got 99, want one of 0 to"),
         (["--trial"], "trial: got none, want 1 to"),
         (["--overlays", "cost_tube"], "solution: got None with the overlay cost_tube"),
+        (["--solution", "a", "b", "--overlays", "cost_tube"], "error: --solution: got 2 with run.html, want one"),
+        (["--funnel", "a", "b", "--overlays", "funnel"], "error: --funnel: got 2 with run.html, want one"),
     ],
 )
 def test_wrong_options_are_refused(

@@ -155,7 +155,7 @@ def test_a_funnel(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     np.testing.assert_allclose(sizes, 0.25 * (1 - nearest[:, None] / 200) * np.ones(3), rtol=0.02)
     capsys.readouterr()
     assert main(["render", str(run), "--out", str(path), "--funnel", str(kept), str(kept)]) == 2
-    assert "funnel: got 2 with run.rrd, want one" in capsys.readouterr().err
+    assert "error: --funnel: got 2 with run.rrd, want one" in capsys.readouterr().err
 
 
 def test_every_shape_is_drawn(run: Path, tmp_path: Path) -> None:
@@ -200,8 +200,8 @@ def test_without_the_package_it_says_what_to_install(
     [
         (["--fps", "5"], "--fps: got 5 with run.rrd, want it with a video or a still"),
         (["--overlays", "plan"], "--overlays: got plan with run.rrd, want it with a video or a still"),
-        (["--trial", "0", "1"], "trial: got 2 with run.rrd, want one"),
-        (["--trial"], "trial: got 0 with run.rrd, want one"),
+        (["--trial", "0", "1"], "--trial: got 2 with run.rrd, want one"),
+        (["--trial"], "--trial: got 0 with run.rrd, want one"),
     ],
 )
 def test_what_the_viewer_decides_is_refused(

@@ -108,10 +108,11 @@ class Render:
         # Whoever opens such a file chooses the camera and the time.
         accepted = ["rollouts", "out", "trial", "funnel", *(["overlays", "solution"] if kind == ".html" else [])]
         refuse(self, vars(self).keys() - accepted, f"with {out.name}, want it with a video or a still")
-        single = ["rollouts", "solution", "funnel"] if kind == ".html" else ["rollouts", "funnel", "trial"]
-        for name in single:
-            if (given := getattr(self, name)) != getattr(Render, name, None) and len(given) != 1:
-                raise ls.InputError(f"{name}: got {len(given)} with {out.name}, want one")
+        single = {"ROLLOUT": self.rollouts, "--funnel": self.funnel or None}
+        single |= {"--solution": self.solution or None} if kind == ".html" else {"--trial": self.trial}
+        for option, given in single.items():
+            if given is not None and len(given) != 1:
+                raise ls.InputError(f"{option}: got {len(given)} with {out.name}, want one")
 
 
 def _one_or_all(items: Sequence[Any]) -> Any:
