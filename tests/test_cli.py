@@ -381,11 +381,11 @@ def test_bad_input_is_one_line(
 def test_what_is_done_quickly_is_not_talked_about(capsys: pytest.CaptureFixture[str]) -> None:
     """Only what is resumed says at once how much is done: that has taken somebody's time before."""
     for total in (1, 2, 150):
-        with console.progress("simulating", "step") as progress:
+        with console.Progress("simulating", "step") as progress:
             for done in range(1, total + 1):
                 progress(done, total)
     assert capsys.readouterr() == ("", "")
-    with console.progress("stressing", "trial") as progress:
+    with console.Progress("stressing", "trial") as progress:
         for done in (40, 60, 100):
             progress(done, 100)
     assert capsys.readouterr() == ("40 of 100 trials are done, 60 to go\n", "")
@@ -398,7 +398,7 @@ def test_lines_say_how_far_it_is_what_is_found_and_how_long_it_takes(
     """Where there is no terminal, at most one in ten seconds, by a clock on which each part takes as long."""
     now, times = 0.0, list[float]()
     monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: now))
-    with console.progress("looking", "knot") as progress:
+    with console.Progress("looking", "knot") as progress:
         for done in range(total + 1):
             progress(done, total, f"level {done}")
             for line in capsys.readouterr().out.splitlines():
@@ -420,7 +420,7 @@ def test_a_bar_leaves_no_semaphore_where_a_process_ends_at_once() -> None:
 import multiprocessing, os
 multiprocessing.set_start_method("spawn")
 from lqrsim.commands import console
-with console.progress("simulating", "step") as progress:
+with console.Progress("simulating", "step") as progress:
     progress(1, 3)
     console.say("above the bar")
     os._exit(0)

@@ -280,8 +280,8 @@ def bar(**options: Any) -> "tqdm[Any]":
     return tqdm(**options)
 
 
-class Progress:
-    """The progress of some work: a bar on a terminal, elsewhere occasional lines. Call it with the amount done.
+class Progress(contextlib.AbstractContextManager["Progress"]):
+    """The progress of a block: a bar on a terminal, elsewhere occasional lines. Call it with the amount done.
 
     The first call starts the clock: preparations before it, such as compiling, do not count.
     """
@@ -314,11 +314,6 @@ class Progress:
             line += f", {rate:.3g} {self._unit}s/s, {self._bar.format_interval((total - done) / rate)} left"
         say(line + (f"; {status}" if status else ""))
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.close()
-
-
-def progress(what: str, unit: str) -> contextlib.AbstractContextManager[Progress]:
-    """Progress during a block."""
-    return contextlib.closing(Progress(what, unit))

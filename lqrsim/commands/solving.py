@@ -302,7 +302,7 @@ class Simulate:
         disturbances = [*(disturbance.scaled(self.strength) for disturbance in named), *self._single_disturbances()]
         plant, goal = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
         options = stated(self, ls.simulate, controller=controller, disturbances=disturbances, **goal)
-        with console.progress("simulating", "step") as progress:
+        with console.Progress("simulating", "step") as progress:
             rollout = ls.simulate(plant, solution, progress=progress, **options)
         console.say(rollout.summary())
         if self.controller in DESIGNED and self.design_disturbances is None:
@@ -483,7 +483,7 @@ class Demo:
             runs = dict[str, ls.Rollout]()
             for name, disturbances in {"undisturbed": (), "disturbed": scenario.disturbances}.items():
                 options = {"disturbances": disturbances, "seed": self.seed, **scenario.near_enough()}
-                with console.progress("simulating", "step") as progress:
+                with console.Progress("simulating", "step") as progress:
                     rollout = ls.simulate(scenario.plant(), plan, controller=law, progress=progress, **options)
                 console.say(rollout.summary())
                 runs[name] = tube.added_to(rollout) if tube is not None and name == "disturbed" else rollout
@@ -500,7 +500,7 @@ class Demo:
             if video:  # with the calibrated panes that show the robot's position
                 run, (quality, fps) = runs["disturbed"], ("draft", 5) if self.quick else ("standard", 30)
                 options = {"insets": cameras.measuring(run.plane), "quality": quality, "fps": fps}
-                with console.progress("rendering", "frame") as progress:
+                with console.Progress("rendering", "frame") as progress:
                     console.wrote(ls.render(run, folder / "video.mp4", progress=progress, **options))
             if console.wants_result():
                 shown = {name: console.of_rollout(run, scenario.problem) for name, run in runs.items()}

@@ -64,7 +64,7 @@ class Stress(SetupOptions):
             options = stated(self, ls.stress.Campaign)
             options = {name: value for name, value in options.items() if not hasattr(setup, name)}
             campaign = ls.stress.Campaign.of_sets(setup, self.sweep, **options)
-        with console.progress("stressing", "trial") as progress:
+        with console.Progress("stressing", "trial") as progress:
             options = stated(self, ls.stress.run_campaign, progress=progress)
             results = ls.stress.run_campaign(campaign, folder, **options)
         console.say(results.summary())
@@ -153,7 +153,7 @@ class Report:
         if is_table:
             results.rates().save(path)
         else:
-            with console.progress("reporting", "part") as progress:
+            with console.Progress("reporting", "part") as progress:
                 ls.report(results, **stated(self, ls.report, out=path, progress=progress))
         console.wrote(path)
         if console.wants_result():
@@ -237,7 +237,7 @@ class FailureOptions(StudyOptions):
             return 0 if getattr(result, "success", True) else 1
 
         try:
-            with console.keeping(write), console.progress(*self.SEARCH) as progress:
+            with console.keeping(write), console.Progress(*self.SEARCH) as progress:
                 result = self._search(problem, report=console.say, progress=progress)
         except ls.stress.NoFailure as none:
             return _say_none(none)
@@ -357,7 +357,7 @@ class Certify:
         certificate = ls.load(self.file, ls.stress.FailureCertificate)
         console.say(certificate.summary())
         try:
-            with console.progress("splitting", "repetition") as progress:
+            with console.Progress("splitting", "repetition") as progress:
                 recheck = ls.stress.certify(certificate, **stated(self, ls.stress.certify, progress=progress))
         except ls.stress.NoFailure as none:
             return _say_none(none)
@@ -428,6 +428,6 @@ class FunnelCommand(StudyOptions):
                 console.wrote(ls.view.plot_funnel(result, folder / "funnel.png", world=world, radius=radius))
             return 0 if result.levels.any() else 1
 
-        with console.keeping(write), console.progress("looking", "knot") as progress:
+        with console.keeping(write), console.Progress("looking", "knot") as progress:
             funnel = ls.funnel(**options, progress=progress)
         return write(funnel)

@@ -88,7 +88,7 @@ class Render:
             case ".rrd":
                 exports.write_rerun(drawn, out, trial=rows, funnel=funnel)
             case _:
-                with console.progress("rendering", "frame") as progress:
+                with console.Progress("rendering", "frame") as progress:
                     options = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
                     ls.render(drawn, out, **stated(self, ls.render, **options, progress=progress))
         console.wrote(out)
@@ -285,7 +285,7 @@ class Verify:
             solution = ls.load(self.solution or beside, ls.Solution)
             # The solution file next to a run may belong to another run; a given solution is used in any case.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
-        with console.progress("verifying", "frame") as progress:
+        with console.Progress("verifying", "frame") as progress:
             options: dict[str, Any] = {"solution": solution, "progress": progress}
             if is_run:
                 verification = ls.verify_run(rollout, self.trial or 0, **options)

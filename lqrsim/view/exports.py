@@ -201,6 +201,10 @@ def _of_trial(arrays: _Arrays, overlays: Overlays, geoms: Sequence[DrawnGeom]) -
     for time in recorded.frame_times:
         recorded.pose(data, float(time))
         poses.append(np.hstack([data.xpos[bodies], data.xquat[bodies]]))
+    table = np.array(poses)
+    turns = table[:, :, 3:]  # each quaternion on the side of the one before
+    signs = np.where(np.sum(turns[1:] * turns[:-1], axis=2) < 0, -1.0, 1.0)
+    turns[1:] *= np.cumprod(signs, axis=0)[:, :, None]
     places = [
         [*model.geom_pos[geom.number], *model.geom_quat[geom.number]]
         if geom.moves
@@ -216,7 +220,7 @@ def _of_trial(arrays: _Arrays, overlays: Overlays, geoms: Sequence[DrawnGeom]) -
         "readings": [" · ".join(overlays.readings(float(time))) for time in run.times],
         "robot": arrays.rounded(recorded.driven(run.times)),
         "times": arrays.exact(recorded.frame_times, "float32"),
-        "poses": arrays.rounded(_without_jumps(np.array(poses))),
+        "poses": arrays.rounded(table),
         "places": arrays.exact(places, "float32"),
         "bodies": [int(np.searchsorted(bodies, model.geom_bodyid[geom.number])) for geom in geoms],
     }
@@ -245,14 +249,6 @@ def _view(recorded: RecordedTrial, aspect: float) -> dict[str, Any]:
     vectors = {"eye": camera.pos, "forward": camera.forward, "up": camera.up}
     field = 2 * float(np.arctan2(camera.frustum_top, camera.frustum_near))
     return {"aspect": aspect, "field": field} | {name: vector.tolist() for name, vector in vectors.items()}
-
-
-def _without_jumps(poses: Array) -> Array:
-    """Positions and quaternions (k, bodies, 7) with each quaternion on the side of the one before."""
-    turns = poses[:, :, 3:]
-    signs = np.where(np.sum(turns[1:] * turns[:-1], axis=2) < 0, -1.0, 1.0)
-    turns[1:] *= np.cumprod(signs, axis=0)[:, :, None]
-    return poses
 
 
 TIMELINE = "time"

@@ -151,16 +151,38 @@ class Caption:
 
 
 class Legend:
-    """The legend of all runs, a strip below them; its height in pixels is 0 if it is empty."""
+    """The legend of all runs, a strip below them, in rows; its height in pixels is 0 if it is empty.
+
+    The colour None is the map of the tracking error.
+    """
 
     def __init__(self, overlays: Sequence[Overlays], size: tuple[int, int]) -> None:
-        entries = legend_entries(overlays)
-        letter_height = max(round(0.8 * _letter_height(*size)), 8)
-        self.tile = legend_tile(tuple(entries.items()), letter_height, size[0]) if entries else None
-        self.height = 0 if self.tile is None else self.tile.shape[0] + self.tile.shape[0] % 2
+        height, rows = max(round(0.8 * _letter_height(*size)), 8), list[list[tuple[float, str, Colour | None]]]()
+        font, swatch, space = _font(height), round(2.5 * height), 0.6 * height
+        x = widest = space
+        for name, colour in legend_entries(overlays).items():
+            needed = font.getlength(name) + swatch + 3 * space
+            if not rows or x + needed > size[0]:
+                rows.append([])
+                x = space
+            rows[-1].append((x, name, colour))
+            x += needed
+            widest = max(widest, x)
+        tile = Image.new("RGBA", (round(widest), round((1.6 * len(rows) + 0.6) * height)), PAPER)
+        draw = ImageDraw.Draw(tile)
+        for number, row in enumerate(rows):
+            top = (1.6 * number + 0.45) * height
+            for left, name, colour in row:
+                for column in range(swatch):
+                    shade = error_colours(np.array([column / swatch]))[0, :3] if colour is None else colour
+                    place = (left + column, top + 0.45 * height, left + column, top + 0.95 * height)
+                    draw.line(place, fill=tuple(round(255 * part) for part in shade))
+                draw.text((left + swatch + space, top), name, font=font, fill=INK)
+        self.tile = np.asarray(tile)
+        self.height = self.tile.shape[0] + self.tile.shape[0] % 2 if rows else 0
 
     def draw(self, image: Pixels) -> None:
-        if self.tile is not None:
+        if self.height:
             image[-self.height :] = 255
             blend(image[-self.tile.shape[0] :], self.tile, left=0, top=0)
 
@@ -182,33 +204,6 @@ def text_tile(lines: tuple[str, ...], height: int, *, width: int, bold: bool = T
     draw = ImageDraw.Draw(tile)
     for number, (font, line) in enumerate(zip(fonts, lines, strict=True)):
         draw.text((0.7 * height, (0.4 + 1.5 * number) * height), line, font=font, fill=INK)
-    return np.asarray(tile)
-
-
-@lru_cache(maxsize=16)
-def legend_tile(entries: tuple[tuple[str, Colour | None], ...], height: int, width: int) -> Pixels:
-    """A legend (h, w, 4) in rows of at most `width` pixels; the colour None is the map of the tracking error."""
-    font, swatch, space = _font(height), round(2.5 * height), 0.6 * height
-    rows: list[list[tuple[float, str, Colour | None]]] = [[]]
-    x = widest = space
-    for name, colour in entries:
-        needed = font.getlength(name) + swatch + 3 * space
-        if rows[-1] and x + needed > width:
-            rows.append([])
-            x = space
-        rows[-1].append((x, name, colour))
-        x += needed
-        widest = max(widest, x)
-    tile = Image.new("RGBA", (round(widest), round((1.6 * len(rows) + 0.6) * height)), PAPER)
-    draw = ImageDraw.Draw(tile)
-    for number, row in enumerate(rows):
-        top = (1.6 * number + 0.45) * height
-        for left, name, colour in row:
-            for column in range(swatch):
-                shade = error_colours(np.array([column / swatch]))[0, :3] if colour is None else colour
-                place = (left + column, top + 0.45 * height, left + column, top + 0.95 * height)
-                draw.line(place, fill=tuple(round(255 * part) for part in shade))
-            draw.text((left + swatch + space, top), name, font=font, fill=INK)
     return np.asarray(tile)
 
 

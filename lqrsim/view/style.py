@@ -94,17 +94,12 @@ def figure(
         drawn.draw_without_rendering()
         for axes in drawn.axes:
             _keep_apart(axes)
-        _fix_layout(drawn)
+        drawn.draw_without_rendering()
+        drawn.set_layout_engine("none")
+        for axes in drawn.axes:  # rounded: the layout engine's solver orders variables by address, and so its rounding
+            axes.set_position(Bbox(axes.get_position(original=True).get_points().round(9)))
         for suffix, file in unfinished:
             drawn.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
-
-
-def _fix_layout(drawn: Figure) -> None:
-    """Round the places of axes: the layout engine's solver orders variables by address, and with them its rounding."""
-    drawn.draw_without_rendering()
-    drawn.set_layout_engine("none")
-    for axes in drawn.axes:
-        axes.set_position(Bbox(axes.get_position(original=True).get_points().round(9)))
 
 
 class Panel(NamedTuple):
