@@ -11,8 +11,8 @@ from sampling import is_short
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.commands.options import ControllerName, PolicyName
-from lqrsim.commands.stressing import CampaignPolicyName
+from lqrsim.commands.options import ControllerName
+from lqrsim.commands.stressing import CampaignPolicyName, PolicyName
 from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
 from lqrsim.reports.page import COLOURS, LINES, MARKERS

@@ -4,13 +4,13 @@ import ast
 import inspect
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 import lqrsim as ls
@@ -115,7 +115,6 @@ def _parsed(file: str) -> ast.Module:
     return ast.parse((Path(__file__).parents[1] / file).read_text(encoding="utf-8"))
 
 
-PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
 DesignSet = Annotated[
     str | None,
@@ -143,15 +142,3 @@ def refuse(command: Any, names: Collection[str], why: str) -> None:
             got = f"{value:g}" if type(value) is float else value
             got = " ".join(map(str, value)) if isinstance(value, (tuple, list)) else got
             raise ls.InputError(f"--{field.name.replace('_', '-')}: got {got} {why}")
-
-
-@dataclass(frozen=True, kw_only=True)
-@options_of("stress/study.py", "Setup", goal_radius="METRES", goal_tolerance="SHARE", seed="INT")
-class SetupOptions:
-    """The options that state a `Setup`, for commands that run a scenario under disturbances."""
-
-    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
-    """As in `lqrsim solve`."""
-    design_disturbances: DesignSet = None
-    solution: SolutionFile = None
-    json: Json = False

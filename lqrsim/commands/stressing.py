@@ -9,14 +9,27 @@ from tyro.conf import Positional, Suppress, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import Folder, Json, PolicyName, SetupOptions, optional, options_of, refuse, stated
+from lqrsim.commands.options import DesignSet, Folder, Json, SolutionFile, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
     from lqrsim.results.certified import Funnel
     from lqrsim.stress.failure_search import RareFailures, SmallestFailure
     from lqrsim.stress.safer_plans import HardenedPlan
 
+PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
+
+
+@dataclass(frozen=True, kw_only=True)
+@options_of("stress/study.py", "Setup", goal_radius="METRES", goal_tolerance="SHARE", seed="INT")
+class SetupOptions:
+    """The options that state a `Setup`, for commands that run a scenario under disturbances."""
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    """As in `lqrsim solve`."""
+    design_disturbances: DesignSet = None
+    solution: SolutionFile = None
+    json: Json = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,7 +74,14 @@ def render_html(
     """
     path = check_path("path", path, suffixes=(".html",))
     check_drawn(overlays, solution=solution, funnel=funnel)
-    rows, arrays = _rows(rollout, trial), _Arrays()
+    if trial is None:
+        states, frames = (np.any(np.isfinite(part).all(axis=2), axis=1) for part in (rollout.states, rollout.frames))
+        rows = np.flatnonzero(states & frames).tolist()
+        if not rows:
+            raise InputError("rollout: got no trial with a finite state, want one that can be drawn")
+    else:
+        rows = rows_of(trial, rollout.trials)
+    arrays = _Arrays()
     scale = common_scale(RecordedTrial(rollout, row) for row in rows)
 
     def overlays_of(row: int) -> Overlays:  # one at a time, as each has a model of its own, which may be large
@@ -93,16 +100,6 @@ def render_html(
     with replacing(path) as unfinished:
         unfinished.write_text(page, encoding="utf-8")
     return path
-
-
-def _rows(rollout: Rollout, trial: int | Sequence[int] | None) -> list[Any]:
-    if trial is None:
-        states, frames = (np.any(np.isfinite(part).all(axis=2), axis=1) for part in (rollout.states, rollout.frames))
-        rows = np.flatnonzero(states & frames).tolist()
-        if not rows:
-            raise InputError("rollout: got no trial with a finite state, want one that can be drawn")
-        return rows
-    return rows_of(trial, rollout.trials)
 
 
 class _Arrays:

@@ -34,19 +34,7 @@ from lqrsim.scenes.world import Obstacle, World
 from lqrsim.view import style as styles
 from lqrsim.view.overlays import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.recorded_trial import drawn_geoms, model_of, robot_body
-from lqrsim.view.style import (
-    AROUND,
-    LAYOUTS,
-    LIMIT,
-    MARGIN,
-    PLAN,
-    RUNS,
-    SOLID,
-    Panel,
-    Style,
-    arrange,
-    legend_below,
-)
+from lqrsim.view.style import AROUND, LAYOUTS, LIMIT, MARGIN, PLAN, RUNS, SOLID, Panel, Style, arrange, legend_below
 
 EDGE = "#5b6470"
 OUTLINES = 24  # number of ellipses whose outlines are drawn
