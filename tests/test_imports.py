@@ -50,9 +50,9 @@ FLOORS_WITHIN = {
         ("rollout",),
     ),
     "codegen": (
-        ("disk_cache", "language", "llvm"),
+        ("disk_cache", "language"),
         ("sources",),
-        ("fingerprint", "jitted", "plain", "printer"),
+        ("fingerprint", "plain", "printer"),
         ("compiled_module", "symbolic"),
         ("user_functions",),
     ),

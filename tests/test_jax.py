@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
-from lqrsim.codegen.jax_steps import JaxSteps
+from lqrsim.codegen.user_functions import JaxSteps
 from lqrsim.errors import Array
 from lqrsim.problem.derivative_check import evaluate
 

@@ -27,9 +27,8 @@ from sampling import examples, is_short, rarely
 
 import lqrsim as ls
 from lqrsim import kernels
-from lqrsim.codegen.compiled_module import Call, Entry
+from lqrsim.codegen.compiled_module import Call, Entry, Loaded, object_code
 from lqrsim.codegen.language import Pointer, type_of
-from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, ScopedFunction, Source, source_of, text_source

@@ -24,9 +24,8 @@ from sampling import examples
 from scipy import special
 
 from lqrsim.codegen import language
-from lqrsim.codegen.compiled_module import CompiledModule, compilations
+from lqrsim.codegen.compiled_module import CompiledModule, compilations, object_code
 from lqrsim.codegen.language import SubsetError, type_of
-from lqrsim.codegen.llvm import object_code
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, text_source

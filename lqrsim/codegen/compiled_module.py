@@ -1,4 +1,4 @@
-"""Kernels as machine code, compiled when first used and cached on disk by content.
+"""Kernels as machine code, compiled by LLVM for this processor when first used, and cached on disk by content.
 
 Functions that Python calls are *entries*: they are compiled for the types of their arguments, which they get as one
 block of memory, a number or an address every 8 bytes. Functions that compiled code calls are C functions with the
@@ -7,10 +7,12 @@ signatures below, called by their addresses.
 
 import contextlib
 import ctypes
+import ctypes.util
 import functools
 import importlib
 import logging
 import operator
+import os
 import threading
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
@@ -22,7 +24,6 @@ import numpy as np
 from lqrsim import kernels
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.language import BOOL, FLOAT, INT, VECTOR, Group, Pointer, Pointers, Scalar, Type, scalars, type_of
-from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, Source
 from lqrsim.errors import Array
@@ -34,9 +35,95 @@ logger = logging.getLogger("lqrsim")
 # Functions that were compiled in this process instead of loaded from disk.
 compilations: list[str] = []
 compiling = threading.RLock()
+_loading = threading.Lock()
 
 # Functions that take long to compile, for which a message is printed.
 LONG = ("smoother", "ilqr")
+
+
+# LLVM.
+
+
+@functools.cache
+def _binding() -> Any:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    # Where LLVM finds the C library's functions, those of its own intrinsics, too.
+    for library in ("ucrtbase", "msvcrt") if os.name == "nt" else (ctypes.util.find_library("m") or "libm.so.6",):
+        with contextlib.suppress(RuntimeError):
+            llvm.load_library_permanently(library)
+    return llvm
+
+
+def _machine(level: int = 3) -> Any:
+    llvm = _binding()
+    _, name, features = instruction_set()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(
+        cpu=name, features=features, opt=level, jit=True, reloc="default", codemodel="jitdefault"
+    )
+
+
+def object_code(text: str, level: int = 3) -> bytes:
+    """Compile IR to an object file, optimized as by -O0 to -O3."""
+    return _emitted(_binding().parse_assembly(text), level)
+
+
+def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[str]]:
+    """An object file that exports only the function `name` of the IR, as `symbol`, and the names that it needs."""
+    module = _binding().parse_assembly(text)
+    needed = []
+    for part in (*module.functions, *module.global_variables):
+        if part.is_declaration:
+            needed += [] if part.name.startswith("llvm.") else [part.name]
+        elif part.name == name:
+            part.name = symbol
+        else:
+            part.linkage = "internal"
+    return _emitted(module), needed
+
+
+def has_symbols(names: list[str]) -> bool:
+    """Whether LLVM finds functions or variables of all these names."""
+    llvm = _binding()
+    return all(llvm.address_of_symbol(name) for name in names)
+
+
+def _emitted(module: Any, level: int = 3) -> bytes:
+    llvm, machine = _binding(), _machine(level)
+    module.triple, module.data_layout = llvm.get_process_triple(), str(machine.target_data)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=level)
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = True
+    passes = llvm.create_pass_builder(machine, options)
+    passes.getModulePassManager().run(module, passes)
+    return machine.emit_object(module)
+
+
+class Loaded:
+    """An object file in memory; keep it alive as long as it is in use.
+
+    Raises RuntimeError if the contents are no object file for this processor, or a function is not found.
+    """
+
+    def __init__(self, contents: bytes) -> None:
+        llvm = _binding()
+        with _loading:
+            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+            self._engine.add_object_file(llvm.ObjectFileRef.from_data(contents))
+            self._engine.finalize_object()
+
+    def address(self, symbol: str) -> int:
+        """The address of a function. Raises RuntimeError if no function has this name."""
+        address = self._engine.get_function_address(symbol)
+        if not address:
+            raise RuntimeError(f"the object file has no {symbol}")
+        return address
+
+
+# Modules of kernels.
 
 
 class CompiledModule:
@@ -265,7 +352,7 @@ def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[list[Sca
 @functools.cache
 def _toolchain() -> str:
     """A hash of all that machine code depends on, except the source: all kernels, and the compiler's own modules."""
-    modules = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
+    modules = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "compiled_module"))
     paths = [Path(str(importlib.import_module(name).__file__)) for name in modules]
     paths += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))
     texts = (path.read_bytes() for path in paths)

@@ -5,15 +5,20 @@ called back through Python, at microseconds per call. A numba function is compil
 if it has a fingerprint: numba compiles it once, to LLVM IR. An object file of this IR is cached. In the file everything
 except the function itself is internal: numba numbers its functions within a process, so files of two processes would
 contain different functions of the same name.
+
+A function of JAX is jitted, with derivatives by automatic differentiation. All is computed on the processor and in
+double precision, whatever the user's settings are. Whole Runge-Kutta steps of it, one or all of a plan, are a function,
+too.
 """
 
 import collections
+import contextlib
 import ctypes
 import inspect
 import logging
 import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property, partial
 from importlib.metadata import version
@@ -22,12 +27,11 @@ from typing import Any
 import numpy as np
 
 from lqrsim.codegen import disk_cache as disk
-from lqrsim.codegen.compiled_module import compilations, compiling
+from lqrsim.codegen.compiled_module import Loaded, compilations, compiling, has_symbols, object_code_of_one
 from lqrsim.codegen.fingerprint import fingerprint, identity, note_helpers, stale
-from lqrsim.codegen.jitted import Jitted, JittedDerivatives
-from lqrsim.codegen.llvm import Loaded, has_symbols, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
 from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
+from lqrsim.kernels.declarations import HESSIANS, JACOBIANS, STATES
 from lqrsim.machine import instruction_set
 
 logger = logging.getLogger("lqrsim")
@@ -346,6 +350,179 @@ def c_function(callback: Callable[..., None], *kinds: Any) -> tuple[Any, int]:
     """A C function of arguments of these kinds that calls back: the object to keep alive, and its address."""
     held = ctypes.CFUNCTYPE(None, *kinds)(callback)
     return held, ctypes.cast(held, ctypes.c_void_p).value or 0
+
+
+# Functions of JAX.
+
+
+@contextlib.contextmanager
+def in_double_precision() -> Iterator[None]:
+    """The context of all calls of JAX."""
+    import jax
+
+    with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        try:
+            yield
+        except jax.errors.JAXTypeError as error:  # many lines, with a link
+            got = f"an operation that JAX cannot trace ({str(error).splitlines()[0].rstrip('.')})"
+            raise InputError(f"got {got}, want those of jax.numpy, and jnp.where for branches") from None
+
+
+class Jitted:
+    """`f(x, u, p)` or `f(x, p)` of NumPy arrays, which returns an array; compiled at its first call.
+
+    The user's function, of JAX arrays, is `py_func`, as it is in numba.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.py_func = function
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is compiled, which cannot be pickled."""
+        return {name: value for name, value in vars(self).items() if name != "_jitted"}
+
+    def __call__(self, *given: Any) -> Any:
+        with in_double_precision():
+            return np.asarray(self._jitted(*given))
+
+    def traced(self, *given: Any) -> Any:
+        import jax.numpy as jnp
+
+        return jnp.asarray(self.py_func(*given))
+
+    @cached_property
+    def _jitted(self) -> Callable[..., Any]:
+        import jax
+
+        return jax.jit(self.traced)
+
+
+class JittedDerivatives(Jitted):
+    """`derivatives(x, u, p, a, b)`, or without `u` or `b`, which writes to one or two arrays of given shapes.
+
+    They are the Jacobian, with its columns for x and for u apart; or, if the first has the size of (x, u), the gradient
+    and the Hessian.
+    """
+
+    def __init__(self, function: Callable[..., Any], shapes: tuple[tuple[int, ...], ...]) -> None:
+        super().__init__(function)
+        self.shapes = shapes
+
+    def __call__(self, *given: Any) -> Any:
+        count = len(self.shapes)
+        with in_double_precision():
+            for array, values in zip(given[-count:], self._jitted(*given[:-count]), strict=True):
+                array[...] = values
+
+    def traced(self, *given: Any) -> tuple[Any, ...]:
+        import jax
+        import jax.numpy as jnp
+
+        *parts, p = given
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+
+        def joined(z: Any) -> Any:
+            return jnp.ravel(super(JittedDerivatives, self).traced(*jnp.split(z, ends), p)).astype(float)
+
+        z = jnp.concatenate(parts)
+        if len(self.shapes[0]) == 1:
+            value = lambda z: joined(z)[0]  # noqa: E731
+            return jax.grad(value)(z), jax.hessian(value)(z)
+        columns = jnp.split(jax.jacfwd(joined)(z), ends, axis=1)
+        return tuple(part.reshape(shape) for part, shape in zip(columns, self.shapes, strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JaxSteps(UserFunction):
+    """Runge-Kutta steps of the rates `function`, which is `Jitted`, from as many states as compiled code gives."""
+
+    _jitted: dict[int, Callable[[Array], Any]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def plain_call(self, parameters: Mapping[str, float]) -> Callable[..., None]:
+        numbers = np.array(list(parameters.values()))
+
+        def run(what: int, count: int, skipped: int, x: Array, u: Array, p: Array, h: float, *more: Array) -> None:
+            pairs = zip((x, u, *more[: what + 2]), self._sizes, strict=False)
+            x, u, weights, *outputs = (array.reshape(-1, size) for array, size in pairs)
+            rows = slice(skipped, skipped + count)
+            self._write(what, x[:count], u[:count], numbers, h, weights[rows], [output[:count] for output in outputs])
+
+        return run
+
+    @property
+    def _sizes(self) -> tuple[int, ...]:
+        """The sizes of a row of x, u, weights, and each output."""
+        n, w = self.states, self.states + self.controls
+        return n, self.controls, n, n, n * w, w * w
+
+    @cached_property
+    def called_back(self) -> tuple[Any, int]:
+        n, m, end = self.states, self.controls, self.offset + len(self.parameters)
+
+        def callback(
+            what: int, count: int, skipped: int, x: int, u: int, data: int, h: float, weights: int, *outputs: int
+        ) -> None:  # fmt: skip
+            def rows(address: int, size: int, first: int = 0) -> Array:
+                return view(address + 8 * first * size, count * size).reshape(count, size)
+
+            arrays = list(map(rows, outputs[: what + 1], self._sizes[3:]))
+            arguments = rows(x, n), rows(u, m), view(data, end)[self.offset :], h
+            w = rows(weights, n, skipped) if what == HESSIANS else None
+            self._guarded(lambda: self._write(what, *arguments, w, arrays), arrays)
+
+        pointer = ctypes.c_void_p
+        return c_function(callback, *[ctypes.c_int64] * 3, *[pointer] * 3, ctypes.c_double, *[pointer] * 4)
+
+    def _write(
+        self, what: int, x: Array, u: Array, p: Array, h: float, weights: Array | None, outputs: list[Array]
+    ) -> None:
+        """Write states (K, n) and Jacobians (K, n w), and add Hessians (K, w w), or do the first of this."""
+        n, w, last = self.states, self.states + self.controls, len(p) + 1
+        # A single array each way: several take twice as long to transfer.
+        packed = np.empty((len(x), w + last + (n if what == HESSIANS else 0)))
+        packed[:, :n], packed[:, n:w], packed[:, w], packed[:, w + 1 : w + last] = x, u, h, p
+        packed[:, w + last :] = weights if what == HESSIANS else 0.0
+        with in_double_precision():
+            if what not in self._jitted:
+                self._jitted[what] = self._compiled(what)
+            outcome = np.asarray(self._jitted[what](packed))
+        outputs[0][...] = outcome[:, :n]
+        if what >= JACOBIANS:
+            outputs[1][...] = outcome[:, n : n + n * w]
+        if what == HESSIANS:
+            outputs[2][...] += outcome[:, n + n * w :]
+
+    def _compiled(self, what: int) -> Callable[[Array], Any]:
+        import jax
+        import jax.numpy as jnp
+
+        assert isinstance(self.function, Jitted)
+        n, w, last = self.states, self.states + self.controls, len(self.parameters) + 1
+        rate, parameters = jax.jit(self.function.traced), parameters_class(self.parameters)  # traced once for 4 stages
+
+        def step(z: Any, h: Any, p: Any) -> Any:
+            x, u = z[:n], z[n:]
+            first = rate(x, u, p)
+            second = rate(x + 0.5 * h * first, u, p)
+            third = rate(x + 0.5 * h * second, u, p)
+            fourth = rate(x + h * third, u, p)
+            return x + h / 6 * (first + 2 * second + 2 * third + fourth)
+
+        def of_row(row: Any) -> Any:
+            z, h, numbers, weights = row[:w], row[w], row[w + 1 : w + last], row[w + last :]
+            p = parameters(*numbers)
+            if what == STATES:
+                return step(z, h, p)
+            jacobian, after = jax.jacfwd(lambda z: (step(z, h, p),) * 2, has_aux=True)(z)
+            results = [after, jacobian.ravel()]
+            if what == HESSIANS:
+                results.append(jax.hessian(lambda z: weights @ step(z, h, p))(z).ravel())
+            return jnp.concatenate(results)
+
+        return jax.jit(jax.vmap(of_row))
+
+
+# What a part of a problem has of its functions.
 
 
 def with_derivatives(

@@ -2,7 +2,7 @@
 
 The data of each function begin with its address and, if given, the address of its derivatives; its parameters follow.
 Outputs are NaN where the user's function does not write them. `differences.py` computes derivatives by differences.
-Of JAX, whole Runge-Kutta steps are a function, too, one or all of a plan at once: that of `codegen/jax_steps.py`.
+Of JAX, whole Runge-Kutta steps are a function, too, one or all of a plan at once: that of `codegen/user_functions.py`.
 """
 
 from math import nan

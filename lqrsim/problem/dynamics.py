@@ -14,10 +14,10 @@ from lqrsim.annotations import Count, Finite, Positive, checked
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.edge_pushing import Operations, hessian_of
-from lqrsim.codegen.jax_steps import JaxSteps
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import (
+    JaxSteps,
     UserFunction,
     check_derivative,
     interrupt_of,

@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from lqrsim.codegen.compiled_module import Call, Entry
+from lqrsim.codegen.compiled_module import Call, Entry, Loaded, object_code
 from lqrsim.codegen.language import type_of
-from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, ScopedFunction, text_source
 
