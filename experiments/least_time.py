@@ -20,7 +20,7 @@ from runner import FolderSettings, Result, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.problem.costs import CostSum
-from lqrsim.problem.obstacle_cost import ObstacleCost
+from lqrsim.problem.obstacles import ObstacleCost
 
 
 @dataclass(frozen=True, kw_only=True)

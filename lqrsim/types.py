@@ -6,7 +6,7 @@ from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.replanner import LiveReplanner, ReplanRecord
 from lqrsim.control.tubes import Tube
 from lqrsim.outlines import Box, Capsule
-from lqrsim.problem.collision_spheres import SphereCenters
+from lqrsim.problem.collision_shape import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.derivative_check import DerivativeCheck

@@ -10,7 +10,7 @@ from sampling import examples, rarely
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_approach import Approaches
+from lqrsim.scenes.contacts import Approaches
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import strategy
 

@@ -22,9 +22,8 @@ from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
-from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.mjcf import MjcfRobot
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenes.scene import load_scene, scene_from_xml
 from lqrsim.simulation.closed_loop import ClosedLoop, simulate

@@ -14,8 +14,8 @@ from sampling import examples, rarely
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.scenes.contact_modes import ContactModes, Switches
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics
+from lqrsim.scenes.contacts import ContactModes, Switches
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.contact_modes import (

@@ -40,8 +40,7 @@ from lqrsim.disturbances import (
     WheelRadiusMismatch,
 )
 from lqrsim.errors import InputError
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation import disturbances
 from lqrsim.simulation.closed_loop import simulate

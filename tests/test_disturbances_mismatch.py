@@ -9,8 +9,7 @@ import pytest
 from tracking import hover, track, weave
 
 from lqrsim.errors import InputError
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
 from lqrsim.scenes.scene import load_scene, scene_from_xml
 from lqrsim.simulation.closed_loop import ClosedLoop, simulate
 from lqrsim.simulation.disturbances import (

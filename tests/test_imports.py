@@ -58,18 +58,11 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics",),
-        ("collision_spheres", "noise", "residual"),
-        ("collision_shape",),
-        ("costs",),
+        ("costs", "noise"),
         ("constraints",),
-        (
-            "clearance",
-            "control_rate",
-            "formulas",
-            "obstacle_cost",
-            "quadratic_cost",
-            "state_bounds",
-        ),
+        ("mjcf_dynamics",),
+        ("collision_shape",),
+        ("control_rate", "formulas", "obstacles", "quadratic_cost", "sites", "state_bounds"),
         ("problem",),
         ("belief",),
     ),
@@ -88,7 +81,7 @@ FLOORS_WITHIN = {
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.
 ALLOWED = {
-    "mujoco": ("scenes", "robots", "simulation", "view", "verify"),
+    "mujoco": ("scenes", "problem", "robots", "simulation", "view", "verify"),
     "matplotlib": ("view", "reports"),
     "av": ("view", "verify"),
     "jax": ("codegen",),

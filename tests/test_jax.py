@@ -139,7 +139,7 @@ def test_costs_and_places_of_jax() -> None:
     still = ls.Dynamics(lambda x, u, p: [u[0], x[0]], **cart)
     balls = ls.CollisionSpheres(lambda x, p: [[x[0], x[1]], [x[0] + jnp.sin(x[1]), 1.0]], [0.1, 0.2], level="jax")
     np.testing.assert_allclose(balls.centres(still, [0.3, 0.5])[:, :2], [[0.3, 0.5], [0.3 + np.sin(0.5), 1.0]])
-    from lqrsim.problem.collision_spheres import evaluate_slopes
+    from lqrsim.problem.collision_shape import evaluate_slopes
 
     slopes = evaluate_slopes(balls.bind(still), 2, np.array([[0.3, 0.5]]))[1]
     np.testing.assert_allclose(slopes[0, 1, :2], [[1.0, np.cos(0.5)], [0.0, 0.0]], rtol=1e-14)

@@ -81,12 +81,11 @@ from lqrsim.kernels.records import (
     StructuredArray,
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
-from lqrsim.problem.collision_spheres import SphereCenters
+from lqrsim.problem.collision_shape import SphereCenters
 from lqrsim.problem.control_rate import LastCommand, RateCost, RateLimits
+from lqrsim.problem.mjcf_dynamics import ForceLimit, ForceLimits, MjcfDynamics
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.results.archive import sha256
-from lqrsim.robots.force_limits import ForceLimit, ForceLimits
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
 from lqrsim.solvers.between_knots import WithinPeriods
@@ -1154,7 +1153,7 @@ class TestParts:
         self.steps(ls.Quadrotor().dynamics, x, np.full(4, 1.2), 0.05)
         for name in [one for one in vars(rotation_ratios) if "ratio" in one]:
             replay(source_of(rotation_ratios), {}, name, size**2)
-        replay(source_of("lqrsim.problem.obstacle_cost"), {}, "exponential", -size)
+        replay(source_of("lqrsim.problem.obstacles"), {}, "exponential", -size)
 
     @pytest.mark.parametrize("kind", ["box", "arm", *rarely("cart", "wheel")])
     def test_mujoco(self, kind: str) -> None:
@@ -1520,7 +1519,7 @@ def test_no_kernel_is_left_out() -> None:
     package, without = Path(str(kernels.__file__)).parent.parent, ("declarations", "records")
     written = {
         f"lqrsim.{room}.{path.stem}.{node.name}"
-        for room in ("kernels", "problem", "robots")
+        for room in ("kernels", "problem", "robots", "solvers")
         for path in (package / room).glob("*.py")
         for node in ast.parse(path.read_text(encoding="utf-8")).body
         if isinstance(node, ast.FunctionDef) and path.stem not in without

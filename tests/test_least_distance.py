@@ -7,7 +7,7 @@ from sampling import examples
 from scipy.optimize import linprog
 
 from lqrsim.errors import Array
-from lqrsim.scenes.least_distance import least_distance, nonnegative_least_squares
+from lqrsim.scenes.mjcf_holding import least_distance, nonnegative_least_squares
 
 
 def drawn(seed: int) -> tuple[Array, Array]:

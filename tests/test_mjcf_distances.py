@@ -17,9 +17,9 @@ from tracking import track
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import Array, InputError
+from lqrsim.problem.collision_shape import levers
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.scenes.mjcf_kinematics import reach_of
-from lqrsim.scenes.mjcf_obstacles import levers
 from lqrsim.scenes.scene import scene_from_xml
 
 SHAPES = {

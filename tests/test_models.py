@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from lqrsim import robots
 from lqrsim.errors import InputError
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
 from lqrsim.scenes.mjcf_text import names
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.plant import Plant
@@ -27,7 +26,7 @@ def open_floor(tmp_path):
     return Plant(DifferentialDrive(), load_scene(path))
 
 
-def test_registry_finds_each_file():
+def test_registry_finds_each_robot():
     assert robots.names() == ["differential_drive", "quadrotor"]
     assert isinstance(robots.get("quadrotor"), Quadrotor)
     with pytest.raises(InputError, match=r"^robot: got 'quadrotr', want one of: differential_drive, quadrotor"):

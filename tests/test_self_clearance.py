@@ -151,7 +151,7 @@ def test_many_links_have_one_row_each(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = arm('<geom type="cylinder" size="0.06 0.1"/>')
     kept, rows = robot.self_clearance(0.01), []
     for most in (3, 2):
-        monkeypatch.setattr("lqrsim.robots.mjcf_shapes.MOST_ROWS", most)
+        monkeypatch.setattr("lqrsim.problem.obstacles.MOST_ROWS", most)
         term = kept.bind(robot.dynamics)
         rows.append([term.describe(row) for row in range(term.rows)])
     assert rows[0][1] == "a clearance of 0.01 m between 'base' and 'hand'"

@@ -22,7 +22,7 @@ from lqrsim.control.sampled_loop import DeviationNorm, SampledLoop, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 from lqrsim.kernels.records import LoopMoments
-from lqrsim.problem.collision_shape import KeepsClear, each_once
+from lqrsim.problem.obstacles import KeepsClear, each_once
 
 
 @hypothesis.given(st.floats(-5, 5), st.floats(-5, 5), st.floats(-1, 1))

@@ -44,7 +44,7 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import InputError
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import Quadrotor
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import KINDS, PRESETS, preset

@@ -10,7 +10,7 @@ from PIL import Image
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics
 
 TILE = 400, 225  # pixels of a picture on a sheet
 

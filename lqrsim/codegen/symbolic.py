@@ -97,7 +97,7 @@ def _writers() -> str:
     package = Path(__file__).parents[1]
     names = (
         "codegen/edge_pushing", "codegen/symbolic", "control/plan_model", "problem/belief",
-        "problem/collision_spheres", "problem/dynamics", "problem/formulas", "problem/noise",
+        "problem/collision_shape", "problem/dynamics", "problem/formulas", "problem/noise",
     )  # fmt: skip
     return "".join((package / f"{name}.py").read_text(encoding="utf-8") for name in names)
 

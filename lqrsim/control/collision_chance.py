@@ -13,8 +13,8 @@ import numpy as np
 from scipy.special import ndtr, owens_t
 
 from lqrsim.errors import Array, InputError
-from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_shape import KeepsClear, ShapeInWorld, each_once
+from lqrsim.problem.collision_shape import ShapeInWorld
+from lqrsim.problem.obstacles import Clearance, KeepsClear, each_once
 from lqrsim.problem.problem import Problem
 
 LARGEST_MARGIN = 12.0  # standard deviations of clearance; with more the chance of a collision is below 1e-32

@@ -3,7 +3,7 @@
 States are tangent coordinates: a position for each degree of freedom, then the velocities, then the actuators' own
 states. The rotation of a ball or free joint is three numbers: a rotation vector, or a turn about an axis after a tilt,
 see `rotations.py`. `p` has the wrench on the body that `MjcfPhysics(body=...)` names, then addresses and sizes, at the
-indices named below; `robots/mjcf_dynamics.py` writes it. Several threads may run these functions at once. Each takes a
+indices named below; `problem/mjcf_dynamics.py` writes it. Several threads may run these functions at once. Each takes a
 slot, an `MjData` that it owns for as long as it needs it. If bodies carry loads, a slot also has its own model.
 
 A step and its helper functions are compiled separately. Functions that do arithmetic here are therefore `outline` and

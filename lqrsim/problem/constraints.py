@@ -17,10 +17,9 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import Term, address_of
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
-from lqrsim.problem import residual as kernel
-from lqrsim.problem.costs import CostTerm, ProblemPart
+from lqrsim.problem import costs
+from lqrsim.problem.costs import CostTerm, ProblemPart, Residual
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.residual import Residual
 from lqrsim.results.solution_parts import Trajectory
 
 EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
@@ -94,7 +93,7 @@ class ConstraintTerm(Term):
           columns: the index of each row's number among L.
         """
         shared = max(1, residual.rows)
-        rows = source_of(kernel, AT=residual.numbers, ROWS=shared)
+        rows = source_of(costs, AT=residual.numbers, ROWS=shared)
         return cls(
             residual.filling(rows.filled(value=(rows, "row_value"), slope=(rows, "row_slope"))),
             np.concatenate([residual.data, least.shape, columns, least.ravel()]), residual.rows, describe,

@@ -31,7 +31,7 @@ from lqrsim.kernels import differences, runge_kutta, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 
 if TYPE_CHECKING:
-    from lqrsim.scenes.contact_modes import ContactModes
+    from lqrsim.scenes.contacts import ContactModes
 
 # The largest number of steps of second derivatives. A thousand take 0.6 s to derive and 1 s to compile; the aeroplane
 # of `experiments/altro_problems.py` takes 2,300.
@@ -91,7 +91,7 @@ class Dynamics:
 
     _prefix = ""
     _want = "Dynamics(...), such as robot.dynamics"
-    # Whether MuJoCo does the steps; see `robots/mjcf_dynamics.py`. They have no second derivatives.
+    # Whether MuJoCo does the steps; see `problem/mjcf_dynamics.py`. They have no second derivatives.
     by_mujoco: bool = False
     # Relative size of states whose cost is negligible: if the least cost is zero, it is not reached to rounding.
     rounding: float = 1e-13

@@ -24,7 +24,6 @@ from lqrsim.errors import (
     renamed,
     shaped,
 )
-from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import (
     EQUALITY_TOLERANCE,
     Constraint,
@@ -39,6 +38,7 @@ from lqrsim.problem.control_rate import ControlRate, RateLimits
 from lqrsim.problem.costs import Cost, CostSum, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
+from lqrsim.problem.obstacles import KeepsClear
 from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry

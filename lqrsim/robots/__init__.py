@@ -1,8 +1,6 @@
-"""The robots. To add one, add a file here and its MJCF in models/. Every subclass of `Robot` in the file is found."""
+"""The robots: `packaged.py` has those of the package, `mjcf.py` makes one from any MJCF."""
 
-import importlib
 import inspect
-import pkgutil
 from functools import cache
 
 from lqrsim.errors import check_name
@@ -11,10 +9,10 @@ from lqrsim.robots.base import Robot
 
 @cache
 def _registry() -> dict[str, type[Robot]]:
-    modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
-    classes = [item for module in modules for item in vars(module).values() if inspect.isclass(item)]
-    robots = [item for item in classes if issubclass(item, Robot) and not inspect.isabstract(item)]
-    return {robot.name: robot for robot in robots if hasattr(robot, "name")}  # the others are made from a file
+    from lqrsim.robots import packaged
+
+    classes = [item for item in vars(packaged).values() if inspect.isclass(item)]
+    return {item.name: item for item in classes if issubclass(item, Robot) and item is not Robot}
 
 
 def names() -> list[str]:

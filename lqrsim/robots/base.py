@@ -11,8 +11,7 @@ from lqrsim.errors import Array, InputError, check_kind, vectors_of
 if TYPE_CHECKING:
     import mujoco
 
-    from lqrsim.problem.collision_shape import CollisionGeoms, ShapeInWorld
-    from lqrsim.problem.collision_spheres import CollisionSpheres
+    from lqrsim.problem.collision_shape import CollisionGeoms, CollisionSpheres, ShapeInWorld
     from lqrsim.problem.dynamics import Dynamics
     from lqrsim.scenes.world import World
 
@@ -21,7 +20,7 @@ Indices = npt.NDArray[np.intp]
 
 
 class Robot(abc.ABC):
-    """A robot. Subclass it to add your own; `quadrotor.py` is an example, `docs/adding_a_robot.md` lists the steps.
+    """A robot. Subclass it to add your own; `packaged.py` has examples, `docs/adding_a_robot.md` lists the steps.
 
     Attributes:
       name: name of the robot on the command line.

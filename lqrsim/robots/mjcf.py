@@ -23,27 +23,32 @@ from lqrsim.errors import (
     renamed,
     vectors_of,
 )
-from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_shape import ShapeInWorld
+from lqrsim.problem.collision_shape import CollisionGeoms, MjcfBalls, ShapeInWorld
 from lqrsim.problem.constraints import Constraint
 from lqrsim.problem.control_rate import ControlRate
 from lqrsim.problem.costs import Cost
-from lqrsim.problem.obstacle_cost import ObstacleCost
+from lqrsim.problem.mjcf_dynamics import ForceLimit, ForceLimits, MjcfDynamics, limited_forces
+from lqrsim.problem.obstacles import Clearance, ObstacleCost, SelfClearance
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.problem.state_bounds import LimitCost, StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
-from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms, SelfClearance
 from lqrsim.rotations import AXES
 from lqrsim.scenes.mjcf_holding import Holding, at_rest, efforts, falling, holding
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
-from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, solid_geoms
 from lqrsim.scenes.mjcf_text import listed
-from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
+from lqrsim.scenes.scene import (
+    Choice,
+    Scene,
+    chosen_geoms,
+    in_the_way,
+    mounting_pairs,
+    obstacle_geoms,
+    scene_of,
+    solid_geoms,
+)
 from lqrsim.scenes.world import World
 
 _log = logging.getLogger("lqrsim")
@@ -172,8 +177,8 @@ class MjcfRobot(Robot):
         self.balls = MjcfBalls(model) if many else None
 
     @cached_property
-    def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return MjcfGeoms(self.scene)
+    def geoms(self) -> CollisionGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return CollisionGeoms(self.scene)
 
     @checked
     def among(self, world: World) -> ShapeInWorld:

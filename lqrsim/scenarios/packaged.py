@@ -8,15 +8,14 @@ import numpy as np
 
 from lqrsim.annotations import Bounds, Line, Positive, Seed, Want, checked
 from lqrsim.errors import check_name, keep, renamed
-from lqrsim.problem.obstacle_cost import ObstacleCost
+from lqrsim.problem.obstacles import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.results.goal import Target
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.solution import Solution
 from lqrsim.robots.base import Robot
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
 from lqrsim.robots.sensors import Sensor
 from lqrsim.scenes.scene import Scene, load_scene
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push

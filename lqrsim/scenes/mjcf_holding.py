@@ -1,5 +1,6 @@
 """The controls that hold a robot from an MJCF still, by MuJoCo's own forces and rates of activations at rest."""
 
+import contextlib
 import copy
 import itertools
 from collections.abc import Iterable, Iterator
@@ -10,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.least_distance import least_distance
 from lqrsim.scenes.mjcf_kinematics import Equalities, placed
 from lqrsim.scenes.mjcf_model import MjcfModel, ranges
 from lqrsim.scenes.mujoco_log import unlogged
@@ -29,6 +29,7 @@ _END = 1e-9  # relative distance from the end of its range within which an activ
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
 _VERTICAL = 1 - 1e-6  # least part of a slide's axis along gravity, of one by which a base is let down
+_OFF = 1e-9  # slope of a least-squares problem that is no rounding, relative to the lengths of column and target
 _FALLS = 200  # heights at which a body that is let down may touch: thinner supports are not found
 
 
@@ -390,6 +391,34 @@ def _least_squares(
         if farthest > 0:
             return None
     return start + basis @ solve_triangular(triangle, nearest)
+
+
+def least_distance(rows: Array, least: Array) -> tuple[Array, Array]:
+    """For the shortest y (n,) with `rows y >= least`: a residual (n+1,) and forces (K,) of the rows, not negative.
+
+    y is -residual[:-1] / residual[-1], a sum of rows times their multipliers -forces / residual[-1]. If no y satisfies
+    all rows, the residual is zero. Lawson and Hanson, Solving Least Squares Problems, ch. 23.
+    """
+    matrix, target = np.vstack([rows.T, least]), np.append(np.zeros(rows.shape[1]), 1.0)
+    forces = nonnegative_least_squares(matrix, target)
+    return matrix @ forces - target, forces
+
+
+def nonnegative_least_squares(matrix: Array, target: Array) -> Array:
+    """The x >= 0 (K,) with the least |matrix x - target|.
+
+    SciPy's `nnls` is ten times as fast as its other solver, but may end elsewhere: scipy/scipy#25389.
+    """
+    from scipy.optimize import lsq_linear, nnls
+
+    most = 30 * matrix.shape[1]
+    with contextlib.suppress(RuntimeError):  # more iterations
+        x, _ = nnls(matrix, target, maxiter=most)
+        slopes = (matrix @ x - target) @ matrix
+        size = np.linalg.norm(matrix, axis=0) * np.linalg.norm(target)
+        if (np.where(x > 0, np.abs(slopes), -slopes) <= _OFF * size).all():
+            return x
+    return lsq_linear(matrix, target, (0.0, np.inf), method="bvls", tol=1e-15, max_iter=most).x
 
 
 def without_limits(model: mujoco.MjModel) -> mujoco.MjModel:

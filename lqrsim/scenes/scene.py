@@ -13,27 +13,34 @@ collide if contype or conaffinity is not zero, and contacts are not switched off
   prolonged ones would stay behind these planes.
 
 `obstacles=` of `load_scene` chooses other obstacles, by names or by a function. `MjcfRobot` leaves out geoms that are
-not in the way of that robot.
+not in the way of that robot: see `in_the_way`.
 """
 
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.annotations import Want, checked
 from lqrsim.errors import Array, InputError, check_count, check_items, check_name, excerpt, free_name
-from lqrsim.scenes.mjcf_kinematics import colliding, placed
+from lqrsim.scenes.mjcf_kinematics import carriers, colliding, driven_trees, placed, posed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco
 from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
 from lqrsim.scenes.world import FLAT, KINDS, OTHER_KINDS, Obstacle, World
 
 _FLAGS = mujoco.mjtDisableBit
+_FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_TOUCHING = 1e-3  # m; a geom nearer to another touches it
+_LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
+_LOWERED, _CARRIES = 1e-3, 0.7  # m; a geom carries another if lowering it by this widens the gap by this share or more
+_POSITIONS = 64  # random positions of joints in which a geom must touch what carries it
 
+Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geom
 Choice = bool | Sequence[str] | Callable[[Any], bool]  # a choice of obstacles; see `load_scene`
 
 
@@ -220,3 +227,214 @@ def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
         return normal @ (centre - plane.position) + radius * math.sqrt(max(0.0, 1 - float(normal @ axis) ** 2))
 
     return any(height(plane) <= 1e-6 and plane.rotation[:, 2] @ axis <= 1e-9 for plane in planes)
+
+
+# What a robot that consists of all moving bodies of an MJCF can touch, and which of it is in its way.
+
+
+def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
+    """The candidates (ids of geoms fixed to the world) that are obstacles to the robot whose first moving body this is.
+
+    They are those of `touchable`, except its own base and, with `floors`, a floor that anything touches at rest.
+    """
+    data, pairs = placed(model), touching_pairs(model, candidates)
+    pairs = pairs[~np.isin(model.geom_bodyid[pairs[:, 1]], [*_base(model)])]
+    if floors:
+        level = _ground(model, data)
+        near = pairs[np.isin(pairs[:, 1], [*level])]
+        touched = set(near[_touch(model, data, near), 1].tolist())
+        ground = (level if _sinks(model, data, body) else touched) | _supports(model, pairs)
+        pairs = pairs[~np.isin(pairs[:, 1], [*ground])]
+    avoidable = set(pairs[~_always_touch(model, pairs), 1].tolist())
+    return [geom for geom in candidates if geom in avoidable]
+
+
+def touchable(model: mujoco.MjModel, candidates: list[int], body: int) -> list[int]:
+    """The candidates that MuJoCo lets the robot touch, except ground and what only carries it; see `in_the_way`.
+
+    Ground is a floor that the robot can sink to, by a free joint or a slide that is not level, and what it stands on
+    and can move over.
+    """
+    data, pairs = placed(model), touching_pairs(model, candidates)
+    touched = set(pairs[~_always_touch(model, pairs), 1].tolist())
+    of_robot = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
+    ground = (_ground(model, data) if _sinks(model, data, body) else set[int]()) | _supports(model, pairs[of_robot])
+    return [geom for geom in candidates if geom in touched and geom not in ground]
+
+
+def mounting_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs that touch in every position of the joints, of obstacles that another geom can also touch."""
+    pairs = touching_pairs(model, obstacles)
+    always = _always_touch(model, pairs)
+    return pairs[always & np.isin(pairs[:, 1], pairs[~always, 1])]
+
+
+def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs of a moving geom and an obstacle that MuJoCo lets collide.
+
+    They collide by contype and conaffinity, unless their bodies are excluded, or as a pair in the MJCF.
+    """
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
+    fixed = np.array(obstacles, dtype=np.int64)
+    pairs = np.stack(np.meshgrid(moving, fixed, indexing="ij"), axis=-1).reshape(-1, 2)
+    return pairs[_collide_by_kind(model, pairs) | _are_stated(model, pairs)]
+
+
+def link_pairs(model: mujoco.MjModel, body: int) -> Pairs:
+    """The pairs of geoms on two links of the robot that MuJoCo lets collide.
+
+    It does not if their bodies are fixed to each other, are parent and child, or are excluded, but for a pair in the
+    MJCF. Pairs that touch in every position of the joints are left out. Links are the bodies of kinematic trees that
+    actuators move, and of the tree of `body`, and what carries them: what the robot handles is none.
+    """
+    welds, trees = model.body_weldid, [*driven_trees(model, body)]
+    geoms = np.flatnonzero((welds[model.geom_bodyid] != 0) & np.isin(model.body_treeid[model.geom_bodyid], trees))
+    pairs = np.stack([geoms[places] for places in np.triu_indices(len(geoms), 1)], axis=1).astype(np.int64)
+    first, second = welds[model.geom_bodyid[pairs]].T
+    joined = first == second
+    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        parents = welds[model.body_parentid]
+        joined |= (parents[first] == second) | (parents[second] == first)
+    pairs = pairs[_collide_by_kind(model, pairs) & ~joined | _are_stated(model, pairs)]
+    base = np.flatnonzero((welds[model.geom_bodyid] == 0) & np.isin(model.geom_bodyid, [*_base(model)]))
+    fixed = touching_pairs(model, base.tolist())
+    pairs = np.concatenate([pairs, fixed[np.isin(fixed[:, 0], geoms)]])
+    return pairs[~_always_touch(model, pairs, carried=False)]
+
+
+def _collide_by_kind(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that collide by contype and conaffinity, and whose bodies are not excluded."""
+    kinds, others = model.geom_contype[pairs], model.geom_conaffinity[pairs]
+    low, high = np.sort(model.geom_bodyid[pairs].astype(np.int64), axis=1).T
+    touch = (kinds[:, 0] & others[:, 1]) | (others[:, 0] & kinds[:, 1]) != 0
+    return touch & ~np.isin(low << 16 | high, model.exclude_signature)
+
+
+def _are_stated(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that are pairs in the MJCF."""
+    stated = np.stack([model.pair_geom1, model.pair_geom2], axis=1).astype(np.int64)
+    low, high = np.sort(pairs, axis=1).T
+    return np.isin(low * model.ngeom + high, np.sort(stated, axis=1) @ [model.ngeom, 1])
+
+
+def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs whose distances matter: those that MuJoCo lets collide and that do not always touch.
+
+    A link that turns on a pedestal touches it always: no plan can avoid that, and it is no collision. Of an obstacle
+    without such pairs, which the user has chosen by name or by a rule, all pairs matter.
+    """
+    pairs = touching_pairs(model, obstacles)
+    pairs = pairs[~_always_touch(model, pairs)]
+    untouched = sorted(set(obstacles) - set(pairs[:, 1].tolist()))
+    if untouched:
+        moving = solid_geoms(model)
+        extra = np.stack(np.meshgrid(moving, untouched, indexing="ij"), axis=-1).reshape(-1, 2)
+        pairs = np.concatenate([pairs, extra])
+    return pairs
+
+
+def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
+    """Ids of the moving geoms that can collide; of all moving geoms if none can."""
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    solid = moves & colliding(model)
+    return np.flatnonzero(solid if solid.any() else moves)
+
+
+def _base(model: mujoco.MjModel) -> set[int]:
+    """The bodies that carry the moving bodies, up to the world, and everything fixed to the last of these."""
+    fixed, parents = model.body_weldid == 0, model.body_parentid.tolist()
+    mounts = {parents[body] for body in np.flatnonzero(~fixed).tolist() if fixed[parents[body]]} - {0}
+    base = {link for body in mounts for link in carriers(model, body)}
+    for body in range(1, model.nbody):  # children come after their parents
+        if fixed[body] and parents[body] in mounts:
+            mounts.add(body)
+    return base | mounts
+
+
+def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
+    """Ids of level planes that face up, and of height fields."""
+    planes = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (data.geom_xmat[:, 8] > _LEVEL)
+    return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
+
+
+def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs whose geoms touch or overlap."""
+    touching, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
+    apart = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1) - sizes.sum(axis=1)
+    for k in np.flatnonzero((apart < _TOUCHING) | (sizes == 0).any(axis=1)):  # planes have no size
+        touching[k] = _close(model, data, pairs[k])
+    return touching
+
+
+def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
+    return mujoco.mj_geomDistance(model, data, *pair.tolist(), 2 * _TOUCHING, None) < _TOUCHING
+
+
+def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that touch in every position of the joints; without `carried`, of all but free joints."""
+    if not len(pairs):
+        return np.zeros(0, dtype=bool)
+    always = _touch(model, placed(model), pairs)
+    if carried:
+        always &= ~_carried_by(model, pairs, _FREE)
+    remaining = np.flatnonzero(always)
+    for data in posed(model, _random_positions(model)) if len(remaining) else ():
+        always[remaining] = [_close(model, data, pair) for pair in pairs[remaining]]
+        remaining = remaining[always[remaining]]
+        if not len(remaining):
+            break
+    return always
+
+
+def _carried_by(model: mujoco.MjModel, pairs: Pairs, *kinds: int) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs whose moving geom is carried by a joint of one of these kinds."""
+    bodies = model.geom_bodyid[pairs[:, 0]].tolist()
+    moved = {body: any(kind in kinds for kind, _ in _joints(model, body)) for body in set(bodies)}
+    return np.array([moved[body] for body in bodies], dtype=bool)
+
+
+def _random_positions(model: mujoco.MjModel) -> Array:
+    """Random positions (_POSITIONS, nq) of all joints but free ones; slides without a range are within 1 m of rest."""
+    rng, positions = np.random.default_rng(0), np.tile(model.qpos0, (_POSITIONS, 1))
+    slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+    single = slides | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    span, rest = np.where(slides, 1.0, np.pi), model.qpos0[model.jnt_qposadr]
+    low, high = np.where(model.jnt_limited, model.jnt_range.T, [rest - span, rest + span])[:, single]
+    positions[:, model.jnt_qposadr[single]] = rng.uniform(low, high, (_POSITIONS, len(low)))
+    for first in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]:
+        turns = rng.standard_normal((_POSITIONS, 4))
+        positions[:, first : first + 4] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    return positions
+
+
+def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
+    """The obstacles of these pairs on which the other geom stands, if a free joint or a slide moves it over them.
+
+    It stands there at rest; with a free joint, in a keyframe also counts.
+    """
+    floating, moving = _carried_by(model, pairs, _FREE), _carried_by(model, pairs, _FREE, _SLIDE)
+    if not moving.any():
+        return set()
+    supports, reach = set[int](), _TOUCHING + 2 * _LOWERED
+    for k, data in enumerate(posed(model, [model.qpos0, *model.key_qpos])):
+        candidates = pairs[floating if k else moving]
+        for geom, support in candidates[_touch(model, data, candidates)].tolist():
+            gap = mujoco.mj_geomDistance(model, data, geom, support, reach, None)
+            data.geom_xpos[support, 2] -= _LOWERED
+            if mujoco.mj_geomDistance(model, data, geom, support, reach, None) - gap > _CARRIES * _LOWERED:
+                supports.add(support)
+            data.geom_xpos[support, 2] += _LOWERED
+    return supports
+
+
+def _joints(model: mujoco.MjModel, body: int) -> Iterator[tuple[int, int]]:
+    """The kind and number of each joint between a body and the world."""
+    for link in carriers(model, body):
+        first, count = int(model.body_jntadr[link]), int(model.body_jntnum[link])
+        yield from ((int(model.jnt_type[joint]), joint) for joint in range(first, first + count))
+
+
+def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
+    """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
+    upward = np.abs(data.xaxis[:, 2]) > 1e-9
+    return any(kind == _FREE or (kind == _SLIDE and upward[joint]) for kind, joint in _joints(model, body))

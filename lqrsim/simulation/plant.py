@@ -24,9 +24,8 @@ from lqrsim.robots.base import Robot, indices_in
 from lqrsim.robots.sensors import RobotSensors, Sensor, ignore_timing
 from lqrsim.scenes import mjcf_kinematics
 from lqrsim.scenes.mjcf_model import compiled
-from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
 from lqrsim.scenes.mujoco_log import unlogged
-from lqrsim.scenes.scene import Scene, obstacle_geoms
+from lqrsim.scenes.scene import Pairs, Scene, mounting_pairs, obstacle_geoms, touchable, touching_pairs
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator

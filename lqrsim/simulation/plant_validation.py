@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
-from lqrsim.problem.collision_shape import ShapeInWorld
-from lqrsim.problem.collision_spheres import CollisionSpheres
+from lqrsim.problem.collision_shape import CollisionSpheres, ShapeInWorld
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot, indices_in
 from lqrsim.scenes.scene import Scene

@@ -11,7 +11,7 @@ import numpy as np
 from lqrsim.annotations import OneOf, Positive, checked
 from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.robots.base import Robot
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
 from lqrsim.simulators.quadrotors import Frame, package
 from lqrsim.versions import versions_of

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from lqrsim.annotations import Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt, keep
 from lqrsim.robots.base import Robot
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
 from lqrsim.simulators.quadrotors import Frame, package
 from lqrsim.versions import versions_of

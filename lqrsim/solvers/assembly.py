@@ -11,7 +11,7 @@ import numpy as np
 from lqrsim.annotations import LINE
 from lqrsim.errors import Array, printable
 from lqrsim.kernels.records import Policy
-from lqrsim.problem.collision_shape import each_once
+from lqrsim.problem.obstacles import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target, departure
 from lqrsim.results.solution import Solution

@@ -1,6 +1,6 @@
 """Plans at the edges of contact modes: a descent within a mode, and conditions for optimality of such a plan.
 
-A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contact_modes.py`. A
+A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contacts.py`. A
 descent ends at a *switch*, next to a jump or at a kink: a contact that is just not reached, or just lets go. The
 gradient is not zero there, and steps along it cross the switch. Here a switch is an inequality, like a limit of a
 control:
@@ -30,8 +30,8 @@ from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import ContactCertificate, Quadratic, Status
-from lqrsim.scenes.contact_modes import ContactModes, Period, Switches
-from lqrsim.scenes.least_distance import least_distance
+from lqrsim.scenes.contacts import ContactModes, Period, Switches
+from lqrsim.scenes.mjcf_holding import least_distance
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget, Laps
 from lqrsim.solvers.certify import faults

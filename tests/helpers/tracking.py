@@ -7,8 +7,7 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Certificate, Status, Trajectory
 from lqrsim.robots.base import Robot
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
 
 
 def track(robot: Robot, start: npt.ArrayLike, controls: npt.ArrayLike, dt: float, *, feedback: bool = True) -> Solution:

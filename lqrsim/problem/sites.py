@@ -30,10 +30,9 @@ from lqrsim.kernels.mjcf_dynamics import (
 )
 from lqrsim.kernels.rotation_ratios import cotangent_ratio
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
-from lqrsim.problem.costs import Cost, CostTerm
+from lqrsim.problem.costs import Cost, CostTerm, Residual
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.residual import Residual
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes.mjcf_kinematics import axes_of, posed
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.world import SPACE

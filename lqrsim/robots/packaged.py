@@ -1,4 +1,4 @@
-"""The quadrotor, driven by the forces of its rotors. Paper: Sec. VI-B."""
+"""The robots of the paper, which are the packaged ones. To add one, add a class here and its MJCF in models/."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,8 +16,74 @@ from lqrsim.robots.base import Robot, configuration_of
 
 @checked
 @dataclass(frozen=True)
+class DifferentialDrive(Robot):
+    """The iRobot Create: two wheels, driven by their speeds. Paper: Sec. VI-A.
+
+    State: (x, y, heading) of the middle of the axle. Control: speed of the left and the right wheel.
+
+    Lengths are in m. MJCF: models/create.xml.
+
+    Attributes:
+      max_speed: largest speed of a wheel's rim in m/s, in either direction.
+      wheel_radius: radius of a wheel in m; also the height of the axle.
+    """
+
+    axle_length: Positive = 0.258
+    radius: Positive = 0.17
+    max_speed: Positive = 0.5
+    wheel_radius: Positive = 0.036
+
+    name = "differential_drive"
+    body = "create"
+    joints = ("create_base", "create_wheel_left", "create_wheel_right")
+    actuators = ("create_wheel_left", "create_wheel_right")
+    wheels = ("create_tread_left", "create_tread_right")
+
+    @cached_property
+    def dynamics(self) -> Dynamics:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return Dynamics(
+            _drive_rate,
+            states={"x": "m", "y": "m", "heading": "rad"},
+            controls={"left": "m/s", "right": "m/s"},
+            parameters={"axle_length": self.axle_length},
+            position=("x", "y"),
+            angles=("heading",),
+            control_limits=(-self.max_speed, self.max_speed),
+        )
+
+    def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
+        qpos, _ = configuration_of(qpos, qvel, 9, 8)
+        qw, qx, qy, qz = np.moveaxis(qpos[..., 3:7], -1, 0)
+        heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        state = np.concatenate([qpos[..., :2], heading[..., None]], axis=-1)
+        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
+
+    def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
+        """The qpos (..., 9) and qvel (..., 8) at rest in states (..., 3), wheels on a floor at height zero."""
+        state = vectors_of("state", state, 3)
+        qpos = np.zeros((*state.shape[:-1], 9))
+        qpos[..., :2] = state[..., :2]
+        qpos[..., 2] = self.wheel_radius
+        qpos[..., 3] = np.cos(state[..., 2] / 2)
+        qpos[..., 6] = np.sin(state[..., 2] / 2)
+        return qpos, np.zeros((*state.shape[:-1], 8))
+
+
+def _drive_rate(x: Any, u: Any, p: Any) -> list[Any]:
+    from sympy import cos, sin
+
+    _, _, heading = x
+    left, right = u
+    speed = (left + right) / 2
+    return [speed * cos(heading), speed * sin(heading), (right - left) / p.axle_length]
+
+
+@checked
+@dataclass(frozen=True)
 class Quadrotor(Robot):
-    """State: position, velocity in world axes, rotation vector, angular velocity in body axes. Control: rotor forces.
+    """A quadrotor, driven by the forces of its rotors. Paper: Sec. VI-B.
+
+    State: position, velocity in world axes, rotation vector, angular velocity in body axes. Control: rotor forces.
 
     Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. Numbers are in kg, m, s and N. MJCF: models/quadrotor.xml.
 
@@ -60,7 +126,7 @@ class Quadrotor(Robot):
         if self.yaw_inertia is not None:
             constants += ("yaw_inertia",)
         return Dynamics(
-            _rate if self.yaw_inertia is None else _rate_with_two_inertias,
+            _quadrotor_rate if self.yaw_inertia is None else _quadrotor_rate_with_two_inertias,
             states={name: unit for names, unit in units.items() for name in names.split()},
             controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
             parameters={name: getattr(self, name) for name in constants},
@@ -83,14 +149,14 @@ class Quadrotor(Robot):
         return qpos, np.concatenate([velocity, angular_velocity], axis=-1)
 
 
-def _rate_with_two_inertias(x: Any, u: Any, p: Any) -> list[Any]:
-    """As `_rate`, with J = diag(inertia, inertia, yaw_inertia) and the gyroscopic torque -w x J w."""
-    *rate, x_rate, y_rate, z_rate = _rate(x, u, p)
+def _quadrotor_rate_with_two_inertias(x: Any, u: Any, p: Any) -> list[Any]:
+    """As `_quadrotor_rate`, with J = diag(inertia, inertia, yaw_inertia) and the gyroscopic torque -w x J w."""
+    *rate, x_rate, y_rate, z_rate = _quadrotor_rate(x, u, p)
     gyroscopic = (p.yaw_inertia - p.inertia) / p.inertia * x[11]
     return [*rate, x_rate - gyroscopic * x[10], y_rate + gyroscopic * x[9], z_rate * p.inertia / p.yaw_inertia]
 
 
-def _rate(x: Any, u: Any, p: Any) -> list[Any]:
+def _quadrotor_rate(x: Any, u: Any, p: Any) -> list[Any]:
     velocity, rotation, w = x[3:6], x[6:9], x[9:12]
     thrust = rotations.rotate(rotation, [0, 0, sum(u)])
     wind, force, push = ([getattr(p, f"{name}_{axis}") for axis in "xyz"] for name in ("wind", "force", "torque"))
