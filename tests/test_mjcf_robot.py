@@ -1013,8 +1013,19 @@ def test_joint_limits_are_bounds() -> None:
     robot, _ = robot_of("cart", 0)
     bounds = robot.joint_limits
     assert bounds.bounds == {"slider": (-0.3, 0.3)}
-    with pytest.raises(InputError, match="StateBounds: got nothing"):
-        _ = robot_of("wheel", 0)[0].joint_limits
+
+
+@pytest.mark.parametrize("joints", ["hinge", "slide", "ball", "free", "hinge hinge"])
+def test_joint_limits_of_a_robot_without_any_are_refused_by_their_name(joints: str) -> None:
+    nested = ""
+    for number, kind in enumerate(joints.split()):
+        nested += f'<body><joint name="j{number}" type="{kind}"/><geom size="0.1"/>'
+    bodies = nested + "</body>" * len(joints.split())
+    actuator = '<actuator><motor joint="j0" gear="1 0 0 0 0 0"/></actuator>'
+    xml = f"<mujoco><worldbody>{bodies}</worldbody>{actuator}</mujoco>"
+    robot = ls.MjcfRobot(scene_from_xml(xml, "loose"))
+    with pytest.raises(InputError, match=r"^MjcfRobot loose: joint_limits: got none, want problems without$"):
+        _ = robot.joint_limits
 
 
 @settings(max_examples=examples(15))

@@ -135,6 +135,18 @@ def test_seen_from_above() -> None:
     assert world.seen_by("xyz") is world
 
 
+@settings(max_examples=examples(20))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_an_upright_ellipsoid_that_is_round_from_above_is_a_circle(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    up, place, (radius, half) = int(rng.integers(3)), rng.normal(size=3), rng.uniform(0.1, 1.0, size=2)
+    rotation = Rotation.from_euler("z", rng.uniform(-4, 4)).as_matrix() @ np.roll(np.eye(3), 2 - up, axis=0)
+    egg = ls.Obstacle("egg", "ellipsoid", place, rotation, np.insert(np.full(2, radius), up, half))
+    points = rng.normal(size=(5, 2))
+    distances = ls.World([egg]).seen_by("xy").distance(points)
+    np.testing.assert_allclose(distances, np.linalg.norm(points - place[:2], axis=1) - radius, rtol=0, atol=1e-12)
+
+
 def test_a_row_is_as_long_as_said() -> None:
     assert ls.World([obstacle("box")]).table.shape == (ROW,)
     assert ls.World().distance(np.zeros((7, 3))).tolist() == [np.inf] * 7

@@ -535,7 +535,9 @@ class MjcfRobot(Robot):
         places = {names[joint.dof]: joint.limits for joint in self.mjcf.joints if joint.limits is not None}
         limited = [joint for joint in self.mjcf.joints if np.isfinite(joint.speed)]
         speeds = {names[nv + joint.dof]: (-joint.speed, joint.speed) for joint in limited}
-        return StateBounds(places | speeds)
+        if not (bounds := places | speeds):
+            raise InputError(f"MjcfRobot {self.name}: joint_limits: got none, want problems without")
+        return StateBounds(bounds)
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state (n,) at rest as in the MJCF, or in one of its keyframes, except for the named states.

@@ -278,9 +278,12 @@ def _prism(obstacle: Obstacle) -> Obstacle:
 
 def _from_above(obstacle: Obstacle) -> Obstacle:
     """The obstacle with infinite height; planes are unchanged. Raises InputError if it is tilted."""
-    obstacle._check_kind()
     upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # flags of a vertical local axis
     size = obstacle.size.copy()
+    if obstacle.kind == "ellipsoid" and upright.any() and np.ptp(size[~upright]) == 0:  # a circle from above
+        size = np.array([size[~upright][0], np.inf, 0.0])
+        return replace(obstacle, kind="cylinder", rotation=np.eye(3), size=size)
+    obstacle._check_kind()
     match obstacle.kind:
         case "sphere":
             return replace(obstacle, kind="cylinder", rotation=np.eye(3), size=np.array([size[0], np.inf, 0.0]))
