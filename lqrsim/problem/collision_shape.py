@@ -413,6 +413,77 @@ class CollisionGeoms:
 
 
 @dataclass(frozen=True, eq=False)
+class GeomPairs:
+    """Pairs of geoms of an MJCF, in rows, whose least distances `kernels/mjcf_dynamics.py` computes.
+
+    Attributes:
+      dynamics: the robot's, or made of these. pairs: (K, 2), of which the first geom moves. rows: (K,), of `count`.
+    """
+
+    dynamics: Dynamics
+    model: mujoco.MjModel
+    pairs: Pairs
+    rows: npt.NDArray[np.int64]
+    count: int
+
+    def residual(self, parts: tuple[str, ...], reach: float) -> Residual:
+        """The distances of all rows, which have names, up to `reach` in m, as functions of the state."""
+        return Residual(
+            source_of(mjcf_dynamics, ROWS=self.count), self._data(reach), parts, leading_states=self.model.nv,
+            functions=(MjcfMemory.of(self._called),),
+        )  # fmt: skip
+
+    def distances(
+        self, states: npt.ArrayLike, displaced: Array | None = None, reach: float = _UNBOUNDED
+    ) -> tuple[Array, Array]:
+        """Distances (..., rows) in m at states (..., n), and the pair of each row at the last state.
+
+        Obstacles are displaced by (D, rows, 3) in m, by the first of these for the first of D equal parts of the
+        states.
+        """
+        states = vectors_of("states", states, len(self.dynamics.state_coordinates))
+        flat, rows = in_c_order(states.reshape(-1, states.shape[-1])), self.count
+        displaced = np.zeros((1, rows, 3)) if displaced is None else displaced
+        out, pairs, each = np.empty(len(flat) * rows), np.empty(rows), max(1, len(flat) // max(1, len(displaced)))
+        self._module.distances_of(
+            len(flat), flat, each, in_c_order(displaced.reshape(-1)), self._addressed(reach), out, pairs,
+            np.empty((rows, 6)),
+        )  # fmt: skip
+        return out.reshape(*states.shape[:-1], rows), pairs
+
+    def slopes(self, states: Array) -> tuple[Array, Array]:
+        """Distances (k, rows) at states (k, n), and their derivatives in these, (k, rows, n)."""
+        flat, rows = in_c_order(vectors_of("states", states, len(self.dynamics.state_coordinates))), self.count
+        out, slopes = np.empty(len(flat) * rows), np.zeros((len(flat) * rows, flat.shape[1]))
+        data = self._addressed(_UNBOUNDED)
+        self._module.slopes_of(len(flat), flat, data, out, slopes, np.empty(rows), np.empty((rows, 6)))
+        return out.reshape(-1, rows), slopes.reshape(-1, rows, flat.shape[1])
+
+    @property
+    def _called(self) -> MjcfDynamics:
+        assert isinstance(self.dynamics.calling, MjcfDynamics)
+        return self.dynamics.calling
+
+    @property
+    def _module(self) -> Any:
+        states = len(self.dynamics.state_coordinates)
+        return module_of(source_of(mjcf_dynamics), f"MuJoCo's distances ({states} states)", N=states)
+
+    def _addressed(self, reach: float) -> Array:
+        return np.concatenate([[float(self._called.physics.address())], self._data(reach)])
+
+    @checked
+    def _data(self, reach: Finite) -> Array:
+        """The data of the kernel, except the address of p."""
+        model, pairs = self.model, self.pairs
+        bodies, radii = model.geom_bodyid[pairs], model.geom_rbound[pairs]  # that of a plane is 0
+        planes = model.geom_type[pairs[:, 1]] == int(mujoco.mjtGeom.mjGEOM_PLANE)
+        moving = np.where(model.body_weldid[bodies[:, 1]] != 0, bodies[:, 1], 0)
+        columns = [self.rows, pairs[:, 0], bodies[:, 0], pairs[:, 1], radii.sum(axis=1), planes, moving]
+        return np.concatenate([[self.count, len(pairs), reach], np.stack(columns, axis=1).astype(np.float64).ravel()])
+
+
+@dataclass(frozen=True, eq=False)
 class ShapeInWorld:
     """A robot's collision shape among obstacles: one ball or several; `GeomsInWorld` is that of geoms.
 
@@ -564,20 +635,16 @@ class GeomsInWorld(ShapeInWorld):
         rows = sorted(set(keys))
         index = {key: row for row, key in enumerate(rows)}
         count, numbered = max(1, len(rows)), np.array([index[key] for key in keys], dtype=np.int64)
-        distances = Residual(
-            source_of(mjcf_dynamics, ROWS=count),
-            distance_data(model, self.geoms.pairs[chosen], numbered, count, reach),
-            parts=tuple(model.body(body).name for body, _ in rows), leading_states=model.nv,
-            functions=(MjcfMemory.of(self._mjcf_dynamics),),
-        )  # fmt: skip
-        return distances, tuple(number for _, number in rows)
+        pairs = GeomPairs(self.dynamics, model, self.geoms.pairs[chosen], numbered, count)
+        parts, numbers = tuple(model.body(body).name for body, _ in rows), tuple(number for _, number in rows)
+        return pairs.residual(parts, reach), numbers
 
     def places(self, states: Array) -> Array:
         return states[..., None, :]
 
     def clearances(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distances (..., O) in m at states (..., n); (K, ..., n), if obstacles are displaced by (K, O, 3)."""
-        return geom_distances(self.dynamics, states, self._to_each()[1], displaced)[0]
+        return self._to_each.distances(states, displaced)[0]
 
     def clearance(self, places: Array, displaced: Array | None = None) -> Array:
         """NaN where a state has a NaN."""
@@ -589,13 +656,8 @@ class GeomsInWorld(ShapeInWorld):
         return distances if known.all() else np.where(known, distances, np.nan)
 
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
-        flat, count = in_c_order(vectors_of("states", states, len(self.dynamics.state_coordinates))), len(self.world)
-        distances, slopes = np.empty(len(flat) * count), np.zeros((len(flat) * count, flat.shape[1]))
-        pair_of_row, segments = np.empty(count), np.empty((count, 6))
-        _geom_module(flat.shape[1]).slopes_of(
-            len(flat), flat, self._to_each()[1], distances, slopes, pair_of_row, segments
-        )
-        return distances.reshape(-1, count), slopes.reshape(-1, count, flat.shape[1])[..., list(along)]
+        distances, slopes = self._to_each.slopes(states)
+        return distances, slopes[..., list(along)]
 
     def nearest(self, places: Array, displaced: Array) -> int:
         return int(self.clearances(places[None], displaced[None])[0, 0].argmin())
@@ -608,31 +670,27 @@ class GeomsInWorld(ShapeInWorld):
         if not len(self.world) or np.isnan(state[list(self.depends_on)]).any():
             return None
         state = np.where(np.isnan(state), 0.0, state)  # velocities and activations, which move no geom
-        chosen, data = self._to_each()
-        distances, pairs = geom_distances(self.dynamics, state, data)
+        each = self._to_each
+        distances, pairs = each.distances(state)
         if distances.min() >= -_TOUCHING:
             return None
         nearest, model = int(distances.argmin()), self.geoms.scene.model
-        pair = self.geoms.pairs[chosen[int(pairs[nearest])]]
+        pair = each.pairs[int(pairs[nearest])]
         body, other = (model.body(number).name for number in model.geom_bodyid[pair].tolist())
         where = f"with {body!r} {-distances.min():.3g} m inside obstacle {self.world.names[nearest]!r}"
         exclude = f'<contact><exclude body1="{other}" body2="{body}"/></contact> in the MJCF'
         return where, f"; or, if they may overlap, {exclude}; or obstacles= of the robot without it"
 
     @property
-    def _mjcf_dynamics(self) -> MjcfDynamics:
-        assert isinstance(self.dynamics.calling, MjcfDynamics)
-        return self.dynamics.calling
-
-    def _to_each(self) -> tuple[npt.NDArray[np.intp], Array]:
-        """The indices of the pairs, and the kernel's data with the address of p, for all distances to each obstacle."""
+    def _to_each(self) -> GeomPairs:
+        """The pairs with a row for each obstacle."""
         place = np.full(len(self.geoms.scene.world), -1, dtype=np.int64)
         place[self.numbers] = np.arange(len(self.numbers))
         rows = np.asarray(place[self.geoms.obstacles], dtype=np.int64)
         chosen = np.flatnonzero(rows >= 0)
-        pairs, count = self.geoms.pairs[chosen], len(self.numbers)
-        data = distance_data(self.geoms.scene.model, pairs, rows[chosen], count, _UNBOUNDED)
-        return chosen, np.concatenate([[float(self._mjcf_dynamics.physics.address())], data])
+        return GeomPairs(
+            self.dynamics, self.geoms.scene.model, self.geoms.pairs[chosen], rows[chosen], len(self.numbers)
+        )
 
 
 def shape_in(
@@ -709,40 +767,6 @@ def hull_distances(
 
 def _distances() -> CompiledModule:
     return module_of(source_of(distances), "distances to obstacles")
-
-
-def geom_distances(
-    dynamics: Dynamics, states: npt.ArrayLike, data: Array, displaced: Array | None = None
-) -> tuple[Array, Array]:
-    """Distances (..., rows) at states (..., n) by the kernel's data, and the pair of each row at the last state.
-
-    Obstacles are displaced by (D, rows, 3) in m, by the first of these for the first of D equal parts of the states.
-    """
-    states = vectors_of("states", states, len(dynamics.state_coordinates))
-    flat, rows = in_c_order(states.reshape(-1, states.shape[-1])), int(data[1])
-    displaced = np.zeros((1, rows, 3)) if displaced is None else displaced
-    distances, pairs, each = np.empty(len(flat) * rows), np.empty(rows), max(1, len(flat) // max(1, len(displaced)))
-    _geom_module(flat.shape[1]).distances_of(
-        len(flat), flat, each, in_c_order(displaced.reshape(-1)), data, distances, pairs, np.empty((rows, 6))
-    )
-    return distances.reshape(*states.shape[:-1], rows), pairs
-
-
-def _geom_module(states: int) -> Any:
-    return module_of(source_of(mjcf_dynamics), f"MuJoCo's distances ({states} states)", N=states)
-
-
-@checked
-def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int64], count: int, reach: Finite) -> Array:
-    """The data of `kernels/mjcf_dynamics.py`, except the address of p.
-
-    The first geom of each of K pairs moves; `rows` (K,) are theirs, of `count`; `reach` is the largest distance in m.
-    """
-    bodies, radii = model.geom_bodyid[pairs], model.geom_rbound[pairs]  # that of a plane is 0
-    planes = model.geom_type[pairs[:, 1]] == int(mujoco.mjtGeom.mjGEOM_PLANE)
-    moving = np.where(model.body_weldid[bodies[:, 1]] != 0, bodies[:, 1], 0)
-    columns = [rows, pairs[:, 0], bodies[:, 0], pairs[:, 1], radii.sum(axis=1), planes, moving]
-    return np.concatenate([[count, len(pairs), reach], np.stack(columns, axis=1).astype(np.float64).ravel()])
 
 
 def levers(model: mujoco.MjModel) -> Array:

@@ -267,10 +267,6 @@ class MjcfDynamics(Dynamics):
         return self._name
 
     @cached_property
-    def source(self) -> Source:
-        return self.step_source
-
-    @cached_property
     def step_source(self) -> Source:
         return source_of(kernel)
 

@@ -15,22 +15,20 @@ from lqrsim.annotations import Finite, NonNegative, Positive, checked
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError, check_array, check_number, real
-from lqrsim.kernels import mjcf_dynamics
 from lqrsim.kernels.declarations import ROW, N, exact, places, places_jacobian, power_of_two, stack, zeros
 from lqrsim.kernels.distances import hull_distance, signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import (
     MOST_ROWS,
     CollisionGeoms,
     CollisionSpheres,
+    GeomPairs,
     ShapeInWorld,
-    distance_data,
-    geom_distances,
     shape_in,
 )
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
-from lqrsim.problem.costs import Cost, CostTerm, Residual
+from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.mjcf_dynamics import MjcfDynamics, MjcfMemory
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.scene import link_pairs
 from lqrsim.scenes.world import World
@@ -299,21 +297,18 @@ class SelfClearance(Constraint):
             firsts = list(dict.fromkeys(first for first, _ in self.links))
             merged = np.array([firsts.index(first) for first, _ in self.links])
             described, rows = [f"{link!r} and other links" for link in firsts], merged[rows]
-        count = max(1, len(described))
-        distances = Residual(
-            source_of(mjcf_dynamics, ROWS=count), distance_data(model, self._pairs, rows, count, reach),
-            parts=tuple(described), leading_states=model.nv, functions=(MjcfMemory.of(dynamics.calling),),
-        )  # fmt: skip
+        pairs = GeomPairs(dynamics, model, self._pairs, rows, max(1, len(described)))
 
         def describe(row: int) -> str:
             return f"a clearance of {self.margin:g} m between {described[row]}"
 
+        distances = pairs.residual(tuple(described), reach)
         return ConstraintTerm.of_residual(distances, np.array([[self.margin]]), [0] * len(described), describe)
 
     def distances(self, dynamics: MjcfDynamics, states: npt.ArrayLike) -> Array:
         """The distance (..., L) in m of the links of each pair in `links`, at states (..., n); at most 1 m."""
-        data = distance_data(self._mjcf.model, self._pairs, self._rows, len(self.links), 1.0)
-        return geom_distances(dynamics, states, np.concatenate([[float(dynamics.physics.address())], data]))[0]
+        pairs = GeomPairs(dynamics, self._mjcf.model, self._pairs, self._rows, len(self.links))
+        return pairs.distances(states, reach=1.0)[0]
 
     def check(self, field: str, dynamics: MjcfDynamics, state: Array) -> None:
         """Raises InputError if links are nearer to each other than the margin at a state (n,), named `field`."""
