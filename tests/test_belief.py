@@ -345,13 +345,14 @@ def test_derivatives_of_a_step_are_those_of_differences() -> None:
     np.testing.assert_allclose(hessian, expected, atol=1e-7)
 
 
-def drive(scenario: ls.Scenario, **changed: Any) -> ls.Problem:
-    """The packaged drive, two seconds along a wall with a beacon."""
+def drive(scenario: ls.Scenario, *, compass: bool = False, **changed: Any) -> ls.Problem:
+    """The packaged drive, two seconds along a wall with a beacon. With a compass, its heading is known."""
     sensors = ls.belief.NoisySensors(beacons, parameters={"left": -2.0, "noise": 0.05}, delay=1)
-    noise = ls.Noise(0.01 * np.eye(3))
-    of = ls.belief.Belief(scenario.robot.dynamics, dt=DT, noise=noise, sensors=sensors)
+    noise, known = ls.Noise(0.01 * np.eye(3)), ("x", "y") if compass else None
+    of = ls.belief.Belief(scenario.robot.dynamics, dt=DT, noise=noise, sensors=sensors, uncertain=known)
+    covariance = START * np.outer(*[[1, 1, not compass]] * 2) / 10
     given: dict[str, Any] = {
-        "dt": DT, "steps": 20, "initial": ls.FixedState(of.state([-0.9, -2.4, 0.0], START / 10)),
+        "dt": DT, "steps": 20, "initial": ls.FixedState(of.state([-0.9, -2.4, 0.0], covariance)),
         "stage_cost": ls.ControlCost([1.0, 1.0]), "noise": of.innovations,
         "final_cost": ls.QuadraticCost({"m": 100.0}, about={"x": -0.3, "y": -2.3}),
     }  # fmt: skip
@@ -438,15 +439,17 @@ class Reading(ls.belief.BeliefFeedback):
 
 
 def test_a_run_reads_its_true_states_as_late_as_is_stated() -> None:
-    """The formulas of the beacons in NumPy, to rounding; nothing before the first reading arrives."""
+    """The formulas of the beacons in NumPy, to rounding; nothing before the first reading arrives, but what is known."""
     scenario, trials = ls.scenarios.differential_drive(), 3
-    problem = drive(scenario)
+    problem = drive(scenario, compass=True)
     law, delay = Reading(problem, ls.smooth(problem)), 1
     off = ls.disturbances.InitialStateError(0.05)
     run = ls.simulate(scenario.plant(), controller=law, disturbances=[off], trials=trials, frames=False)
     x, y, heading = np.moveaxis(run.states, 2, 0)
     exact = [*(np.sqrt((x - place) ** 2 + y**2 + 0.01) for place in (-2.0, 2.0)), np.sin(heading)]
     read, wanted = np.moveaxis(np.array(law.read), 0, 1), np.stack(exact, axis=2)
+    np.testing.assert_array_equal(read[..., 3], heading[:, :-1])
+    read = read[..., :3]
     assert np.isnan(read[:, :delay]).all()
     np.testing.assert_allclose(read[:, delay:], wanted[:, : read.shape[1] - delay], atol=1e-12)
 
@@ -454,7 +457,7 @@ def test_a_run_reads_its_true_states_as_late_as_is_stated() -> None:
 def belief_scenario() -> ls.Scenario:
     """The packaged drive along a wall, with what a run meets."""
     scenario = ls.scenarios.differential_drive()
-    problem = drive(scenario)
+    problem = drive(scenario, compass=True)
     of = problem.dynamics
     assert isinstance(of, ls.belief.Belief)
     lost = ls.belief.ReadingErrors(of, loss=0.2)
