@@ -147,8 +147,8 @@ def dense(case: Case, solution: ls.Solution) -> Dense:
     step = 1e-30
 
     def slopes(function: object, at: Array) -> Array:
-        """By complex steps, (K, D), of variables (D, B) or (D,)."""
-        moved = at[:, None].astype(complex) + 1j * step * np.diag(size)
+        """By complex steps, (K, ..., D), of variables (D, ...)."""
+        moved = at[..., None] + 1j * step * np.diag(size).reshape(D, *[1] * (at.ndim - 1), D)
         return np.imag(function(moved)) / step  # type: ignore[operator]
 
     gradient = slopes(lambda y: _cost(case, y), z)
@@ -172,12 +172,9 @@ def dense(case: Case, solution: ls.Solution) -> Dense:
         over, even = _rows(case, y)
         return _cost(case, y) - np.tensordot(on_above, over, 1) - np.tensordot(on_equal, even, 1)
 
-    hessian = np.zeros((D, D))
-    for j in range(D):
-        for sign in (1, -1):
-            beside = z.copy()
-            beside[j] += sign * 1e-4 * size[j]
-            hessian[j] += sign * slopes(lagrangian, beside) / 2e-4
+    step_aside = 1e-4 * np.diag(size)
+    ahead, back = (slopes(lagrangian, z[:, None] + sign * step_aside) for sign in (1, -1))
+    hessian = (ahead - back) / 2e-4
     hessian = (hessian + hessian.T) / 2
     tangent = np.eye(D)
     if len(rows):
