@@ -1,6 +1,7 @@
 """Beliefs: against LQG in closed form, an extended Kalman filter of matrices, differences, and drawn runs."""
 
 import dataclasses
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -463,6 +464,24 @@ def belief_scenario() -> ls.Scenario:
     lost = ls.belief.ReadingErrors(of, loss=0.2)
     met = (ls.disturbances.InitialStateError(0.1), ls.disturbances.StateNoise(of.process), lost)
     return dataclasses.replace(scenario, name="along a wall", problem=problem, disturbances=met, goal_radius=0.1)
+
+
+@pytest.mark.parametrize(
+    ("sweep", "strength", "numbers"), [("scenario", 1.0, [1, 2]), ("scenario:StateNoise", 2.0, [1])]
+)
+def test_failures_under_disturbances_of_formulas_are_written(
+    sweep: str, strength: float, numbers: list[int], tmp_path: Path
+) -> None:
+    """What has no plain data is stated by its number among the scenario's own, and in words; the rest by settings."""
+    reference = f"{__file__}:belief_scenario"
+    problem = ls.stress.ReliabilityProblem(reference, sweep=sweep, strength=strength, failure="miss")
+    problem.rare_failures(particles=20, repetitions=2, keep=0.0).save(tmp_path, shown=1)
+    stated = json.loads((tmp_path / "rare.json").read_text())["disturbances"]
+    of_scenario = [one["settings"] for one in stated if one["kind"] == "of the scenario"]
+    assert [one["number"] for one in of_scenario] == numbers
+    met = [problem.resolved.disturbances[number].scaled(strength) for number in numbers]
+    assert [one["text"] for one in of_scenario] == [one.describe(problem.resolved.plant()) for one in met]
+    assert len(stated) == len(problem.disturbances)
 
 
 def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> None:

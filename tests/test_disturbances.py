@@ -124,5 +124,6 @@ def test_numbers_by_name_or_unit_are_those_in_order(arena, named: dict[str, floa
     assert pickle.loads(pickle.dumps(one)) == one
     first, second = (simulate(arena, weave(4), disturbances=[each], seed=3).measured for each in (one, other))
     np.testing.assert_array_equal(first, second)
-    (again,) = disturbances_from_json(disturbances_as_json([one]), ls.scenarios.differential_drive())
+    scenario = ls.scenarios.differential_drive()
+    (again,) = disturbances_from_json(disturbances_as_json([one], scenario), scenario)
     assert again == one

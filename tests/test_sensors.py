@@ -416,7 +416,8 @@ def test_the_file_says_what_is_not_given(cart, on_track):
 
 def test_errors_of_sensors_are_stored_as_plain_data():
     one = SensorErrors(IMU, strength=0.5)
-    assert disturbances_from_json(disturbances_as_json([one]), ls.scenarios.quadrotor()) == (one,)
+    scenario = ls.scenarios.quadrotor()
+    assert disturbances_from_json(disturbances_as_json([one], scenario), scenario) == (one,)
 
 
 @given(names=st.lists(st.sampled_from([one.name for one in IMU]), max_size=4))

@@ -223,7 +223,6 @@ class BreakingPoint:
 
     policy: str
     sweep: str
-    below: float
     strength: float | None
     success: Estimate | None
 
@@ -236,7 +235,7 @@ def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.
         points = degradation(table, policy, sweep)
         first = next((point for point in points if point.exact.high < below), None)
         strength, exact = (None, None) if first is None else (first.cell.strength, first.exact)
-        breaking_points.append(BreakingPoint(policy, sweep, below, strength, exact))
+        breaking_points.append(BreakingPoint(policy, sweep, strength, exact))
     return sorted(breaking_points, key=lambda point: np.inf if point.strength is None else point.strength)
 
 

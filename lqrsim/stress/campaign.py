@@ -25,7 +25,6 @@ from lqrsim.errors import InputError, check_path, excerpt, free_name, without_ad
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
-from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
@@ -91,7 +90,7 @@ def run_campaign(
         if os.path.exists(folder / MANIFEST):
             _check_same_campaign(specification, read_manifest(folder), folder)
         else:
-            _begin(campaign, specification, _solve(campaign), folder)
+            _begin(campaign, specification, folder)
         results = Results(folder, scenario=campaign.scenario)
         unfinished = _unfinished(results)
         if unfinished and (others := changed(results.manifest["versions"])):
@@ -246,18 +245,13 @@ def _specification(campaign: Campaign) -> dict[str, Any]:
     }
 
 
-def _solve(campaign: Campaign) -> dict[str, Solution]:
-    """The solution that each policy runs."""
-    scenario, design = campaign.resolved, campaign.design_disturbances
-    solutions = policies.solve_policies(campaign.policies, scenario, design, campaign.given)
+def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> None:
+    """Solve; write the solutions and, at last, the manifest, with which the folder is that of a campaign."""
+    scenario, given, design = campaign.resolved, campaign.given, campaign.design_disturbances
+    solutions = policies.solve_policies(campaign.policies, scenario, design, given)
     for policy in {*policies.DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
         policies.make_controller(policies.POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
-    return solutions
-
-
-def _begin(campaign: Campaign, specification: dict[str, Any], solutions: dict[str, Solution], folder: Path) -> None:
-    """Write the solutions and, at last, the manifest, with which the folder is that of a campaign."""
-    scenario, given, hashes = campaign.resolved, campaign.given, dict[str, dict[str, str]]()
+    hashes = dict[str, dict[str, str]]()
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         hashes[policy] = {"digest": solving.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}

@@ -29,7 +29,7 @@ from lqrsim.results.archive import plain, sha256, write_text
 from lqrsim.results.certified import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenarios.references import names_code
+from lqrsim.scenarios.references import disturbance_set, names_code
 from lqrsim.scenarios.solutions import digest_of_solution
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
@@ -619,15 +619,16 @@ def write_json(
     problem: ReliabilityProblem, solution: Solution, path: Path, options: Mapping[str, Any], found: object, stopped: str
 ) -> None:
     """Write the settings of a search, and what it found."""
-    settings = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
+    scenario, settings = problem.resolved, {field.name: getattr(problem, field.name) for field in fields(problem)}
+    settings |= options
     settings["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
         "format": f"lqrsim {path.stem}",
         "version": 3,
         "asked": settings,
-        "disturbances": disturbances_as_json(problem.disturbances),
-        "model": sha256(problem.resolved.scene.xml),
-        "problem": problem.resolved.problem.digest,
+        "disturbances": disturbances_as_json(disturbance_set(problem.sweep, scenario), scenario, problem.strength),
+        "model": sha256(scenario.scene.xml),
+        "problem": scenario.problem.digest,
         "policy": digest_of_solution(solution),
         "versions": versions(),
         "machine": description(),

@@ -271,24 +271,10 @@ class Campaign(Setup):
         """The campaign as plain data without its solution, from which `from_json` makes it again."""
         design = self.design_disturbances
         fields = {name: getattr(self, name) for name in CAMPAIGN_FIELDS} | {
-            "sweeps": {name: self._as_json(sweep) for name, sweep in self.sweeps.items()},
-            "design_disturbances": None if design is None else disturbances_as_json(design),
+            "sweeps": {name: disturbances_as_json(sweep, self.resolved) for name, sweep in self.sweeps.items()},
+            "design_disturbances": None if design is None else disturbances_as_json(design, self.resolved),
         }
         return json.loads(json.dumps(fields))
-
-    def _as_json(self, sweep: Disturbances) -> list[dict[str, Any]]:
-        """As `disturbances_as_json`. The scenario's own may have formulas, which are no plain data: by their number."""
-        numbers = {id(disturbance): number for number, disturbance in enumerate(self.resolved.disturbances)}
-        plant, items = self.resolved.plant(), list[dict[str, Any]]()
-        for disturbance in sweep:
-            try:
-                items += disturbances_as_json([disturbance])
-            except InputError:
-                if id(disturbance) not in numbers:
-                    raise
-                settings = {"number": numbers[id(disturbance)], "text": disturbance.describe(plant)}
-                items.append({"kind": OF_SCENARIO, "settings": settings})
-        return items
 
     @classmethod
     @checked
@@ -342,16 +328,31 @@ class Trials:
         return self._controllers[key]
 
 
-def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:
-    """The kind and the settings of each disturbance. Raises InputError if a setting is not plain data."""
+def disturbances_as_json(
+    disturbances: Iterable[Disturbance], scenario: Scenario, strength: float | None = None
+) -> list[dict[str, Any]]:
+    """The kind and the settings of each disturbance, scaled by a strength if there is one.
+
+    The scenario's own may have formulas, which are no plain data: these are stated by their number among its own.
+    Raises InputError if a setting of another is no plain data.
+    """
+    numbers = {id(disturbance): number for number, disturbance in enumerate(scenario.disturbances)}
     items = list[dict[str, Any]]()
     for disturbance in disturbances:
-        if not dataclasses.is_dataclass(disturbance):
-            raise InputError(f"{type(disturbance).__name__}: got a class that is no dataclass, want a dataclass")
-        names = [field.name for field in dataclasses.fields(disturbance) if field.init]
-        settings = {name: getattr(disturbance, name) for name in names}
-        items.append({"kind": type(disturbance).__qualname__, "settings": settings})
-    return json.loads(json.dumps(items, default=_plain))
+        scaled = disturbance if strength is None else disturbance.scaled(strength)
+        kind = type(scaled)
+        if not dataclasses.is_dataclass(scaled):
+            raise InputError(f"{kind.__name__}: got a class that is no dataclass, want a dataclass")
+        settings = {field.name: getattr(scaled, field.name) for field in dataclasses.fields(scaled) if field.init}
+        try:
+            item = {"kind": kind.__qualname__, "settings": json.loads(json.dumps(settings, default=_plain))}
+        except InputError:
+            if id(disturbance) not in numbers:
+                raise
+            settings = {"number": numbers[id(disturbance)], "text": scaled.describe(scenario.plant())}
+            item = {"kind": OF_SCENARIO, "settings": settings}
+        items.append(item)
+    return items
 
 
 def _plain(value: Any) -> Any:
@@ -364,7 +365,7 @@ def _plain(value: Any) -> Any:
 
 
 def disturbances_from_json(items: Iterable[Mapping[str, Any]], scenario: Scenario) -> tuple[Disturbance, ...]:
-    """The inverse of `disturbances_as_json`, and of the numbers of the scenario's own."""
+    """The inverse of `disturbances_as_json`."""
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
     return tuple(
         scenario.disturbances[item["settings"]["number"]]
