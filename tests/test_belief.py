@@ -486,10 +486,10 @@ def test_failures_under_disturbances_of_formulas_are_written(
 
 def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> None:
     """Outcomes are those of `simulate`; formulas of disturbances are those of the scenario. Sensors are drawn."""
-    setup = ls.stress.Setup(f"{__file__}:belief_scenario")
-    campaign = ls.stress.Campaign.of_sets(setup, ["scenario"], strengths=(1.0,), policies=("smooth",), trials=20)
+    reference = f"{__file__}:belief_scenario"
+    campaign = ls.stress.Campaign.of_sets(reference, ["scenario"], strengths=(1.0,), policies=("smooth",), trials=20)
     results = ls.stress.run_campaign(campaign, tmp_path / "runs", workers=0, batch=7)
-    scenario, cell = setup.resolved, results.cells[0]
+    scenario, cell = campaign.resolved, results.cells[0]
     solution = results.trials.solutions["smooth"]
     law = ls.belief.BeliefFeedback(scenario.problem, solution)
     options: dict[str, Any] = {"goal_radius": 0.1, "disturbances": scenario.disturbances}
@@ -500,7 +500,7 @@ def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> Non
     assert "loss 0.2" in " ".join(run.disturbances)
     whole = found.outcome != "collided"
     np.testing.assert_array_equal(found.goal[whole], run.goal_distance[whole])
-    stored = ls.stress.Results(tmp_path / "runs", scenario=setup.scenario)
+    stored = ls.stress.Results(tmp_path / "runs", scenario=reference)
     assert ls.stress.replay(stored, cell, 3).outcome == (run.outcome[3],)
     others = "track", "offset_free", "replan"
     for policy in others:

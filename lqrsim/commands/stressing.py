@@ -62,21 +62,22 @@ class Stress(SetupOptions):
     """Resume the campaign in the folder with its own settings, without the options that state others."""
 
     def run(self) -> int:
-        from lqrsim.scenarios.references import folder_name
+        from lqrsim.scenarios.references import folder_name, resolve
+
+        def folder_of(scenario: ls.Scenario) -> Path:
+            folder = self.out or Path("runs/stress") / folder_name(scenario)
+            console.check_output("--out", folder)
+            return folder
 
         if self.resume:
             accepted = {"scenario", "solution", "out", "resume", "json", "workers", "batch", "scheduler"}
             refuse(self, vars(self).keys() - accepted, "with --resume, which has the campaign's own, want it without")
-        setup = ls.stress.Setup(**stated(self, ls.stress.Setup))
-        folder = self.out or Path("runs/stress") / folder_name(setup.resolved)
-        console.check_output("--out", folder)
-        if self.resume:
+            folder = folder_of(resolve(self.scenario))
             campaign = ls.stress.Results(folder, scenario=self.scenario).campaign
             campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
         else:
-            options = stated(self, ls.stress.Campaign)
-            options = {name: value for name, value in options.items() if not hasattr(setup, name)}
-            campaign = ls.stress.Campaign.of_sets(setup, self.sweep, **options)
+            campaign = ls.stress.Campaign.of_sets(sets=self.sweep, **stated(self, ls.stress.Campaign))
+            folder = folder_of(campaign.resolved)
         with console.Progress("stressing", "trial") as progress:
             options = stated(self, ls.stress.run_campaign, progress=progress)
             results = ls.stress.run_campaign(campaign, folder, **options)

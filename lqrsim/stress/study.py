@@ -46,6 +46,7 @@ OF_SCENARIO = "of the scenario"  # the kind of a disturbance that is stored by i
 
 Name = Annotated[str, Want("a name")]
 SetName = Annotated[str, Want("a name, such as 'light'")]
+Names = Annotated[Sequence[str], Want("a tuple of names")]
 Disturbances = Annotated[tuple[Disturbance, ...], Want("a tuple of disturbances, such as (ControlNoise(0.05),)")]
 
 
@@ -186,7 +187,7 @@ class Campaign(Setup):
 
     Attributes:
       sweeps: name -> disturbances at strength 1. Those that are made of formulas, such as a `Noise`, can only be
-        disturbances of the scenario, as in `Campaign.of_sets(setup, ["scenario"])`.
+        disturbances of the scenario, as in `Campaign.of_sets("my_robot.py:hallway", ["scenario"])`.
       strengths: factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate.
       policies: some of CAMPAIGN_POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is
         the plan of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan
@@ -227,32 +228,28 @@ class Campaign(Setup):
             raise InputError(f"trials: got {got}, want at most {_MOST_FILES}: fewer trials, or larger shards")
 
     @classmethod
-    def of_sets(cls, setup: Setup, sets: Sequence[str], *, policies: Sequence[str] = (), **options: Any) -> "Campaign":
+    @checked
+    def of_sets(
+        cls, scenario: str, sets: Names, *, design_disturbances: SetName | None = None, policies: Names = (),
+        **options: Any,
+    ) -> "Campaign":  # fmt: skip
         """A campaign whose disturbances are sets by name, as in `lqrsim stress`.
 
         Args:
-          setup: what it shares with other studies; its design disturbances are a set, too.
           sets: names of the sweeps.
+          design_disturbances: the name of a set, too.
           policies: as in `Campaign`; by default those of the first four that the scenario allows.
-          **options: the other attributes of `Campaign`, which are not those of a `Setup`.
+          **options: the other attributes of `Campaign`.
         """
-        check_kind("setup", setup, Setup, "a Setup")
-        sets = check_items("sets", sets, str, "a tuple of names of sets of disturbances")
-        policies = check_items("policies", policies, str, "a tuple of names of policies")
-        scenario, design = setup.resolved, setup.design_disturbances
-        impossible = impossible_policies(scenario, setup.given)
-        shared = {field.name: getattr(setup, field.name) for field in dataclasses.fields(Setup)}
-        # What the setup or the sets state would be ignored.
-        allowed = [name for name in CAMPAIGN_FIELDS if name not in (*shared, "sweeps", "policies")]
-        for name in options:
-            check_name("options", name, allowed)
-        named = {
-            "design_disturbances": None if design is None else tuple(design_disturbances(scenario, design)),
-            "sweeps": {name: disturbance_set(name, scenario) for name in sets},
-            "policies": policies or tuple(policy for policy in DEFAULT_POLICIES if policy not in impossible),
-        }
-        campaign = cls(**options | shared | named)
-        keep(campaign, resolved=scenario, given=setup.given)
+        bare = cls(scenario, sweeps=dict.fromkeys(sets, ()), **options)
+        impossible, design = impossible_policies(bare.resolved, bare.given), design_disturbances
+        campaign = dataclasses.replace(
+            bare,
+            sweeps={name: disturbance_set(name, bare.resolved) for name in sets},
+            design_disturbances=None if design is None else disturbance_set(design, bare.resolved),
+            policies=policies or tuple(policy for policy in DEFAULT_POLICIES if policy not in impossible),
+        )
+        keep(campaign, resolved=bare.resolved, given=bare.given)
         return campaign
 
     @property

@@ -212,7 +212,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "Study": (setup | {"sweep": "light", "strength": 1.0, "policy": "smooth", "design_disturbances": None},),
         "Campaign": (asked,),
         "Campaign.of_sets": ({
-            "setup": ls.stress.Setup(**setup), "sets": ["scenario"], "policies": ["open_loop"], "trials": 2
+            **setup, "sets": ["scenario"], "policies": ["open_loop"], "trials": 2
         },),
         "Campaign.disturbances": ({"self": campaign, "cell": cell},),
         "Campaign.from_json": ({"fields": campaign.as_json(), "scenario": campaign.resolved, "solution": None},),
