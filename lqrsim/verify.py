@@ -29,7 +29,7 @@ from lqrsim.scenes.mjcf_kinematics import carriers, posed
 from lqrsim.view import gl
 from lqrsim.view.cameras import RIM, Camera, calibrated, measuring
 from lqrsim.view.picture import Pane
-from lqrsim.view.recorded_trial import drawn_size, interpolated, model_of, place_of, robot_body, tracked_balls
+from lqrsim.view.recorded_trial import RecordedTrial, interpolated, place_of, tracked_balls
 from lqrsim.view.render import digest, read_metadata
 
 HIDDEN_FRACTION = 0.05  # of the frames, in which the robot may be hidden
@@ -108,22 +108,11 @@ class Verification:
     __str__ = summary
 
 
-def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
-    """The model that was run. Raises InputError if there is no such trial, or it has no frames."""
-    model = model_of(rollout, trial)
+def recorded_trial(rollout: Rollout, trial: int) -> RecordedTrial:
+    """The trial with its model. Raises InputError if there is none, or it has no frames."""
     if len(rollout.frame_times) < 2:
         raise InputError(f"rollout.frames: got shape {rollout.frames.shape}, want what simulate(frames=True) records")
-    return model
-
-
-def _size(rollout: Rollout, model: mujoco.MjModel) -> float:
-    """The radius of the robot in metres, to which errors are relative; without one, its size in pictures."""
-    return rollout.radius or drawn_size(model, rollout, robot_body(model, rollout.body))
-
-
-def describe(rollout: Rollout, trial: int) -> str:
-    """Robot, scene, seed and trial, as text."""
-    return f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}, trial {rollout.first_trial + trial}"
+    return RecordedTrial(rollout, trial)
 
 
 def frames_at_states(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[np.intp]]:
@@ -141,13 +130,11 @@ def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
     return rollout.places(trial)[np.abs(rollout.times - times[:, None]).argmin(axis=1)]
 
 
-def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
+def frame_positions(recorded: RecordedTrial, times: Array) -> Array:
     """Positions (N, d) of the robot's body from the frames, which are denser than the states."""
-    good = np.isfinite(rollout.frames[trial]).all(axis=1)
-    body = robot_body(model, rollout.body)
-    balls = tracked_balls(rollout)
-    places = [place_of(data, body, balls).copy() for data in posed(model, rollout.frames[trial, good])]
-    return interpolated(rollout.of_world(places), rollout.frame_times[good], times)
+    rollout, balls = recorded.rollout, tracked_balls(recorded.rollout)
+    places = [place_of(data, recorded.robot, balls).copy() for data in posed(recorded.model, recorded.frames)]
+    return interpolated(rollout.of_world(places), recorded.frame_times, times)
 
 
 def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
@@ -198,8 +185,8 @@ def verify_run(
     X-rays, in which obstacles hide nothing, and all of it is in each picture. For a robot without a position, the
     position of its last ball is read, or of its outermost geom if it has no balls.
     """
-    model = drawable_model(rollout, trial)
-    body, place = robot_body(model, rollout.body), None
+    recorded = recorded_trial(rollout, trial)
+    model, body, place = recorded.model, recorded.robot, None
     if (balls := tracked_balls(rollout)) is not None:
         body, place = balls.tracked
     geom = _tracked_geom(model, body, place)
@@ -209,7 +196,7 @@ def verify_run(
     measured: list[Array] = []
     offsets: list[Array] = []
     thickness, curved = _thickness(model, geom, rollout.frames[trial, rows], views)
-    bound, wanted = DRAWN_BOUND * _size(rollout, model), 1.0 if thickness >= THIN else FILLED / thickness
+    bound, wanted = DRAWN_BOUND * (rollout.radius or recorded.size), 1.0 if thickness >= THIN else FILLED / thickness
     pixel = max(view.height for view in views) / SIZE[1]
     # The edge of a thin geom, or a straight edge, may lie along the pixels, and be drawn half of one too far.
     coarse = thickness < THIN or not curved
@@ -218,7 +205,7 @@ def verify_run(
     finer = int(np.clip(np.ceil(wanted), 1, FINEST))
     bound = max(bound, pixel / finer) if coarse else bound
     size, centre = (finer * SIZE[0], finer * SIZE[1]), mask_centre if thickness >= THIN else mask_middle
-    for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views, size):
+    for masks, offset in _silhouettes(recorded, geom, rollout.frames[trial, rows], views, size):
         measured.append(np.array([view.measure(centre(mask), size) for view, mask in zip(views, masks, strict=True)]))
         offsets.append(offset)
         if progress:
@@ -230,13 +217,12 @@ def verify_run(
         detail = f"{finer * thickness:.2g} pixels where it is thinnest, want {THINNEST:g} or more"
         others.append(Criterion("thickness", finer * thickness >= THINNEST, detail))
     return compare(
-        describe(rollout, trial),
+        recorded,
         f"the silhouette of {name} in {size[0]} x {size[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
         times,
         seen=places - rollout.of_world(offsets),
         actual=state_positions(rollout, trial, times),
-        planned=interpolated(rollout.planned_places, rollout.times, times),
         apart=apart,
         bound=bound,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
@@ -304,11 +290,11 @@ def _reach(kind: mujoco.mjtGeom, size: Array, directions: Array) -> Array:
 
 
 def _silhouettes(
-    model: mujoco.MjModel, geom: int, rollout: Rollout, frames: Array, views: Sequence[Camera], size: tuple[int, int]
+    recorded: RecordedTrial, geom: int, frames: Array, views: Sequence[Camera], size: tuple[int, int]
 ) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
     """For each frame (nq,): masks (height, width) of the geom in each view, and its offset from the robot's place."""
     gl.bind()
-    body = robot_body(model, rollout.body)
+    model, balls = recorded.model, tracked_balls(recorded.rollout)
     model.geom_group[:], model.geom_group[geom] = 1, 0
     model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
     model.vis.global_.offwidth, model.vis.global_.offheight = size
@@ -325,7 +311,7 @@ def _silhouettes(
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
                 masks.append(renderer.render()[..., 0] > 0)
-            yield masks, data.geom_xpos[geom] - place_of(data, body, tracked_balls(rollout))
+            yield masks, data.geom_xpos[geom] - place_of(data, recorded.robot, balls)
 
 
 FEWEST_PIXELS = 20  # of the tracked object; with fewer, the centre is too uncertain
@@ -433,7 +419,7 @@ def verify_video(
     panes = [pane for pane in panes if pane.run == panes[0].run]
     views = [pane.camera for pane in panes if pane.camera is not None]
     triangulate(views, np.zeros((0, len(views), 2)), plane)  # reports missing views before the slow part
-    model, radius = drawable_model(rollout, trial), metadata.markers[panes[0].run]
+    recorded, radius = recorded_trial(rollout, trial), metadata.markers[panes[0].run]
     measured: list[list[Array]] = []
     off = 0.0  # s, largest difference between the actual and the intended time of a frame
     for time, image in _decoded(path):
@@ -446,8 +432,9 @@ def verify_video(
     seen, apart = triangulate(views, measured[:count], plane)
     areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
     drawn_times, _ = frames_at_states(rollout, trial)
-    differences = frame_positions(rollout, trial, model, drawn_times) - state_positions(rollout, trial, drawn_times)
-    worst, most = np.linalg.norm(differences, axis=1).max(), RECORD_BOUND * _size(rollout, model)
+    differences = frame_positions(recorded, drawn_times) - state_positions(rollout, trial, drawn_times)
+    robot = rollout.radius or recorded.size
+    worst, most = np.linalg.norm(differences, axis=1).max(), RECORD_BOUND * robot
     shows = f"the video shows {', '.join(metadata.runs)}, this run is {name}"
     timed = len(measured) == metadata.frames and off < 1 / float(metadata.rate) / 4
     counted = f"got {len(measured)}, want the {metadata.frames} that were written"
@@ -462,16 +449,16 @@ def verify_video(
     )
     named = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
     return compare(
-        f"{Path(path).name}, {describe(rollout, trial)}",
+        recorded,
         f"the green mark in its panes {named}",
         times,
         seen=seen,
-        actual=frame_positions(rollout, trial, model, times),
-        planned=interpolated(rollout.planned_places, rollout.times, times),
+        actual=frame_positions(recorded, times),
         apart=apart,
-        bound=VIDEO_BOUND * _size(rollout, model),
+        bound=VIDEO_BOUND * robot,
         interval=metadata.speed * (1 / float(metadata.rate)),
         others=others,
+        video=f"{Path(path).name}, ",
     )
 
 
@@ -494,17 +481,17 @@ def _measure_marker(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radi
 
 
 def compare(
-    subject: str,
+    recorded: RecordedTrial,
     method: str,
     times: Array,
     *,
     seen: Array,
     actual: Array,
-    planned: Array,
     apart: Array,
     bound: float,
     interval: float,
     others: tuple[Criterion, ...],
+    video: str = "",
 ) -> Verification:
     """Compare positions (N, d) from pixels with the actual ones; `apart` (N,) is the views' disagreement in metres.
 
@@ -530,6 +517,9 @@ def compare(
         tests.append(Criterion("time", abs(shift) <= late, detail))
         tests.append(Criterion("scale", abs(stretch) <= wide, f"{scale:.4f}, want 1 within {wide:.4f}"))
         likely = _likely_cause(tests, times, seen, actual, bound, interval)
+    run = recorded.rollout
+    subject = f"{video}{run.robot} in {run.scene}, seed {run.seed}, trial {run.first_trial + recorded.trial}"
+    planned = interpolated(run.planned_places, run.times, times)
     return Verification(subject, method, times, seen, actual, planned, rms, worst, shift, scale, tuple(tests), likely)
 
 

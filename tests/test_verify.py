@@ -18,8 +18,9 @@ import lqrsim as ls
 from lqrsim import verify
 from lqrsim.cli import main
 from lqrsim.verify import check_plan, run_beside
-from lqrsim.view import cameras, gl
+from lqrsim.view import cameras, gl, recorded_trial
 from lqrsim.view.cameras import Camera
+from lqrsim.view.recorded_trial import model_of
 from lqrsim.view.render import VideoMetadata, digest, read_metadata
 
 faults: Any = importlib.import_module("injected_faults")  # of experiments/, whose benchmark makes them at full size
@@ -356,14 +357,14 @@ def verified_as_rod(
 
     Without a seed the rod lies along the pixels.
     """
-    model = verify.drawable_model(run, 0)
+    model = model_of(run, 0)
     geom, pixel = verify._tracked_geom(model, model.body(run.body).id), 0.0
     for view in (cameras.calibrated("top", run), cameras.calibrated("side", run)):
         pixel = max(pixel, view.height / verify.SIZE[1])
     turn = np.array([1.0, 0, 1, 0]) if seed is None else np.random.default_rng(seed).normal(size=4)
     model.geom_type[geom], model.geom_quat[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, turn / np.linalg.norm(turn)
     model.geom_size[geom] = thickness * pixel / 2, run.radius, 0.0
-    changed.setattr(verify, "drawable_model", lambda *_: model)
+    changed.setattr(recorded_trial, "model_of", lambda *_: model)
     # A small radius is a tight bound: less than half of the finest pixel.
     return ls.verify_run(dataclasses.replace(run, radius=0.08) if seed is None else run)
 
@@ -433,7 +434,7 @@ def test_a_robot_without_position_or_balls_is_measured_by_a_geom_that_is_whole_i
     found = ls.verify_run(run)
     assert found.passed, found.summary()
     assert f"the silhouette of {drawn} in" in found.method
-    data = mujoco.MjData(model := verify.drawable_model(run, 0))
+    data = mujoco.MjData(model := model_of(run, 0))
     for seen, frame in zip(found.seen, run.frames[0, verify.frames_at_states(run, 0)[1]], strict=True):
         data.qpos[:] = frame
         mujoco.mj_kinematics(model, data)
