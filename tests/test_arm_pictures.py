@@ -162,14 +162,8 @@ def test_viewers_follow_its_last_ball(plant: ls.Plant, plan: ls.Solution, run: l
     at_work = Closing(60, **viewer.arguments_for_plant(plant, plan))
     viewer.live(plant, plan, at_work)
     assert max(at_work.apart) < 2e-3
-    scene = mujoco.MjvScene(plant.model, 1000)
-
-    def new() -> mujoco.MjvGeom:
-        scene.ngeom += 1
-        return scene.geoms[scene.ngeom - 1]
-
-    at_work.draw_overlays(new)
-    np.testing.assert_allclose(scene.geoms[scene.ngeom - 1].pos, at_work.planned_position(), rtol=0, atol=1e-6)
+    *_, ghost = at_work.overlay_shapes()
+    np.testing.assert_allclose(ghost.place, at_work.planned_position(), rtol=0, atol=1e-6)
     with pytest.raises(ls.InputError, match="the position, or balls"):
         Closing(1, **viewer.arguments_for_rollout(run, 0) | {"balls": None})
 

@@ -290,8 +290,7 @@ def test_viewers_draw_the_plan_where_the_robot_moves() -> None:
             np.testing.assert_allclose(place, screen.planned_position(), rtol=0, atol=1e-4)  # it keeps to its plan
             assert place[0] == -2.0
         assert screen.caption.endswith(" 0 mm from the plan")
-        drawn: list[mujoco.MjvGeom] = []
-        screen.draw_overlays(lambda drawn=drawn: drawn.append(mujoco.MjvGeom()) or drawn[-1])
+        drawn = [shape.set(mujoco.MjvGeom()) for shape in screen.overlay_shapes()]
         assert {round(float(geom.pos[0]), 6) for geom in drawn} == {-2.0}
         assert drawn[-1].type == mujoco.mjtGeom.mjGEOM_SPHERE
 

@@ -129,13 +129,7 @@ def test_the_caption_tells_solves_and_the_law(moved: Run) -> None:
 
 def test_the_plan_in_force_is_drawn(moved: Run) -> None:
     """The last piece of the line ends where the plan does that is in force, and that is near the new goal."""
-    geoms: list[mujoco.MjvGeom] = []
-
-    def new() -> mujoco.MjvGeom:
-        geoms.append(mujoco.MjvGeom())
-        return geoms[-1]
-
-    moved.screen.draw_overlays(new)
+    geoms = [shape.set(mujoco.MjvGeom()) for shape in moved.screen.overlay_shapes()]
     last = [geom for geom in geoms if np.allclose(geom.rgba, (*colour_of("plan"), 1.0))][-1]
     ends = last.pos + np.outer((-1, 1), last.size[2] * last.mat[:, 2])
     planned = moved.planners[0].active.plan.trajectory.states[-1, :3]

@@ -188,8 +188,8 @@ class Browser(Viewer):
         return self._handle.is_running()
 
     def show(self, time: float, qpos: np.ndarray) -> np.ndarray:
-        place, geoms = super().show(time, qpos), list[mujoco.MjvGeom]()
-        self.draw_overlays(lambda: geoms.append(mujoco.MjvGeom()) or geoms[-1])
+        place = super().show(time, qpos)
+        geoms = [shape.set(mujoco.MjvGeom()) for shape in self.overlay_shapes()]
         self._handle.send_to_viewer(_SceneUpdate(geoms, self.caption))
         return place
 

@@ -17,7 +17,7 @@ from lqrsim.annotations import Finite, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
-from lqrsim.view.overlays import appending_to, set_geom
+from lqrsim.view.overlays import Shape
 from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial, interpolated, tracked_balls
 
 Vector = tuple[Finite, Finite, Finite]
@@ -108,11 +108,11 @@ def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: flo
 
     It is drawn close to the camera, where nothing hides it: in an orthographic picture its place is the same.
     """
-    forward, new = np.array(camera.forward), appending_to(scene)
+    forward, sphere = np.array(camera.forward), mujoco.mjtGeom.mjGEOM_SPHERE
     centre = centre - (forward @ (centre - camera.position)) * forward
     for distance, size, colour in ((1, radius, MARK_RGB), (2, RIM * radius, (0.0, 0.0, 0.0))):
         place = centre + (distance + size) * forward
-        set_geom(new(), mujoco.mjtGeom.mjGEOM_SPHERE, [size] * 3, place, (*colour, 1.0), emission=1)
+        Shape(sphere, [size] * 3, place, (*colour, 1.0)).append(scene, emission=1)
 
 
 def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array]:

@@ -1,12 +1,12 @@
 """Overlays of a trial: lines, dots, tubes, bodies and an arrow in the scene over time; and its readings as text.
 
-MuJoCo draws each as geoms in addition to the model's (`draw`), and so do a page in a browser and Rerun (`exports.py`).
-Tubes are of ellipsoids along a plan, which figures have, too.
+MuJoCo draws their shapes as geoms, in addition to the model's; `exports.py` has them on a page in a browser, and for
+Rerun. Tubes are of ellipsoids along a plan, which figures have, too.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import mujoco
 import numpy as np
@@ -48,7 +48,6 @@ SLIM = 0.65  # relative width of lines within a tube, which is often hardly wide
 SEGMENTS = 120  # of a line, at most: each is a geom of MuJoCo's
 DOTS = 30  # number of latest measured states that are drawn
 ARROW = 4.0  # length of the largest force's arrow, in radii of the robot: longer than the robot, and no path
-UPRIGHT = np.eye(3)
 END_ON = 0.9  # cosine of the angle to the line of sight above which an arrow is not drawn
 
 SIGMAS = 2.0  # standard deviations at which ellipsoids are drawn
@@ -124,27 +123,26 @@ class Ellipsoids:
         return np.array(chosen, dtype=np.int64)[places]
 
 
-NewGeom = Callable[[], mujoco.MjvGeom]
+class Shape(NamedTuple):
+    """A geom of MuJoCo's as it is drawn in addition to the model's, without shadow and gloss."""
 
+    kind: Geom
+    size: npt.ArrayLike  # (3,)
+    place: npt.ArrayLike  # (3,)
+    rgba: npt.ArrayLike
+    rotation: Array = np.eye(3)
 
-def appending_to(scene: mujoco.MjvScene) -> NewGeom:
-    """A function that appends a geom to a scene and returns it."""
+    def set(self, geom: mujoco.MjvGeom, *, emission: float = 0.0) -> mujoco.MjvGeom:
+        """Give a geom of a scene this shape; returns the geom."""
+        mujoco.mjv_initGeom(geom, self.kind, self.size, self.place, self.rotation.ravel(), self.rgba)
+        geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
+        geom.specular, geom.emission = 0, emission
+        return geom
 
-    def new() -> mujoco.MjvGeom:
+    def append(self, scene: mujoco.MjvScene, *, emission: float = 0.0) -> mujoco.MjvGeom:
+        """Append a geom of this shape to a scene; returns the geom."""
         scene.ngeom += 1
-        return scene.geoms[scene.ngeom - 1]
-
-    return new
-
-
-def set_geom(
-    geom: mujoco.MjvGeom, kind: Geom, size: Any, place: Any, rgba: Any, rotation: Array = UPRIGHT, *, emission: float
-) -> mujoco.MjvGeom:
-    """Give a geom this kind, size (3,), place (3,) and colour (4,), without shadow and gloss; returns the geom."""
-    mujoco.mjv_initGeom(geom, kind, size, place, rotation.ravel(), rgba)
-    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
-    geom.specular, geom.emission = 0, emission
-    return geom
+        return self.set(scene.geoms[scene.ngeom - 1], emission=emission)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +153,9 @@ class Drawable:
     rgba: Rgba
     label: str  # in the legend; none if empty
 
-    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
-        """Draw it at a time, with geoms that `new` returns; an arrow waits for the camera, see `draw_for`."""
+    def shapes(self, time: float) -> Iterable[Shape]:
+        """What MuJoCo draws of it at a time; of an arrow nothing, which depends on the camera."""
+        return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +167,7 @@ class Line(Drawable):
     times: Array | None = None  # (k,) at which it gets to its points; None for a line that is always whole
     colours: Array | None = None  # (k-1, 4) of its segments, by the map of the tracking error; None if all have `rgba`
 
-    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+    def shapes(self, time: float) -> Iterator[Shape]:
         """A box for each segment that it has by then; boxes are cheaper than capsules."""
         points = self.points
         colours = np.tile(np.array(self.rgba), (len(points) - 1, 1)) if self.colours is None else self.colours
@@ -183,7 +182,7 @@ class Line(Drawable):
         rotations, centres = np.stack([x, np.cross(z, x), z], axis=-1), points[:-1] + 0.5 * along
         for i in np.flatnonzero(length > 1e-6):
             size = [*self.profile, 0.5 * length[i, 0]]
-            set_geom(new(), Geom.mjGEOM_BOX, size, centres[i], colours[i], rotations[i], emission=emission)
+            yield Shape(Geom.mjGEOM_BOX, size, centres[i], colours[i], rotations[i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,10 +194,10 @@ class Dots(Drawable):
     half_sizes: tuple[float, float, float]
     seconds: float
 
-    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+    def shapes(self, time: float) -> Iterator[Shape]:
         age = time - self.times
         for point in self.points[(age >= 0) & (age < self.seconds - 1e-9)]:
-            set_geom(new(), Geom.mjGEOM_BOX, self.half_sizes, point, self.rgba, emission=emission)
+            yield Shape(Geom.mjGEOM_BOX, self.half_sizes, point, self.rgba)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,9 +209,9 @@ class DrawnTube(Drawable):
     half_axes: Array
     rotations: Array
 
-    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+    def shapes(self, time: float) -> Iterator[Shape]:
         for centre, sizes, rotation in zip(self.centres, self.half_axes, self.rotations, strict=True):
-            set_geom(new(), Geom.mjGEOM_ELLIPSOID, sizes, centre, self.rgba, rotation, emission=emission)
+            yield Shape(Geom.mjGEOM_ELLIPSOID, sizes, centre, self.rgba, rotation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +228,10 @@ class MovingBody(Drawable):
         """Its places at these times, (..., 3)."""
         return interpolated(self.places, self.times, times)
 
-    def draw(self, time: float, new: NewGeom, *, emission: float) -> None:
+    def shapes(self, time: float) -> Iterator[Shape]:
         kind, size = getattr(Geom, f"mjGEOM_{self.kind.upper()}"), self.size
         size = np.full(3, size[0]) if self.kind == "sphere" else size
-        set_geom(new(), kind, size, self.at(time), self.rgba, self.rotation, emission=emission)
+        yield Shape(kind, size, self.at(time), self.rgba, self.rotation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +253,7 @@ class Arrow(Drawable):
         if length < 2 * self.width or abs(force @ forward) > END_ON * strength:
             return
         start = place + self.gap * force / strength
-        geom = set_geom(appending_to(scene)(), Geom.mjGEOM_ARROW, [1, 1, 1], start, self.rgba, emission=emission)
+        geom = Shape(Geom.mjGEOM_ARROW, [1, 1, 1], start, self.rgba).append(scene, emission=emission)
         mujoco.mjv_connector(geom, Geom.mjGEOM_ARROW, self.width, start, start + length * force / strength)
 
 

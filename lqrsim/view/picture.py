@@ -31,7 +31,6 @@ from lqrsim.view.overlays import (
     Arrow,
     Overlays,
     Shown,
-    appending_to,
     check_drawn,
     common_scale,
     error_colours,
@@ -274,12 +273,13 @@ class SceneRenderer:
         self.recorded.pose(data, time)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self.visual_options[0], None, mujoco.MjvCamera(), everything, scene)
-        of_model, new = scene.ngeom, appending_to(scene)
+        of_model = scene.ngeom
         for moment in earlier:
             self.recorded.pose(self.ghost, moment)
             mujoco.mjv_addGeoms(model, self.ghost, *self.visual_options, mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene)
         for drawable in self.overlays.drawables:
-            drawable.draw(time, new, emission=self.emission)
+            for shape in drawable.shapes(time):
+                shape.append(scene, emission=self.emission)
         of_all_views, place = scene.ngeom, place_of(data, self.recorded.robot, tracked_balls(self.recorded.rollout))
         self.window.make_current()
         for (box, view), faded in zip(self.views, self.faded, strict=True):

@@ -8,7 +8,7 @@ import sys
 import threading
 import time as clock
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -31,7 +31,7 @@ from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
-from lqrsim.view.overlays import Line, MovingBody, NewGeom, appending_to, rgba_of
+from lqrsim.view.overlays import Line, MovingBody, Shape, rgba_of
 from lqrsim.view.recorded_trial import POINT, floor_below, interpolated, model_of, place_of, robot_body
 
 GHOST_OPACITY = 0.25
@@ -205,8 +205,8 @@ class Viewer(abc.ABC):
         """The planned place now, (3,)."""
         return self._on_floor(interpolated(self._places, self._times, self._time))
 
-    def draw_overlays(self, new: NewGeom) -> None:
-        """Draw the plan, the trace and the planned place; `new` returns a new geom."""
+    def overlay_shapes(self) -> Iterator[Shape]:
+        """The shapes of the plan, the trace and the planned place."""
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
         plan = np.array([self._on_floor(self._places[knot]) for knot in knots])
         width, flat = 0.002 * float(self.model.stat.extent), self.space.from_above
@@ -218,7 +218,7 @@ class Viewer(abc.ABC):
             Line("trace", TRACE_RGBA, "", np.array(self._trace), (width, width)),
             MovingBody("ghost", rgba_of("ghost", GHOST_OPACITY), "", kind, size, np.eye(3), now, place),
         ):
-            drawable.draw(self._time, new, emission=0.0)
+            yield from drawable.shapes(self._time)
 
     def aim_camera(self, camera: mujoco.MjvCamera) -> None:
         """Aim a free camera as the scene's `overview` camera, if it has one."""
@@ -310,7 +310,8 @@ class Window(Viewer):
         place, scene = super().show(time, qpos), self._viewer.user_scn
         with self._viewer.lock():
             scene.ngeom = 0
-            self.draw_overlays(appending_to(scene))
+            for shape in self.overlay_shapes():
+                shape.append(scene)
         self._viewer.set_texts((None, None, self.caption, None))
         return place
 
