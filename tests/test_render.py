@@ -19,7 +19,7 @@ from tracking import hover, track
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
 from lqrsim.view import cameras, gl
-from lqrsim.view.options import ALL_OVERLAYS, DRAWN_BY, OVERLAYS, Overlay
+from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, OVERLAYS, Overlay
 from lqrsim.view.overlays import DrawnTube, Overlays, Scale, colour_of, legend_entries
 from lqrsim.view.picture import Legend, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
@@ -405,7 +405,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
         return pixels(render(noisy, tmp_path / "still.png", **options))
 
     bare = shown()
-    for overlay in ALL_OVERLAYS:
+    for overlay in OVERLAY_KINDS:
         changed = (np.abs(shown(overlay) - bare).max(axis=2) > 10).mean()
         assert 1e-4 < changed < (1.0 if overlay == "caption" else 0.05), overlay
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
@@ -424,7 +424,7 @@ def test_what_no_overlay_draws_is_refused(
     funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
     given: Any = {"solution": quadrotor_solution, "funnel": funnel, "titles": ("a",)}[name]
     given = [None, given] if several and name != "titles" else given
-    others: Any = tuple(overlay for overlay in ALL_OVERLAYS if overlay != DRAWN_BY[name])
+    others: Any = tuple(overlay for overlay in OVERLAY_KINDS if overlay != DRAWN_BY[name])
     message = f"^{name}: got one without {DRAWN_BY[name]} in overlays=, want it with that"
     with pytest.raises(ls.InputError, match=message):
         render([flight] * (1 + several), tmp_path / "a.png", overlays=others, **{name: given})

@@ -173,7 +173,6 @@ class View:
         check_count("--port", self.port, at_least=0, at_most=65535)
         if self.seconds is not None:
             check_number("--seconds", self.seconds, above=0)
-        kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
             refuse(self, OF_LIVE_RUNS, f"with {self.what}, want it with a SCENARIO")
@@ -201,7 +200,7 @@ class View:
                 options = {"controller": controller, "disturbances": disturbances, "seed": self.seed}
                 viewer.live(plant, solution, screen, ended=console.say, planner=planner, goal=goal, **options)
 
-        with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **arguments, **options) as screen:
+        with viewer.open_viewer(self.viewer, self.port, title=f"lqrsim {self.what}", **arguments, **options) as screen:
             console.say(screen.instructions)
             with contextlib.suppress(KeyboardInterrupt):
                 go(screen)

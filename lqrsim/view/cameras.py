@@ -16,11 +16,12 @@ import numpy.typing as npt
 from lqrsim.annotations import Finite, Line, Positive, checked
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.results.rollout import Rollout
-from lqrsim.view.options import CALIBRATED, VIEWS
 from lqrsim.view.overlays import Shape
 from lqrsim.view.recorded_trial import SHOWN_GROUPS, RecordedTrial, interpolated, tracked_balls
 
 Vector = tuple[Finite, Finite, Finite]
+CALIBRATED = ("top", "side")
+VIEWS = ("overview", "chase", *CALIBRATED)
 
 # Depths in m that are drawn. The depth buffer is linear in an orthographic view, so a wide range loses no precision.
 CLIPPING = 0.01, 1000.0

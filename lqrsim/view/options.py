@@ -1,6 +1,6 @@
-"""What can be drawn over a scene, qualities and views, by name. Imports nothing heavy: the command line needs them."""
+"""What can be drawn over a scene, and qualities, by name. Imports nothing heavy: the command line needs them."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "cost_tube", "funnel", "caption"]
 Quality = Literal["draft", "standard", "publication"]
@@ -40,9 +40,6 @@ OVERLAY_KINDS: dict[Overlay, OverlayKind] = {
     "caption": OverlayKind("time, tracking error, clearance, disturbances, and whether the run is in the funnel"),
 }
 """What each overlay draws."""
-ALL_OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
-OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if OVERLAY_KINDS[name].default)
+OVERLAYS: tuple[Overlay, ...] = tuple(name for name, kind in OVERLAY_KINDS.items() if kind.default)
 # What is given for an overlay, and that overlay; a recording for Rerun has its funnel whatever the overlays.
 DRAWN_BY: dict[str, Overlay] = {"solution": "cost_tube", "funnel": "funnel", "titles": "caption"}
-CALIBRATED = ("top", "side")
-VIEWS = ("overview", "chase", *CALIBRATED)

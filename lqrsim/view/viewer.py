@@ -317,17 +317,16 @@ class Window(Viewer):
 
 
 def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Viewer:
-    """Open a `window` or a `browser`, to be used with `with`; the options are a Viewer's."""
-    if kind == "window":
+    """Open a `window` or a `browser`, to be used with `with`; the options are a Viewer's.
+
+    `auto` is a window where there is a screen.
+    """
+    screen = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    if kind == "window" or (kind == "auto" and screen):
         return Window(**options)
     from lqrsim.view.browser import Browser
 
     return Browser(port=port, title=title, **options)
-
-
-def has_display() -> bool:
-    """Whether there is a screen to open a window on."""
-    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 def _check_window_opens() -> None:
